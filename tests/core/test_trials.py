@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 
 from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.sources.calibration import start_trials
 from stereoservo.core.sources.check import check_targets
+from stereoservo.core.sources.measure_at_pose import markers_lost
 from stereoservo.core.sources.trial_stops import (
     combined_offsets,
     enough_inside,
@@ -21,7 +24,7 @@ from stereoservo.core.sources.trial_stops import (
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.messages.goals import Calibrate, Enable, Home, JointTarget, RenewGoal
 
-from .conftest import BASE
+from .conftest import BASE, CAMERA_NAMES
 
 GOAL = "00000011"
 ENDS = ("calibration_finished", "calibration_aborted", "check_finished")
@@ -189,6 +192,34 @@ def test_a_keep_out_on_the_way_ends_a_side_before_it(bench: Any) -> None:
     assert [
         e for e in bench.events if e.kind == "warning" and "j4" in e.message and "keep-out post" in e.message
     ]
+
+
+def test_stops_of_all_joints_from_which_a_keep_out_bars_the_way_back_are_left_out(bench: Any) -> None:
+    bench = with_trials(bench, range=np.full(6, 0.2), together=8, frames=1)
+    base = bench.settings.trials.base
+    box = np.tile([-np.inf, np.inf], (6, 1))[None]
+    # Between the base and where j1 stands above and j3 below it; reached from beside, it can only be left that way.
+    box[0, 0], box[0, 2] = base[0] + [0.04, 0.055], base[2] - [0.045, 0.03]
+    limits = msgspec.structs.replace(bench.settings.limits, keep_outs=box, keep_out_names=("post",))
+    bench.settings = msgspec.structs.replace(bench.settings, limits=limits)
+    bench.core = ServoCore(bench.settings)
+    end, samples = calibrated(bench)
+    assert end.kind == "calibration_finished", end
+    apart = np.array([e.joints - base for e in samples if e.trial < 0][1:])
+    assert len(apart) > 0
+    assert not ((apart[:, 0] > 0.0) & (apart[:, 2] < 0.0)).any()
+
+
+def test_markers_that_one_camera_loses_are_lost_though_another_sees_them(bench: Any) -> None:
+    visit = start_trials(GOAL, BASE, 0, bench.settings)
+    told = []
+    for k in range(120):  # the cameras' frames come in turn, 10 ms apart
+        seen = np.arange(8) if k % 2 or k < 20 or 60 < k < 70 else np.arange(2)
+        sight = SimpleNamespace(camera=CAMERA_NAMES[k % 2], ids=seen)
+        now_ns = 1 + 10_000_000 * k
+        context = SimpleNamespace(observations=(sight,), settings=bench.settings, now_ns=now_ns)
+        told.append(markers_lost(visit, context, bench.settings.trials))  # type: ignore[arg-type]
+    assert told.index(True) == 112  # of the second loss, which begins at 70
 
 
 @pytest.mark.parametrize("check", [False, True], ids=["trials", "check"])

@@ -161,7 +161,6 @@ class DriveAxis:
         """
         follows = bool((self.status_word or 0) & FOLLOWS_BIT)
         if not self.enabled or self.mode == "pv":
-            self._followed, self._ignored_s = False, 0.0
             return False
         self._followed |= follows
         self._ignored_s = 0.0 if follows or not self._followed else self._ignored_s + period_s
@@ -175,6 +174,9 @@ class DriveAxis:
         self.faulty = self.state in FAULTY
         if not self.at_limit:
             self.limit_side = 0
+        if not self.enabled:  # what it did until now says nothing of the next time
+            self._limited_s = self._asked = self._ignored_s = 0.0
+            self._followed = False
 
     def take_code(self, code: int) -> None:
         """Store an emergency's error code; 0 is the drive's error reset."""

@@ -44,6 +44,7 @@ from stereoservo_drivers.canopen.cia402_presence import (
 )
 from stereoservo_drivers.canopen.cia402_words import (
     FAULTY,
+    OUT_OF_RANGE,
     ControlWord,
     DriveState,
     NmtState,
@@ -54,6 +55,7 @@ from stereoservo_drivers.canopen.cia402_words import (
 )
 from stereoservo_drivers.canopen.option_checks import check_load
 from stereoservo_drivers.canopen.options import CanOptions, CommandMode
+from stereoservo_drivers.canopen.units import wrap_int32
 
 if TYPE_CHECKING:
     import canopen
@@ -71,6 +73,8 @@ SETTLE_S = 0.03
 """A cause that is still there trips a drive again within this time."""
 STANDS_SHARE = 0.01
 """Of the largest velocity: slower than this a drive is at rest."""
+LOOK_S = 0.02
+"""Time over which the positions of a drive that reports no velocity tell whether it is at rest."""
 
 
 class Cia402Bringup:
@@ -202,7 +206,7 @@ class Cia402Bringup:
         state = _state(drive)
         if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
             drive.write(0x6040, 0, ControlWord.QUICK_STOP)
-            until(link, lambda: _at_rest(drive), REST_S)
+            until(link, lambda: _at_rest(link, drive), REST_S)
         if state is not DriveState.FAULT:
             drive.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE)
         off = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
@@ -239,7 +243,12 @@ class Cia402Bringup:
         """Set the best mode that the drive takes. Raises DriverError (``read_back``) where it takes none."""
         for mode in setup.modes:
             number = MODES[mode]
-            drive.write(0x6060, 0, number, "mode")
+            try:
+                drive.write(0x6060, 0, number, "mode")
+            except DriverError as error:
+                if mode == setup.modes[-1] or not _out_of_range(error):
+                    raise
+                continue
             if until(link, lambda number=number: drive.read(0x6061) == number, STATE_S):  # type: ignore[misc]
                 return mode
         self._compare(drive, Write(0x6061, 0, MODES[setup.modes[-1]], option="mode"))
@@ -359,17 +368,30 @@ def _fixed(drive: RemoteDrive, write: Write) -> bool:
     return not write.option and variable is not None and not variable.writable
 
 
+def _out_of_range(error: DriverError) -> bool:
+    """Whether a value was refused as none that the object takes, by the drive or by its EDS."""
+    return error.code == "option" or error.data.get("abort_code") in OUT_OF_RANGE
+
+
 def _state(drive: RemoteDrive) -> DriveState:
     """Drive state read by SDO; the codec takes it as the newest."""
     drive.axis.take_status(drive.read(0x6041))
     return drive.axis.state
 
 
-def _at_rest(drive: RemoteDrive) -> bool:
-    if _state(drive) not in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
-        return True
-    slow = STANDS_SHARE * drive.axis.scale.rate_units(drive.axis.joint.max_velocity)
-    return drive.axis.state is DriveState.QUICK_STOP_ACTIVE and abs(drive.read(0x606C)) <= slow
+def _at_rest(link: Link, drive: RemoteDrive) -> bool:
+    """Whether a drive has ended its quick stop: by the velocity that it reports, or by its positions without one."""
+    state, scale = _state(drive), drive.axis.scale
+    if state is not DriveState.QUICK_STOP_ACTIVE:
+        return state is not DriveState.OPERATION_ENABLED
+    slow = STANDS_SHARE * drive.axis.joint.max_velocity
+    speed = drive.read_if_there(0x606C)
+    if speed is not None:
+        return abs(speed) <= STANDS_SHARE * scale.rate_units(drive.axis.joint.max_velocity)
+    before = drive.read(0x6064)
+    link.wait(LOOK_S)
+    moved = abs(wrap_int32(drive.read(0x6064) - before))
+    return moved * scale.resolution <= max(slow * LOOK_S, scale.resolution)
 
 
 def _read_initial_state(drive: RemoteDrive) -> None:

@@ -248,6 +248,8 @@ def is_communication_error(code: int) -> bool:
 
 ABORT_NO_OBJECT = 0x06020000
 ABORT_NO_SUBINDEX = 0x06090011
+OUT_OF_RANGE = (0x06090030, 0x06090031, 0x06090032)
+"""Codes of values that an object does not take."""
 
 _FIT = "does the EDS fit this drive?"
 _RANGE = "compare the value with the range in the drive's manual"

@@ -89,6 +89,9 @@ def _ways(model: CellModel, way: WayObservations) -> Iterator[_Way]:
         seen: list[tuple[FloatArray, FloatArray]] = []
         for c in range(len(model.cameras)):
             rows = np.flatnonzero((way.ways == number) & (way.cameras == c))
+            if not len(rows):
+                seen.append((np.zeros(0), np.zeros(0)))
+                continue
             start = np.array([np.interp(way.times[rows], times, q) for q in positions.T]).T
             shown, known = _joint_by_pictures(model, c, joint, start, way, rows)
             seen.append((way.times[rows][known], shown[known]))

@@ -261,6 +261,7 @@ class PoseMeasurement(Leased, eq=False, kw_only=True):
     joint_sum: FloatArray
     joint_frames: int = 0
     lost_ns: int = 0
+    lost_camera: str = ""  # which has seen too few markers since lost_ns; 0: none has
     silent_ns: int = 0
     """When some camera was last known never to have delivered."""
 

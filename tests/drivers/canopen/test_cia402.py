@@ -422,6 +422,27 @@ def test_limit_switches_that_are_sent_tell_a_switch_at_once_from_a_limit_of_the_
     assert hint in found[0]
 
 
+def test_a_drive_has_its_time_to_follow_each_time_it_is_enabled(enabled: Cia402Codec) -> None:
+    """Its brake opens for 0.2 s, in which bit 12 is not set."""
+
+    def cycles(count: int, word: int) -> None:
+        for _ in range(count):
+            enabled.receive(tpdo1(1, word))
+            enabled.receive(tpdo1(2, ENABLED | 0x1000))
+            enabled.command(np.zeros(2))
+            assert codes(enabled) == []
+
+    cycles(50, ENABLED)
+    cycles(50, ENABLED | 0x1000)
+    enabled.idle()
+    enabled.receive(tpdo1(1, DISABLED))
+    cycles(50, ENABLED)
+    cycles(1, ENABLED | 0x1000)
+    cycles(24, ENABLED)
+    enabled.command(np.zeros(2))
+    assert codes(enabled) == [("target_ignored", 0)]
+
+
 def test_the_side_of_a_limit_is_forgotten_with_it(enabled: Cia402Codec) -> None:
     assert limited(enabled, 1, 0, [0.2, 0.0])[0] == ("limit_switch", 0)
     enabled.idle()

@@ -22,6 +22,7 @@ from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
 from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
 from stereoservo_sim.emulators.nodes.cia402_node import Cia402Node
+from stereoservo_sim.emulators.nodes.dictionary import Abort, SdoError
 
 COUNTS, GEAR = 4096, 100.0
 COUNTS_PER_RAD = COUNTS * GEAR / (2 * math.pi)
@@ -259,13 +260,16 @@ def test_connecting_twice_gives_the_same(bench: Bench) -> None:
     bench.run()
 
 
-@pytest.mark.parametrize("quick_stop_option", [2, 6])
+@pytest.mark.parametrize(("quick_stop_option", "absent"), [(2, "none"), (6, "none"), (6, "606C")])
 def test_a_drive_that_was_left_moving_is_brought_to_rest_and_switched_off(
-    make_bench: Make, quick_stop_option: int
+    make_bench: Make, tmp_path: Path, quick_stop_option: int, absent: str
 ) -> None:
     # no reaction of the drive's own to the lost master: all of it is the bring-up's
-    joint = make_joint(1)
-    bench = make_bench(make_options(joint, quick_stop_option=quick_stop_option, rpdo_deadline_ms=0))
+    joint, path = make_joint(1), tmp_path / "drive.eds"
+    text = SHIPPED_EDS.read_text().replace(f"[{absent}]", "[266C]")
+    path.write_text(text.replace(f"=0x{absent}\n", "=0x266C\n"))
+    options = make_options(joint, quick_stop_option=quick_stop_option, rpdo_deadline_ms=0)
+    bench = make_bench(options, eds=path)
     bench.connect()
     bench.run()
     bench.cycle(0.5, 0.5)
@@ -411,6 +415,19 @@ def test_a_drive_without_the_mode_is_refused(make_bench: Make) -> None:
     message = bench.refused("mode")
     assert "mode 9 (csv)" in message
     assert "set mode to pv" in message
+
+
+def test_a_drive_that_refuses_a_mode_is_used_with_the_next_one(make_bench: Make) -> None:
+    bench = make_bench(make_options(make_joint(1)))
+
+    def velocity_only(subindex: int, value: int) -> None:
+        if value == 9:
+            raise SdoError(Abort.INVALID_VALUE)
+
+    bench.node(1).dictionary.guard(0x6060, velocity_only)
+    bench.connect()
+    assert bench.codec.axes[0].mode == "pv"
+    assert bench.object(1, 0x6061) == 3
 
 
 def test_sdo_aborts_name_node_object_value_and_option(make_bench: Make) -> None:

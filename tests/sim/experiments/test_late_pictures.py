@@ -34,6 +34,13 @@ def test_trial_motions_show_how_late_pictures_are(late_s: float, jitter_s: float
     for offset in found:
         assert abs(offset.offset_s + late_s + 0.5 * jitter_s) < 2e-3, offset
         assert offset.deviation_s < 1e-3
+    # The second camera sees nothing on the first half of the ways: they tell of the other one as before.
+    way = trials.way
+    kept = (way.cameras == 0) | (way.ways > np.median(way.ways))
+    frames = {name: getattr(way, name)[kept] for name in ("ways", "cameras", "times", "markers", "pixels")}
+    fewer = shutter_offsets(exact_model(cell), msgspec.structs.replace(way, **frames))
+    assert fewer[0] == found[0]
+    assert [offset.camera for offset in fewer[1:]] == ["cam1"]
 
 
 def driven(known_s: float | None, late_s: float) -> tuple[DrivenCell, np.ndarray]:

@@ -428,7 +428,7 @@ def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSet
         if offsets is None:
             why = "(the markers would leave a view)"
         else:
-            why = blocked(settings.base + offsets, everything, context)
+            why = blocked(settings.base + offsets, everything, context, settings.base)
             if not why:
                 trials.target, trials.seen_turns, trials.turn = settings.base + offsets, 0, -1
                 enter(trials, "move", context)

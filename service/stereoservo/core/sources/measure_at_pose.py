@@ -181,13 +181,16 @@ def _of_body(ids: IntArray, static: tuple[int, ...]) -> int:
 
 
 def markers_lost(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> bool:
-    """Some camera has seen too few markers for ``LOST_S``."""
+    """Some camera has seen too few markers for ``LOST_S``, whatever others saw meanwhile."""
     for observation in context.observations:
         if _of_body(observation.ids, context.settings.scene_ids) < trial.min_markers:
-            visit.lost_ns = visit.lost_ns or context.now_ns
-            return (context.now_ns - visit.lost_ns) * 1e-9 > LOST_S
-    if context.observations:
-        visit.lost_ns = 0
+            if not visit.lost_ns:
+                visit.lost_ns, visit.lost_camera = context.now_ns, observation.camera
+            lost_s = (context.now_ns - visit.lost_ns) * 1e-9
+            if visit.lost_camera == observation.camera and lost_s > LOST_S:
+                return True
+        elif visit.lost_camera == observation.camera:
+            visit.lost_ns = 0
     return False
 
 
@@ -255,11 +258,13 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...
     )  # fmt: skip
 
 
-def blocked(target: FloatArray, moving: list[int], context: StepContext) -> str:
+def blocked(
+    target: FloatArray, moving: list[int], context: StepContext, back: FloatArray | None = None
+) -> str:
     """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty where it may.
 
     The programme never leans on the safety stage: a keep-out blocks where it meets the box that the way from here
-    to the stop spans.
+    to the stop spans, and with it the way from anywhere there ``back`` (n,), where that is another one.
     """
     limits = context.settings.limits
     margin = limits.position_margin + 2.0 * context.settings.arrival
@@ -267,8 +272,9 @@ def blocked(target: FloatArray, moving: list[int], context: StepContext) -> str:
         low, high = limits.position_min[joint] + margin[joint], limits.position_max[joint] - margin[joint]
         if not low <= target[joint] <= high:
             return "(joint limit)"
+    ends = np.array([context.q, target, target if back is None else back])
+    low, high = ends.min(axis=0), ends.max(axis=0)
     for name, box in zip(limits.keep_out_names, limits.keep_outs, strict=True):
-        low, high = np.minimum(context.q, target), np.maximum(context.q, target)
         if bool(((box[:, 0] - margin <= high) & (low <= box[:, 1] + margin)).all()):
             return f"(keep-out {name})"
     return ""
