@@ -134,14 +134,19 @@ class DriveAxis:
         switches = self.switches or 0
         return self.joint.direction * ((switches >> 1 & 1) - (switches & 1))
 
-    def stands_at_limit(self, position: float, period_s: float) -> bool:
-        """Whether the drive has limited its motion long enough, and the joint has not gone as it was commanded.
+    def held_at_limit(self, position: float, period_s: float) -> bool:
+        """Whether the drive has limited its motion long enough, and it may be a limit switch or the joint stands.
 
         Call it once a cycle while commanding. Limits of current, ramp and velocity are reported by the same bit, in
-        which a healthy drive may be while it accelerates.
+        which a healthy drive may be while it accelerates. Only limit switches that are sent tell them apart: where they
+        are not, a joint that goes on may be beyond its switch, with a drive that leaves the braking to its master.
         """
-        if not (self.at_limit and self.enabled) or self.commanded * self._asked < 0.0:
+        if not self.enabled or self.commanded * self._asked < 0.0:
             self._limited_s = self._asked = 0.0
+            return False
+        if not self.at_limit:  # it may flicker
+            self._limited_s = max(self._limited_s - period_s, 0.0)
+            self._asked *= self._limited_s > 0.0
             return False
         if self._limited_s == 0.0:
             self._limited_from = position
@@ -152,7 +157,7 @@ class DriveAxis:
             return False
         moved = (position - self._limited_from) * math.copysign(1.0, self._asked)
         self._limited_s = self._asked = 0.0
-        return moved < FOLLOWED_SHARE * asked
+        return self.switches is None or moved < FOLLOWED_SHARE * asked
 
     def ignores_set_points(self, period_s: float) -> bool:
         """Whether the drive, which has followed its set-points since it was enabled, says for long that it does not.
@@ -404,14 +409,14 @@ class Cia402Codec:
         """Note an event where a drive holds its joint back, or ignores what it is told."""
         position = float(self.feedback.positions[axis.index])
         at_switch = axis.commanded * axis.switch_side > 0.0
-        if axis.limit_side == 0 and (axis.stands_at_limit(position, self._period_s) or at_switch):
+        if axis.limit_side == 0 and (axis.held_at_limit(position, self._period_s) or at_switch):
             axis.limit_side = int(np.sign(axis.commanded))
             if at_switch:
                 message, what = "limit switch active (0x60FD)", "reset, enable and move the joint inward"
             elif axis.switches is None:
-                message = "internal limit active and the joint stands: a limit switch, or the drive's own position, "
-                message += "velocity or current limit"
-                what = "see the limit switches (0x60FD); reset, enable and move the joint inward"
+                message = f"internal limit active for {BIT_S * 1e3:.0f} ms: a limit switch, or the drive's own "
+                message += "position, velocity or current limit"
+                what = "reset, enable and move the joint inward; \"switches\" in feedback tells them apart (0x60FD)"
             else:
                 message = "internal limit active and the joint stands, with no limit switch active: the drive's own "
                 message += "position, velocity or current limit"

@@ -164,7 +164,7 @@ def test_the_first_mode_that_a_drive_has_is_used(asked, modes, used):
 
 
 def test_limits_that_act_while_it_accelerates_are_no_fault_but_a_joint_that_stands_is():
-    bench = Bench(SHIPPED_EDS, (9,))
+    bench = Bench(SHIPPED_EDS, (9,), feedback=("velocity", "switches"))
     bench.run()
     bench.drive.word = 0x800
     bench.go(1.0, SPEED)
@@ -174,6 +174,24 @@ def test_limits_that_act_while_it_accelerates_are_no_fault_but_a_joint_that_stan
     assert bench.master.fault is not None
     assert bench.master.fault.code == "limit_switch"
     assert "the joint stands" in bench.master.fault.message
+
+
+@pytest.mark.parametrize("off_ms", [0, 12])
+def test_a_limit_that_lasts_is_a_fault_where_nothing_tells_it_from_a_switch(off_ms):
+    """Its drive leaves the braking to the master, and the joint goes on; the bit may flicker."""
+    bench = Bench(SHIPPED_EDS, (9,))
+    bench.run()
+    bench.drive.word = 0x800
+    bench.go(0.048, SPEED)
+    assert bench.master.fault is None
+    for _ in range(3):
+        bench.drive.word = 0
+        bench.go(off_ms * 1e-3, SPEED)
+        bench.drive.word = 0x800
+        bench.go(0.048, SPEED)
+    assert bench.master.fault is not None
+    assert bench.master.fault.code == "limit_switch"
+    assert '"switches" in feedback' in bench.master.fault.hint + bench.master.fault.message
 
 
 def test_a_drive_that_says_that_it_ignores_its_set_points_is_a_fault_of_that_name():
