@@ -414,9 +414,11 @@ class Cia402Codec:
             if at_switch:
                 message, what = "limit switch active (0x60FD)", "reset, enable and move the joint inward"
             elif axis.switches is None:
-                message = f"internal limit active for {BIT_S * 1e3:.0f} ms: a limit switch, or the drive's own "
+                message = (
+                    f"internal limit active for {BIT_S * 1e3:.0f} ms: a limit switch, or the drive's own "
+                )
                 message += "position, velocity or current limit"
-                what = "reset, enable and move the joint inward; \"switches\" in feedback tells them apart (0x60FD)"
+                what = 'reset, enable and move the joint inward; "switches" in feedback tells them apart (0x60FD)'
             else:
                 message = "internal limit active and the joint stands, with no limit switch active: the drive's own "
                 message += "position, velocity or current limit"
