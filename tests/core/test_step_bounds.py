@@ -18,6 +18,7 @@ from stereoservo.core.cycle import StepInputs, StepOutputs, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.kinematics.model import save_model
+from stereoservo.messages.goals import Goal, Request, RunGoal
 from stereoservo_sim.benchmarks.core_loop import PARTS, CoreLoop, rx90_with_facets
 from stereoservo_sim.world.exact_model import exact_model
 
@@ -123,3 +124,18 @@ def test_a_goal_of_a_large_body_goes_on_from_every_state_bit_for_bit() -> None:
     kinds = {kind for kind, _ in loop.times}
     assert {*PARTS, "way begun", "told"} <= kinds
     assert {f"moving, {part}" for part in (*PARTS, "way begun", "told")} <= kinds
+
+
+def test_a_goal_of_a_large_body_is_refused_where_the_clock_goes_back_amid_its_resolution() -> None:
+    cell = rx90_with_facets(96, 2)
+    loop = CoreLoop(cell, 0, with_groups(exact_model(cell)))
+    loop.take_model()
+    loop.step()
+    check = Goal("00000001", loop.target_at(0.3), law="cartesian3", check=True)
+    loop.step(requests=(Request(9, "test", RunGoal(check)),))
+    job = loop.core.state.planning
+    assert job is not None
+    assert job.resolution is not None
+    back = StepInputs(loop.now_ns - 10**9, 10**7, None, driver_active=True)
+    (reply,) = [event for event in loop.core.step(back).events if event.kind == "reply"]
+    assert (reply.request, reply.accepted, loop.core.state.planning) == (9, False, None)

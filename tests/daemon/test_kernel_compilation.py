@@ -118,6 +118,28 @@ def test_no_cell_needs_kernels_that_the_example_did_not(joints: int) -> None:
     assert signatures() == before
 
 
+LARGE_BODY = """
+from stereoservo.control.marker_groups import with_groups
+from stereoservo.daemon import kernel_compilation
+from stereoservo.numerics.compilation import overloads
+from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90_with_facets
+from stereoservo_sim.world.exact_model import exact_model
+
+kernel_compilation.warm_up()
+cell = rx90_with_facets(300, 2)
+loop = CoreLoop(cell, 0, with_groups(exact_model(cell)))
+before = set(overloads())
+loop.start_goal("stereo")
+loop.move_goal(1)
+assert set(overloads()) == before, set(overloads()) - before
+"""
+
+
+@pytest.mark.slow
+def test_a_large_body_needs_no_kernels_that_the_example_did_not() -> None:
+    subprocess.run([sys.executable, "-c", LARGE_BODY], check=True, timeout=120)
+
+
 def test_kernels_are_loaded_one_at_a_time_once_a_new_record_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

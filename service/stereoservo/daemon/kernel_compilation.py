@@ -26,6 +26,7 @@ import msgspec
 import numba
 import numpy as np
 
+from stereoservo.control.face_choice import spread_in_images
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.law_warmup import warm_up_incidences, warm_up_laws
 from stereoservo.control.laws.cartesian3 import cartesian_step
@@ -110,6 +111,12 @@ def _warm_up_goals() -> None:
     model = example_model()
     pixels = _example_pixels(model)
     seven = np.ones(7)  # a redundant arm's self-motion
+    few, seen = (
+        np.arange(len(MARKERS)),
+        np.ones(pixels.shape[:2]),
+    )  # a body of many markers, of which some are taken
+    spread_in_images(few, pixels, seen)
+    spread_in_images(few, pixels, seen, 3)
     distort_pixel(LENS, 1.0, 1.0)  # for set-points that are said anew in a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
     runs: list[tuple[str, PointSource]] = [(DEFAULT_LAW, "triangulated")]
