@@ -14,6 +14,7 @@ from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import decode_state, encode_state
 from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, relocalize_from_events
+from stereoservo.kinematics.shutter_stamps import ShutterOffset
 from stereoservo.messages.goals import (
     Calibrate,
     CancelGoal,
@@ -550,6 +551,25 @@ def test_pictures_that_a_busy_computer_stamps_late_are_no_moved_camera(cells: An
         cell.until("goal_reached", 30.0)
     told = [camera.timing for camera in cell.status.health.cameras.values()]
     assert all("more latency_s" in text for text in told), told
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_a_bump_in_motion_is_not_learnt_as_an_offset_of_the_stamps(cells: Any, direction: float) -> None:
+    stated_ns = 5_000_000
+    cell = cells()
+    offsets = tuple(ShutterOffset(name, 1e-9 * stated_ns, 1e-4) for name in cell.bench.names)
+    model = msgspec.structs.replace(cell.bench.core.state.model, epoch=2, shutter_offsets=offsets)
+    cell.bench.step(model_update=ModelUpdate(model))
+    learnt: list[int] = []
+    for k in range(100):
+        if k == 50:
+            cell.bump(0)
+        cell.step(Jog({"j1": 0.3 * direction}, lease_s=0.1))
+        learnt.append(cell.bench.core.state.cameras[0].offset_ns)
+    assert abs(learnt[49]) < 1_000_000  # what is stated is wrong, and corrected
+    assert max(learnt) <= 20_000_000, "no shutter opens after its frame has come"
+    assert cell.bench.core.state.reanchoring is not None
+    assert set(learnt[-30:]) == {stated_ns}, "while a camera is not known, as stated"
 
 
 def test_a_camera_that_stands_where_it_stood_is_known_again_at_rest(cells: Any) -> None:

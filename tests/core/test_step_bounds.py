@@ -16,8 +16,9 @@ import pytest
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import StepInputs, StepOutputs, encode
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state import ServoGoal, decode_state, encode_state
 from stereoservo.kinematics.model import save_model
+from stereoservo.messages.goals import Goal, Request, RunGoal
 from stereoservo_sim.benchmarks.core_loop import PARTS, CoreLoop, rx90_with_facets
 from stereoservo_sim.world.exact_model import exact_model
 
@@ -99,21 +100,22 @@ def test_no_step_in_the_largest_cell_does_more_than_is_stated(kinds: tuple[str, 
         assert 0 < other <= MOST_LINES["Python"], (kind, other)
 
 
+class Twin(CoreLoop):
+    """Runs each step a second time, by a core whose state has been written and read."""
+
+    again: StepOutputs | None = None
+
+    def before(self, kind: str, inputs: StepInputs) -> None:
+        copied = decode_state(encode_state(self.core.state))
+        self.again = ServoCore(self.core.settings, copied).step(inputs)
+
+    def step(self, **inputs: Any) -> StepOutputs:
+        outputs = super().step(**inputs)
+        assert encode(self.again) == encode(outputs)
+        return outputs
+
+
 def test_a_goal_of_a_large_body_goes_on_from_every_state_bit_for_bit() -> None:
-    class Twin(CoreLoop):
-        """Runs each step a second time, by a core whose state has been written and read."""
-
-        again: StepOutputs | None = None
-
-        def before(self, kind: str, inputs: StepInputs) -> None:
-            copied = decode_state(encode_state(self.core.state))
-            self.again = ServoCore(self.core.settings, copied).step(inputs)
-
-        def step(self, **inputs: Any) -> StepOutputs:
-            outputs = super().step(**inputs)
-            assert encode(self.again) == encode(outputs)
-            return outputs
-
     cell = rx90_with_facets(256, 4)
     loop = Twin(cell, 0, with_groups(exact_model(cell)))
     for number in range(2):  # the second one preempts the first
@@ -123,3 +125,41 @@ def test_a_goal_of_a_large_body_goes_on_from_every_state_bit_for_bit() -> None:
     kinds = {kind for kind, _ in loop.times}
     assert {*PARTS, "way begun", "told"} <= kinds
     assert {f"moving, {part}" for part in (*PARTS, "way begun", "told")} <= kinds
+
+
+def test_a_goal_of_a_large_body_is_refused_where_the_clock_goes_back_amid_its_resolution() -> None:
+    cell = rx90_with_facets(96, 2)
+    loop = CoreLoop(cell, 0, with_groups(exact_model(cell)))
+    loop.take_model()
+    loop.step()
+    check = Goal("00000001", loop.target_at(0.3), law="cartesian3", check=True)
+    loop.step(requests=(Request(9, "test", RunGoal(check)),))
+    job = loop.core.state.planning
+    assert job is not None
+    assert job.resolution is not None
+    back = StepInputs(loop.now_ns - 10**9, 10**7, None, driver_active=True)
+    (reply,) = [event for event in loop.core.step(back).events if event.kind == "reply"]
+    assert (reply.request, reply.accepted, loop.core.state.planning) == (9, False, None)
+
+
+def test_a_way_that_is_planned_anew_at_rest_goes_on_from_every_state_bit_for_bit() -> None:
+    cell = rx90_with_facets(8, 2)
+    loop = Twin(cell, 0, with_groups(exact_model(cell)))
+    loop.take_model()
+    goals = (
+        Goal("00000001", loop.target_at(0.4), law="cartesian3", gain=2.0),
+        Goal(
+            "00000002", loop.target_at(-0.3), law="trajectory"
+        ),  # planned while the arm moves on: anew at rest
+    )
+    anew = 0
+    for number, (goal, steps) in enumerate(zip(goals, (50, 120), strict=True)):
+        loop.step(requests=(Request(9 + number, "test", RunGoal(goal)),))
+        for _ in range(steps):
+            job = loop.core.state.planning
+            anew += job is not None and job.purpose == "again"
+            loop.step()
+    source = loop.core.state.source
+    assert anew > 0
+    assert isinstance(source, ServoGoal)
+    assert source.plan is not None

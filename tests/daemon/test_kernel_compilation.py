@@ -2,6 +2,7 @@
 without a model; and how the kernels of a first start get into a loop that runs.
 """
 
+import fcntl
 import os
 import pickle
 import subprocess
@@ -118,6 +119,28 @@ def test_no_cell_needs_kernels_that_the_example_did_not(joints: int) -> None:
     assert signatures() == before
 
 
+LARGE_BODY = """
+from stereoservo.control.marker_groups import with_groups
+from stereoservo.daemon import kernel_compilation
+from stereoservo.numerics.compilation import overloads
+from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90_with_facets
+from stereoservo_sim.world.exact_model import exact_model
+
+kernel_compilation.warm_up()
+cell = rx90_with_facets(300, 2)
+loop = CoreLoop(cell, 0, with_groups(exact_model(cell)))
+before = set(overloads())
+loop.start_goal("stereo")
+loop.move_goal(1)
+assert set(overloads()) == before, set(overloads()) - before
+"""
+
+
+@pytest.mark.slow
+def test_a_large_body_needs_no_kernels_that_the_example_did_not() -> None:
+    subprocess.run([sys.executable, "-c", LARGE_BODY], check=True, timeout=120)
+
+
 def test_kernels_are_loaded_one_at_a_time_once_a_new_record_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,3 +229,26 @@ def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pyte
     assert compilation.look(1000.0) == ""
     assert len(began) == 2
     compilation.end()
+
+
+def test_a_cell_with_drives_on_a_bus_waits_for_what_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as the other process holds the lock, and no longer; or until somebody ends the cell."""
+    monkeypatch.setattr(kernel_compilation, "_record_path", lambda: tmp_path / "record")
+    monkeypatch.setattr(kernel_compilation, "WAIT_S", 0.001)
+    asked = []
+
+    def given_up() -> bool:
+        asked.append(len(asked))
+        if len(asked) == 3:
+            fcntl.flock(other, fcntl.LOCK_UN)
+        return len(asked) > 5
+
+    with open(kernel_compilation._lock_path(), "w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        kernel_compilation.wait_until_compiled(given_up)
+        assert len(asked) == 3
+        fcntl.flock(other, fcntl.LOCK_EX)
+        kernel_compilation.wait_until_compiled(given_up)
+        assert len(asked) == 6

@@ -12,6 +12,7 @@ import numpy as np
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.model_arrays import model_arrays, require_fitting
+from stereoservo.core.monitor_state import MOVED
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds
 from stereoservo.core.monitors.diagnosis import start_model_monitor
@@ -172,7 +173,7 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
                 state, settings, arrays, camera, sights, prediction, at_shutter, context.emit
             )
         fold_residuals(state.watching, camera, sights, at_shutter)
-        _follow_offset(camera, context)
+        _follow_offset(camera, observation, context)
     if not _unknown(camera, state, settings):
         used = state.watching.masked == 0.0
         common = common_change(estimate, sights, used, prediction.jacobian[0], arrays)
@@ -183,6 +184,8 @@ FOLLOWED_S = 0.02
 """How far the offset of shutter stamps may be followed from what the trial motions have shown."""
 FOLLOWED_DEVIATION_S = 0.001
 """Standard deviation at which motion has shown an offset well enough to follow it."""
+NO_STAMPS = (*MOVED, "cameras_or_arm")
+"""Verdicts on cameras whose innovations say nothing of their stamps."""
 
 
 def stated_offsets(model: CellModel) -> dict[str, int]:
@@ -190,21 +193,34 @@ def stated_offsets(model: CellModel) -> dict[str, int]:
     return {offset.camera: round(1e9 * offset.offset_s) for offset in model.shutter_offsets}
 
 
-def _follow_offset(camera: int, context: StepContext) -> None:
+def _follow_offset(camera: int, observation: CameraObservation, context: StepContext) -> None:
     """Correct the offset of a camera's stamps by what its markers have shown in motion, within a bound.
 
-    Only where the trial motions have shown it, and none of the joints: play of a joint looks like a late picture.
+    Only where the trial motions have shown it, and none of the joints: play of a joint looks like a late picture. A
+    camera that was moved looks like one, too: its offset is the stated one from the verdict until it is known again,
+    and with any other verdict the offset stays. No shutter opens after its frame has come.
     """
     state, model = context.state, context.state.model
-    timing = state.watching.sightings[camera].timing
-    if timing.square < FOLLOWED_DEVIATION_S**-2 or model is None or model.joint_accuracy is not None:
+    if model is None or model.joint_accuracy is not None:
         return
-    stated = stated_offsets(model).get(context.settings.cameras[camera].name)
+    name = context.settings.cameras[camera].name
+    stated = stated_offsets(model).get(name)
     if stated is None:
         return
+    estimate, timing, verdict = (
+        state.cameras[camera],
+        state.watching.sightings[camera].timing,
+        state.watching.verdict,
+    )
+    if _unknown(camera, state, context.settings) or (verdict.kind in NO_STAMPS and name in verdict.subjects):
+        estimate.offset_ns, timing.product, timing.square = stated, 0.0, 0.0
+        return
+    if timing.square < FOLLOWED_DEVIATION_S**-2 or verdict.kind != "ok":
+        return
     bound = round(1e9 * FOLLOWED_S)
-    offset = state.cameras[camera].offset_ns + round(1e9 * timing.product / timing.square)
-    state.cameras[camera].offset_ns = min(max(offset, stated - bound), stated + bound)
+    latest = min(stated + bound, context.now_ns - observation.t_shutter_ns)
+    offset = estimate.offset_ns + round(1e9 * timing.product / timing.square)
+    estimate.offset_ns = min(max(offset, stated - bound), latest)
     timing.product = timing.square = 0.0
 
 

@@ -128,12 +128,12 @@ def _plan_on(job: PlanJob, context: StepContext) -> None:
     if job.resolution is not None and job.goal.id in context.goals_read:
         return  # of a large body: its markers' faces were this step's work
     try:
+        trusted_model(context)
         if job.planning is None:
             if not set_up(job, context) or job.planning is not None:
                 return
         elif not go_on_planning(job):
             return
-        trusted_model(context)
         report = _report_of(job, context)
     except RefusalError as refusal:
         state.planning = None

@@ -565,6 +565,9 @@ def decode_state(data: bytes) -> CoreState:
     if version < STATE_VERSION:
         data = msgspec.msgpack.encode(_of_this_version(msgspec.msgpack.decode(data), version))
     state: CoreState = _decoder.decode(data)
+    job = state.planning
+    if job is not None and job.purpose == "again" and isinstance(state.source, ServoGoal):
+        job.source = state.source  # written twice, it is one
     return state
 
 
@@ -589,12 +592,10 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """
     if state["source"]["type"] == "trials":
         raise StateVersionError(version)
-    state["version"] = STATE_VERSION
     if version == 6:  # before stamps and gaps of the loop were checked
         nothing = msgspec.to_builtins(Refused())
         state |= {"last_step_ns": 0, "refused_joints": nothing, "stop_reason": state["contact"].pop("reason")}
         state["refused_frames"] = [nothing for _ in state["cameras"]]
-    planning = state.get("planning")
-    if planning is not None:  # before large bodies were planned in parts
+    if (planning := state.get("planning")) is not None:  # before large bodies were planned in parts
         planning["goal"] = planning["source"]["goal"]
-    return state
+    return state | {"version": STATE_VERSION}

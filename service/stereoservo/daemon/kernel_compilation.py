@@ -17,7 +17,9 @@ import pickle
 import platform
 import signal
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +28,7 @@ import msgspec
 import numba
 import numpy as np
 
+from stereoservo.control.face_choice import spread_in_images
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.law_warmup import warm_up_incidences, warm_up_laws
 from stereoservo.control.laws.cartesian3 import cartesian_step
@@ -67,6 +70,8 @@ MODULE, RECORD, BESIDE = "stereoservo.daemon.kernel_compilation", "record", "bes
 """This module, and its second arguments: for the second part of its work, and for low priority."""
 NICE = 10
 """Of the process that compiles while cameras and arm work."""
+WAIT_S = 0.2
+"""Between two looks whether another process has compiled."""
 LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
 
@@ -110,6 +115,12 @@ def _warm_up_goals() -> None:
     model = example_model()
     pixels = _example_pixels(model)
     seven = np.ones(7)  # a redundant arm's self-motion
+    few, seen = (
+        np.arange(len(MARKERS)),
+        np.ones(pixels.shape[:2]),
+    )  # a body of many markers, of which some are taken
+    spread_in_images(few, pixels, seen)
+    spread_in_images(few, pixels, seen, 3)
     distort_pixel(LENS, 1.0, 1.0)  # for set-points that are said anew in a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
     runs: list[tuple[str, PointSource]] = [(DEFAULT_LAW, "triangulated")]
@@ -290,6 +301,10 @@ def _cached(folder: str) -> int:
     return sum(1 for _ in Path(folder).glob("*.nbc"))
 
 
+def _lock_path() -> Path:
+    return _record_path().with_suffix(".lock")
+
+
 def compiled() -> tuple[Overload, ...] | None:
     """The signatures of all kernels, where all are in the cache, of these sources and for this computer; else None."""
     try:
@@ -371,6 +386,19 @@ def kernels_to_come() -> KernelLoader | None:
     return loader if compiled() is None else None
 
 
+def wait_until_compiled(given_up: Callable[[], bool]) -> None:
+    """Wait for the process that compiles into this cache, where there is one, or until ``given_up``."""
+    lock = os.open(_lock_path(), os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        while not given_up():
+            with suppress(BlockingIOError):
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            time.sleep(WAIT_S)
+    finally:
+        os.close(lock)
+
+
 def collect_seldom() -> None:
     """Make the garbage collector rare: what numba makes while it compiles stays, and looking through it costs a
     twentieth of the time.
@@ -398,7 +426,7 @@ def main() -> int:
 
 def _wait_for_others() -> None:
     """Have one process at a time compile into this cache, until it ends."""
-    lock = os.open(_record_path().with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
+    lock = os.open(_lock_path(), os.O_RDWR | os.O_CREAT, 0o600)
     os.set_inheritable(lock, True)  # it is kept by what this process becomes
     fcntl.flock(lock, fcntl.LOCK_EX)
 

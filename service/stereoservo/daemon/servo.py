@@ -20,7 +20,13 @@ from stereoservo.core.cycle import DriverFault, StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan
-from stereoservo.daemon.kernel_compilation import KernelLoader, kernels_to_come, warm_up, warm_up_first
+from stereoservo.daemon.kernel_compilation import (
+    KernelLoader,
+    kernels_to_come,
+    wait_until_compiled,
+    warm_up,
+    warm_up_first,
+)
 from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
 from stereoservo.daemon.pacing import ClockPacing, LoopStatistics, prepare_realtime
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
@@ -284,6 +290,10 @@ def run(plan: RunPlan, termination: Termination) -> None:
         locks.append(ChannelLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
     # Compiled kernels are loaded now, not in the middle of a cycle.
     kernels = kernels_to_come()
+    if kernels is not None and hardware is not None:
+        # A kernel that is loaded holds up every thread of this process, a bus's too, for longer than drives wait.
+        wait_until_compiled(lambda: termination.asked)
+        kernels = None
     if kernels is None:
         warm_up()
     else:
