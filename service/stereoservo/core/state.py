@@ -571,8 +571,7 @@ def decode_state(data: bytes) -> CoreState:
     return state
 
 
-MOVED_IN_VERSION_7 = ("stop_reason",)
-"""Fields that a state of version 6 holds elsewhere."""
+MOVED_IN_VERSION_7 = ("stop_reason",)  # a state of version 6 holds it elsewhere
 
 
 def is_recorded(state: CoreState, data: bytes) -> bool:
