@@ -194,8 +194,8 @@ class TagDetector:
 
     def _quads(self, image: ImageArray, tags: set[int]) -> dict[int, list[FloatArray]]:
         """Quadrilaterals (4, 2) [px] that OpenCV decodes as one of ``tags``."""
-        level = noise_level(image)
-        searched = cv2.GaussianBlur(image, (5, 5), 1.0) if level > NOISY else np.ascontiguousarray(image)
+        image = np.ascontiguousarray(image)  # it may be a window
+        searched = cv2.GaussianBlur(image, (5, 5), 1.0) if noise_level(image) > NOISY else image
         corners, ids, _ = self._detector.detectMarkers(searched)
         quads: dict[int, list[FloatArray]] = {}
         for quad, tag in zip(corners, [] if ids is None else np.ravel(ids).tolist(), strict=True):

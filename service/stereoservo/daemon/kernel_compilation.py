@@ -36,6 +36,7 @@ from stereoservo.control.marker_groups import FLAT_PX, find_groups
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.monitors.moving_camera import rehearse as rehearse_mobile
+from stereoservo.core.prediction import rows_of
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.daemon.process_control import die_with_parent
@@ -91,6 +92,7 @@ def warm_up_first() -> None:
                 inputs, model_update=None, requests=(jog,), driver_active=True, compiling=True
             )
         )
+    rows_of(*(np.zeros(0, np.int64),) * 3)  # at the stops of trials
     warm_up_laws(own=False)
 
 

@@ -114,5 +114,6 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "kills",
         "soak",
         "soak-live",
+        "startup",
     ]
     assert "wheels" in error["message"]
