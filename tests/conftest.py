@@ -61,11 +61,6 @@ def is_fast(path: Path) -> bool:
     return name.parts[0] in FAST and name.as_posix() not in NOT_FAST
 
 
-def file_of(item: pytest.Item) -> str:
-    """Short name of a test's file, which no other file has."""
-    return f"{item.path.parent.name}/{item.path.stem}"
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """With ``-m fast`` no other test file is even imported."""
     other = (
@@ -78,16 +73,14 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the fast ones before ``-m`` chooses. Tests of real processes, which need real time, run one after the other,
-    the others a file at a time beside them. A test that failed runs again, three times at most, where the machine
-    stalled while it ran, or where it is of several processes, which wait for one another's processor.
+    """Mark the fast ones before ``-m`` chooses. A test that failed runs again, three times at most, where the machine
+    stalled while it ran, or where it is of several processes in real time, which wait for one another's processor.
     """
     for item in items:
         if is_fast(item.path) and item.get_closest_marker("slow") is None:
             item.add_marker("fast")
-        processes = item.get_closest_marker("process") is not None
-        item.add_marker(pytest.mark.xdist_group("process" if processes else file_of(item)))
         if item.config.getoption("--hil") is None:
+            processes = item.get_closest_marker("process") is not None
             condition = True if processes else partial(machine_stalled, item)
             item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=condition))
 
