@@ -11,11 +11,10 @@ import numpy as np
 
 from stereoservo.core.cycle import Status, encode
 from stereoservo.daemon.ipc_messages import STATE_CAPACITY, RunPlan, ServoState, save_plan
-from stereoservo.daemon.pacing import LoopStatistics
 from stereoservo.daemon.seqlock import SlotWriter
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.servo_state import STATE_LAYOUT, state_message
+from stereoservo.messages.servo_state import STATE_LAYOUT, LoopStatistics, state_message
 from stereoservo.messages.wire import StateMessage
 from stereoservo.ports.devices import JointDriverDescription, JointSpec
 

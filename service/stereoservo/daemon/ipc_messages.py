@@ -10,7 +10,6 @@ import msgspec
 
 from stereoservo.core.cycle import Event, Status, check_observation, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
-from stereoservo.daemon.pacing import LoopStatistics
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import CameraSection, CellFile
 from stereoservo.messages.decoding import DamagedError, decoding
@@ -18,7 +17,7 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.messages.goals import Request
 from stereoservo.messages.recording_request import RecordedImages
-from stereoservo.messages.servo_state import MAX_PLAN_BYTES, plan_path
+from stereoservo.messages.servo_state import MAX_PLAN_BYTES, LoopStatistics, plan_path
 from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,

@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 
 from stereoservo.core.cycle import Event, ModelUpdate
 from stereoservo.daemon.ipc_messages import ServoState
-from stereoservo.daemon.pacing import LoopStatistics
 from stereoservo.messages.goals import Request
+from stereoservo.messages.servo_state import LoopStatistics
 from stereoservo.ports.devices import CameraObservation, Prior
 from stereoservo.recording.step_records import StepSink
 

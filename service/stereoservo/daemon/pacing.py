@@ -12,25 +12,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import msgspec
+from stereoservo.messages.servo_state import LoopStatistics
 
 _SUB_BITS = 4  # 16 bins an octave: quantiles good to 6 %
 _BINS = 48 << _SUB_BITS
-
-
-class LoopStatistics(msgspec.Struct, frozen=True):
-    """Counts and quantiles of the loop's cycles since its start. Lateness: time of waking after the slot [us]."""
-
-    rate_hz: float
-    cycles: int
-    overruns: int
-    skipped: int
-    p50_us: float
-    p99_us: float
-    max_us: float
-    work_p50_us: float
-    work_p99_us: float
-    work_max_us: float
 
 
 class Histogram:

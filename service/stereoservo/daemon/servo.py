@@ -28,7 +28,7 @@ from stereoservo.daemon.kernel_compilation import (
     warm_up_first,
 )
 from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
-from stereoservo.daemon.pacing import ClockPacing, LoopStatistics, prepare_realtime
+from stereoservo.daemon.pacing import ClockPacing, prepare_realtime
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError
 from stereoservo.daemon.servo_links import ProcessLinks
@@ -36,6 +36,7 @@ from stereoservo.messages.cell_file import CellFileError
 from stereoservo.messages.directories import DirectoryError
 from stereoservo.messages.goals import Hold, Request
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path
+from stereoservo.messages.servo_state import LoopStatistics
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import Clock, DriverError, JointDriver, JointState

@@ -59,7 +59,9 @@ class _Status(msgspec.Struct):
     health: Health = Health()
 
 
-class _Loop(msgspec.Struct):
+class LoopStatistics(msgspec.Struct, frozen=True):
+    """Counts and quantiles of the loop's cycles since its start. Lateness: time of waking after the slot [us]."""
+
     rate_hz: float
     cycles: int
     overruns: int
@@ -76,7 +78,7 @@ class StateRecord(msgspec.Struct):
     """What of a `daemon.ipc_messages.ServoState` clients are told."""
 
     status: _Status
-    loop: _Loop
+    loop: LoopStatistics
     driver_active: bool
     records_dropped: int
     differences: tuple[str, ...]
