@@ -3,7 +3,8 @@ beside the others, and how a servo process gets those into a loop that runs.
 
 Kernels are compiled by running an example cell: an arm with two cameras runs some steps of each law; kernels are
 compiled by types, not by sizes. The cameras' lenses bend, so that the lens's kernels run too. A file in the cache of
-numba tells that all are compiled, of which sources, and with which signatures.
+numba tells that all are compiled, of which sources, and with which signatures; the distribution
+``stereoservo-kernels`` (``deploy/kernels``) brings another one.
 ``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside]`` compiles what is not compiled yet; ``beside``
 others that work: niced.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import importlib.util
 import os
 import pickle
 import platform
@@ -23,6 +25,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
+import llvmlite
 import llvmlite.binding
 import msgspec
 import numba
@@ -58,6 +61,7 @@ from stereoservo.messages.goals import (
 )
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import KERNELS, Overload, load, overloads
+from stereoservo.numerics.kernel_cache import SHIPPED, file_hash, shipped_folder
 from stereoservo.planning.planner_warmup import warm_up_planner
 from stereoservo.ports.devices import CameraObservation, JointState
 
@@ -277,6 +281,40 @@ class _Compiled(NamedTuple):
     overloads: tuple[Overload, ...]
 
 
+class ShippedRecord(NamedTuple):
+    """Content of ``compiled.pickle`` of the installed kernels: what made them, the hashes of the sources of modules."""
+
+    made_by: tuple[str, ...]
+    sources: dict[str, str]
+    overloads: tuple[Overload, ...]
+
+    @staticmethod
+    def maker() -> tuple[str, ...]:
+        """Of kernels that this process can load."""
+        return sys.implementation.cache_tag or "", platform.machine(), numba.__version__, llvmlite.__version__
+
+    def misfit(self) -> str:
+        """Why these kernels do not fit, in words; '' where they do."""
+        if self.made_by != self.maker():
+            return f"made by {' '.join(self.made_by)}, here are {' '.join(self.maker())}"
+        for module, known in self.sources.items():
+            spec = importlib.util.find_spec(module)
+            if spec is None or file_hash(str(spec.origin)) != known:
+                return f"made of another {module}"
+        return ""
+
+
+def _shipped() -> ShippedRecord | None:
+    """The record of the installed kernels; None where none are, or another version wrote it."""
+    folder = shipped_folder()
+    if folder is None:
+        return None
+    try:
+        return ShippedRecord(*pickle.loads((folder / "compiled.pickle").read_bytes()))
+    except Exception:  # whatever unpickling raises
+        return None
+
+
 def _has_cache() -> bool:
     return cartesian_step.stats.cache_path is not None  # type: ignore[attr-defined]
 
@@ -298,7 +336,7 @@ def _stamp(file: str | Path) -> tuple[int, int]:
     return status.st_mtime_ns, status.st_size
 
 
-def _cached(folder: str) -> int:
+def _count(folder: str) -> int:
     """Number of compiled kernels in a folder of the cache."""
     return sum(1 for _ in Path(folder).glob("*.nbc"))
 
@@ -308,7 +346,17 @@ def _lock_path() -> Path:
 
 
 def compiled() -> tuple[Overload, ...] | None:
-    """The signatures of all kernels, where all are in the cache, of these sources and for this computer; else None."""
+    """The signatures of all kernels, where all are in the cache or installed, of these sources and for this computer;
+    else None.
+    """
+    found = _cached_overloads()
+    if found is None:
+        shipped = _shipped()
+        found = None if shipped is None or shipped.misfit() else shipped.overloads
+    return found
+
+
+def _cached_overloads() -> tuple[Overload, ...] | None:
     try:
         record = _Compiled(
             *pickle.loads(_record_path().read_bytes())
@@ -319,7 +367,7 @@ def compiled() -> tuple[Overload, ...] | None:
         return None
     if any(_stamp(source) != stamp for source, stamp in record.sources.items()):
         return None
-    if any(_cached(folder) < count for folder, count in record.caches.items()):
+    if any(_count(folder) < count for folder, count in record.caches.items()):
         return None
     return record.overloads
 
@@ -338,7 +386,7 @@ def record_compiled() -> None:
     record = _Compiled(
         _machine(),
         {source: _stamp(source) for source in sources},
-        {folder: _cached(folder) for folder in folders},
+        {folder: _count(folder) for folder in folders},
         found,
     )
     write_atomically(_record_path(), pickle.dumps(tuple(record)))
@@ -420,6 +468,9 @@ def main() -> int:
             os.nice(NICE)
         _wait_for_others()
         if compiled() is None:
+            shipped = _shipped()
+            if shipped is not None:
+                print(f"{SHIPPED}: {shipped.misfit()}; compiling instead", file=sys.stderr)
             collect_seldom()
             warm_up()
             os.execv(sys.executable, [sys.executable, "-m", MODULE, sys.argv[1], RECORD])

@@ -104,7 +104,6 @@ class Compilation:
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._due: float | None = 0.0
-        self.look(0.0)
 
     def look(self, now: float) -> str:
         """Start it where it is due; returns how it failed, once, else ''."""
@@ -385,10 +384,9 @@ def run_cell(
         termination = Termination(grace_s=0.0)
         clean(directories)
         record_run(partial(begin_run, directories, options.boot, os.getpid()))
-        compilation = (
-            Compilation()
-        )  # of what is needed later, beside the preparation and, niced, beside the work
+        compilation = Compilation()  # of what is needed later, beside the preparation and, niced, beside the work
         try:
+            compilation.look(0.0)
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numba
 from numba.core import event, types
 
+from stereoservo.numerics.kernel_cache import KernelCache
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 LOG_VARIABLE = "STEREOSERVO_COMPILE_LOG"
@@ -39,9 +41,8 @@ def kernel(function: _F) -> _F:
     A kernel that calls another one with a literal (``solve(A, 0)``) calls the same compiled code as with any other
     integer; numba's own way compiles it once more for each literal.
 
-    Numba renews a cached kernel when its own file changes, not when a kernel that it calls changes in another
-    file: after an edit here, touch the callers' files. Where no cache directory is writable the kernel is
-    compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
+    A cached kernel is renewed when its own source changes or that of a kernel which it calls. Where no cache
+    directory is writable the kernel is compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
     """
     return _compile(function)
 
@@ -82,12 +83,12 @@ def load(wanted: Iterable[Overload]) -> Iterator[None]:
 
 def _compile(function: _F, **more: Any) -> _F:
     options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", **more}
-    try:
-        compiled = numba.njit(cache=True, **options)(function)
-    except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
-        warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=3)
-        compiled = numba.njit(**options)(function)
+    compiled = numba.njit(**options)(function)
     if compiled is not function:  # with NUMBA_DISABLE_JIT it is
+        try:
+            compiled._cache = KernelCache(function)
+        except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
+            warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=3)
         _forget_literals(compiled)
         KERNELS[function.__module__, function.__qualname__] = compiled
     return cast(_F, compiled)

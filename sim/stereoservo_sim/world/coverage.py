@@ -6,16 +6,17 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from stereoservo.numerics.compilation import kernel
 
 LINES = 16
 """Lines a pixel row, or the part of it that a shape reaches, on which spans are exact; between them the
 midpoint rule."""
 
 
-@numba.njit(cache=True)
+@kernel
 def _add_span(row: npt.NDArray[np.float64], first: int, u0: float, u1: float, weight: float) -> None:
     """Add ``weight`` times the overlap of [u0, u1] with each pixel to ``row``, whose item 0 is pixel
     ``first``.
@@ -34,7 +35,7 @@ def _add_span(row: npt.NDArray[np.float64], first: int, u0: float, u1: float, we
     row[i1 - first] += weight * (u1 - (i1 - 0.5))
 
 
-@numba.njit(cache=True)
+@kernel
 def _blend(
     image: npt.NDArray[np.float32], v: int, first: int, row: npt.NDArray[np.float64], level: float
 ) -> None:
@@ -45,7 +46,7 @@ def _blend(
             row[i] = 0.0
 
 
-@numba.njit(cache=True)
+@kernel
 def blend_ellipse(image: npt.NDArray[np.float32], conic: npt.NDArray[np.float64], level: float) -> None:
     """Blend the inside of ``conic`` (3, 3) (where ``m' C m < 0``) at ``level`` into ``image``; no
     ellipse, no change.
@@ -81,7 +82,7 @@ def blend_ellipse(image: npt.NDArray[np.float32], conic: npt.NDArray[np.float64]
         _blend(image, v, first, row, level)
 
 
-@numba.njit(cache=True)
+@kernel
 def blend_polygon(image: npt.NDArray[np.float32], corners: npt.NDArray[np.float64], level: float) -> None:
     """Blend a convex polygon, ``corners`` (k, 2) in order, at ``level`` into ``image``."""
     first = max(math.floor(corners[:, 0].min()), 0)

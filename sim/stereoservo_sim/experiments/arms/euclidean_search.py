@@ -4,10 +4,10 @@ random starts.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo_sim.experiments.arms.euclidean_inverse import EuclideanAxes
 
 STEPS = 40
@@ -15,7 +15,7 @@ SOLVED = 1e-11
 APART = 1e-5
 
 
-@numba.njit(cache=True)
+@kernel
 def _forward(
     directions: FloatArray, points: FloatArray, q: FloatArray, R: FloatArray, t: FloatArray, J: FloatArray
 ) -> None:
@@ -54,7 +54,7 @@ def _forward(
         t[2] = z - R[2, 0] * p[0] - R[2, 1] * p[1] - R[2, 2] * p[2]
 
 
-@numba.njit(cache=True)
+@kernel
 def _error(goal: FloatArray, R: FloatArray, t: FloatArray, e: FloatArray) -> float:
     """Spatial twist (6,) to ``goal`` (4, 4), to first order in its rotation; its norm."""
     D = np.empty((3, 3))
@@ -77,7 +77,7 @@ def _error(goal: FloatArray, R: FloatArray, t: FloatArray, e: FloatArray) -> flo
     return float(np.sqrt(total))
 
 
-@numba.njit(cache=True)
+@kernel
 def _eliminate(A: FloatArray, b: FloatArray) -> None:
     """``A⁻¹ b`` into ``b`` (n,), ``A`` (n, n) positive definite, by Gauss."""
     n = b.shape[0]
@@ -93,7 +93,7 @@ def _eliminate(A: FloatArray, b: FloatArray) -> None:
         b[k] /= A[k, k]
 
 
-@numba.njit(cache=True)
+@kernel
 def _newton(
     directions: FloatArray, points: FloatArray, goal: FloatArray, starts: FloatArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:

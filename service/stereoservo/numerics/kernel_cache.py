@@ -1,0 +1,133 @@
+"""The cache of a kernel's machine code: valid for the sources of the kernel and of all that it calls, and filled
+beforehand where the distribution ``stereoservo-kernels`` is installed.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import inspect
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+SHIPPED = "stereoservo_kernels"
+"""The package of that distribution: a folder for each package that has kernels, with the files of numba's cache."""
+GENERIC = ("generic", "")
+"""Processor and features that its code is compiled for, as numba names them."""
+
+
+class KernelCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of one kernel. Raises RuntimeError where no directory for it can be written.
+
+    numba renews a kernel when its own file has changed. Here the key holds the sources of the kernels that it calls as
+    well, and the constants that are compiled into them: after an upgrade, or an edit, nothing old is run.
+    """
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        return (*super()._index_key(sig, codegen), dependencies(self._py_func))
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        for load in (super()._load_overload, self._load_shipped):
+            try:
+                found = load(sig, target_context)
+            except Exception as error:  # of a damaged file: whatever unpickling and LLVM raise
+                warnings.warn(
+                    f"{self._name}: its file in the cache is damaged ({error!r:.200}); compiling it again",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+                found = None
+            if found is not None:
+                return found
+        return None
+
+    def _load_shipped(self, sig: Any, target_context: Any) -> Any:
+        folder = shipped_folder()
+        if folder is None:
+            return None
+        package = self._py_func.__module__.rpartition(".")[0]
+        file = IndexDataCacheFile(
+            str(folder / package), self._impl.filename_base, self._impl.locator.get_source_stamp()
+        )
+        codegen = target_context.codegen()
+        key = list(self._index_key(sig, codegen))
+        key[1] = (codegen.magic_tuple()[0], *GENERIC)
+        data = file.load(tuple(key))
+        return None if data is None else self._impl.rebuild(target_context, data)
+
+
+@functools.cache
+def shipped_folder() -> Path | None:
+    """The folder of compiled kernels that are installed; None without them."""
+    spec = importlib.util.find_spec(SHIPPED)
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    return Path(next(iter(spec.submodule_search_locations)))
+
+
+def dependencies(function: Callable[..., Any]) -> str:
+    """Hash of what a kernel is compiled of besides its own code: the source files of all kernels, functions and classes
+    of its distribution that it reaches by name, and the constants.
+    """
+    found: set[str] = set()
+    seen: set[Callable[..., Any]] = set()
+    waiting = [function]
+    while waiting:
+        this = waiting.pop()
+        if this not in seen:
+            seen.add(this)
+            parts, called = _named_by(this)
+            found |= parts
+            waiting.extend(called)
+    return hashlib.sha256("\n".join(sorted(found)).encode()).hexdigest()
+
+
+@functools.cache
+def _named_by(function: FunctionType) -> tuple[frozenset[str], tuple[FunctionType, ...]]:
+    """A text for its own source file and each constant that a function names; and the functions that it names."""
+    texts, called = {file_hash(inspect.getfile(function))}, []
+    root = function.__module__.partition(".")[0]
+    for name in sorted(set(_names(function.__code__)) & function.__globals__.keys()):
+        value = function.__globals__[name]
+        value = getattr(value, "py_func", value)  # of a kernel
+        if isinstance(value, FunctionType) and not _foreign(value, root):
+            called.append(value)
+        elif isinstance(value, (type, ModuleType)):
+            module = value.__name__ if isinstance(value, ModuleType) else value.__module__
+            if not _foreign(value, root):
+                texts.add(file_hash(str(sys.modules[module].__file__)))
+        elif isinstance(value, np.ndarray):
+            texts.add(f"{name} = {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}")
+        elif isinstance(value, (bool, int, float, complex, str, tuple, np.generic)):
+            texts.add(f"{name} = {value!r}")
+    return frozenset(texts), tuple(called)
+
+
+def _foreign(value: Any, root: str) -> bool:
+    """Whether a function, class or module belongs to a distribution that has a version of its own: numba, numpy."""
+    name = value.__name__ if isinstance(value, ModuleType) else value.__module__
+    return not str(name).startswith((root.partition("_")[0], "stereoservo"))
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+@functools.cache
+def file_hash(path: str) -> str:
+    """SHA-256 of a file's content; of its name alone where it cannot be read (code without a file)."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError:
+        return path

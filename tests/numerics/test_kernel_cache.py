@@ -1,0 +1,129 @@
+"""Compiled kernels in the cache and as installed: renewed with all that they are made of, used only where they fit."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stereoservo.numerics.compilation import LOG_VARIABLE
+
+CALLER = """
+from acme.called import FACTOR, twice
+from stereoservo.numerics.compilation import kernel
+
+@kernel
+def caller(x):
+    return FACTOR * twice(x)
+"""
+CALLED = """
+from stereoservo.numerics.compilation import kernel
+
+FACTOR = {factor}
+
+@kernel
+def twice(x):
+    return {count} * x
+"""
+
+
+@pytest.fixture
+def acme(tmp_path: Path) -> Path:
+    """A distribution with a kernel that calls another one, of another file."""
+    package = tmp_path / "site" / "acme"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "caller.py").write_text(CALLER)
+    (package / "called.py").write_text(CALLED.format(factor=10.0, count=2))
+    return package
+
+
+def run(acme: Path, cache: Path, **environment: str) -> tuple[float, set[str]]:
+    """What a new process computes, and the kernels that it compiles."""
+    log = cache.with_suffix(".log")
+    log.unlink(missing_ok=True)
+    done = subprocess.run(
+        [sys.executable, "-c", "from acme.caller import caller; print(caller(1.0))"],
+        env=os.environ
+        | {
+            "PYTHONPATH": os.pathsep.join([str(acme.parent), os.environ.get("PYTHONPATH", "")]),
+            "PYTHONDONTWRITEBYTECODE": "1",  # files that are changed within a second
+            "NUMBA_CACHE_DIR": str(cache),
+            LOG_VARIABLE: str(log),
+        }
+        | environment,
+        capture_output=True,
+        check=True,
+        text=True,
+        timeout=120,
+    )
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    return float(done.stdout), {line["kernel"] for line in lines if line.get("module", "").startswith("acme")}
+
+
+@pytest.mark.parametrize(("change", "result"), [({"count": 3}, 30.0), ({"factor": 7.0}, 14.0)])
+def test_a_kernel_is_renewed_with_what_it_calls(
+    acme: Path, tmp_path: Path, change: dict[str, float], result: float
+) -> None:
+    assert run(acme, tmp_path / "cache") == (20.0, {"caller", "twice"})
+    assert run(acme, tmp_path / "cache") == (20.0, set())
+    (acme / "called.py").write_text(CALLED.format(**{"factor": 10.0, "count": 2} | change))
+    assert run(acme, tmp_path / "cache") == (result, {"caller", "twice"})
+
+
+def test_installed_kernels_are_used_where_they_fit(acme: Path, tmp_path: Path) -> None:
+    made = tmp_path / "made"
+    run(acme, made, NUMBA_CPU_NAME="generic")
+    installed = acme.parent / "stereoservo_kernels"
+    (folder,) = (path for path in made.iterdir() if path.name.startswith("acme_"))
+    shutil.copytree(folder, installed / "acme")
+    (installed / "__init__.py").touch()
+    assert run(acme, tmp_path / "empty") == (20.0, set())
+    (acme / "called.py").write_text(CALLED.format(factor=10.0, count=4))
+    assert run(acme, tmp_path / "other") == (40.0, {"caller", "twice"})
+    (acme / "called.py").write_text(CALLED.format(factor=10.0, count=2))
+    for file in (installed / "acme").glob("*.nbc"):
+        file.write_bytes(file.read_bytes()[:100])
+    assert run(acme, tmp_path / "damaged") == (20.0, {"caller", "twice"})
+    for file in (tmp_path / "damaged").rglob("*.nbc"):
+        file.write_bytes(b"")  # a computer that lost its power
+    assert run(acme, tmp_path / "damaged") == (20.0, {"caller", "twice"})
+    assert run(acme, tmp_path / "damaged") == (20.0, set())
+
+
+@pytest.mark.slow
+def test_a_release_s_kernels_in_a_fresh_environment(tmp_path: Path) -> None:
+    root = Path(__file__).parents[2]
+    python = tmp_path / "venv" / "bin" / "python"
+
+    def do(*command: str) -> str:
+        environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, check=True, text=True
+        )
+        return done.stdout
+
+    do(sys.executable, "-m", "venv", str(tmp_path / "venv"))
+    install = (str(python), "-m", "pip", "install", "--quiet", "--constraint", str(root / "constraints.txt"))
+    do(*install, str(root), "hatchling")
+    wheel = (
+        str(python),
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-build-isolation",
+        "--no-deps",
+        "--wheel-dir",
+        "dist",
+    )
+    do(*wheel, str(root / "deploy" / "kernels"))
+    (built,) = (tmp_path / "dist").glob("stereoservo_kernels-*.whl")
+    do(*install, "--no-deps", str(built))
+    started = json.loads(
+        do(str(python), "-m", "stereoservo.cli.main", "bench", "startup", "--json", "--repetitions", "1")
+    )
+    assert [row["kernel"] for row in started["kernels"] if row["kernel"].startswith("stereoservo")] == []
