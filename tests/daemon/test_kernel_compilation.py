@@ -214,6 +214,7 @@ def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pyte
 
     monkeypatch.setattr(supervisor, "_spawn", spawn)
     compilation = supervisor.Compilation()
+    assert compilation.look(0.0) == ""
 
     def told(now: float) -> str:
         assert compilation._process is not None

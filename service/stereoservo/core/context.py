@@ -147,8 +147,8 @@ class RefusalError(Exception):
 
 COMPILING = (
     "first start of this version on this computer: control laws, path planner and the watch over the model are still "
-    "being compiled, which takes a minute or two. Calibration, jog, home and joint goals work already; a model waits, and goals in the "
-    "images, teaching and checks are refused: ask again when this reason has gone from the status"
+    "being compiled, which takes a minute or two. Calibration, jog, home and joint goals work already; a model waits, "
+    "and goals in the images, teaching and checks are refused: ask again when this reason has gone from the status"
 )
 """What is not ready, and what is."""
 

@@ -384,9 +384,9 @@ def run_cell(
         termination = Termination(grace_s=0.0)
         clean(directories)
         record_run(partial(begin_run, directories, options.boot, os.getpid()))
-        compilation = Compilation()  # of what is needed later, beside the preparation and, niced, beside the work
+        compilation = Compilation()
         try:
-            compilation.look(0.0)
+            compilation.look(0.0)  # beside the preparation and, niced, beside the work
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")
