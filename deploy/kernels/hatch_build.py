@@ -1,5 +1,5 @@
-"""Builds the distribution ``stereoservo-kernels``: has the installed stereoservo compile its kernels for a generic
-processor into an empty cache, and packs what numba wrote there.
+"""Builds the distribution ``stereoservo-kernels``: has the installed stereoservo compile its kernels into an empty
+cache, for each level of processors that runs here, and packs what numba wrote there.
 """
 
 import os
@@ -15,6 +15,8 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+from stereoservo.numerics.kernel_cache import levels_here
 
 RUNS = (["warmup"], ["demo", "--lockstep", "--json"], ["bench", "features", "--json", "--repetitions", "1"])
 """Commands that run every kernel: of the loop; of the fit, and of dots; of all detectors."""
@@ -57,23 +59,28 @@ class Kernels(BuildHookInterface):
         self._scratch = Path(tempfile.mkdtemp(prefix="stereoservo-kernels-"))
         cache, packed = self._scratch / "cache", self._scratch / "stereoservo_kernels"
         environment = os.environ | {
-            "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(cache),
+            "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(cache),
             "XDG_RUNTIME_DIR": str(self._scratch), "OPENBLAS_NUM_THREADS": "1",
         }  # fmt: skip
 
-        def run(*arguments: str) -> bytes:
+        def run(processor: str, *arguments: str) -> bytes:
             done = subprocess.run(
                 [sys.executable, *arguments],
-                env=environment,
+                env=environment | {"NUMBA_CPU_NAME": processor},
                 cwd=self._scratch,
                 stdout=subprocess.PIPE,
                 check=True,
             )
             return done.stdout
 
-        for command in RUNS:
-            run("-m", "stereoservo.cli.main", *command)
-        packages, record = pickle.loads(run("-c", PACKED))
+        for processor in levels_here():
+            for record in cache.rglob(
+                "compiled-*"
+            ):  # of the level before: nothing is compiled yet for this one
+                record.unlink()
+            for command in RUNS:
+                run(processor, "-m", "stereoservo.cli.main", *command)
+        packages, record = pickle.loads(run(processor, "-c", PACKED))
         for folder in cache.iterdir():
             if folder.name in packages:
                 shutil.copytree(

@@ -15,13 +15,14 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+import llvmlite.binding
 import numpy as np
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 SHIPPED = "stereoservo_kernels"
 """The package of that distribution: a folder for each package that has kernels, with the files of numba's cache."""
-GENERIC = ("generic", "")
-"""Processor and features that its code is compiled for, as numba names them."""
+LEVELS = {"haswell": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"), "generic": ()}
+"""Processors that its code is compiled for, the best first, with what a processor must have to run it."""
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
@@ -58,10 +59,19 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
             str(folder / package), self._impl.filename_base, self._impl.locator.get_source_stamp()
         )
         codegen = target_context.codegen()
-        key = list(self._index_key(sig, codegen))
-        key[1] = (codegen.magic_tuple()[0], *GENERIC)
-        data = file.load(tuple(key))
-        return None if data is None else self._impl.rebuild(target_context, data)
+        signature, (triple, *_), *sources = self._index_key(sig, codegen)
+        for processor in levels_here():
+            data = file.load((signature, (triple, processor, ""), *sources))
+            if data is not None:
+                return self._impl.rebuild(target_context, data)
+        return None
+
+
+@functools.cache
+def levels_here() -> tuple[str, ...]:
+    """Of `LEVELS` those whose code runs on this processor."""
+    here = llvmlite.binding.get_host_cpu_features()
+    return tuple(level for level, needs in LEVELS.items() if all(here.get(need) for need in needs))
 
 
 @functools.cache
