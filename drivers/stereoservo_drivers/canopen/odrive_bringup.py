@@ -53,7 +53,7 @@ def _listening(link: Link, nodes: tuple[int, ...], command: int) -> Iterator[Hea
         yield {node: received[frame_id(node, command)] for node in nodes}
 
 
-class Endpoint(msgspec.Struct, frozen=True):
+class DriveProperty(msgspec.Struct, frozen=True):
     """A property of a release: its number on the wire and its type."""
 
     id: int = 0
@@ -65,7 +65,7 @@ class Release(msgspec.Struct, frozen=True):
 
     fw_version: str
     hw_version: str
-    endpoints: dict[str, Endpoint]
+    endpoints: dict[str, DriveProperty]
 
 
 def load_release(path: Path) -> Release:
