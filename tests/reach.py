@@ -25,7 +25,9 @@ PACKAGES = {
     "stereoservo_drivers": "drivers/stereoservo_drivers",
     "stereoservo_sim": "sim/stereoservo_sim",
 }
-PUBLIC = ("stereoservo_drivers.contracts", "stereoservo.control.contracts", "stereoservo.client")
+PUBLIC = (
+    "stereoservo_drivers.contracts", "stereoservo_drivers.kit", "stereoservo.control.contracts", "stereoservo.client",
+)  # fmt: skip
 """What others import: suites that makers of drivers subclass, the goal client. All of it is an entry point."""
 FOUND_BY_NAME = ("run_", "report_", "draw_", "show_")
 """Functions that an experiment's declaration finds in the modules that it names."""

@@ -30,8 +30,13 @@ SECTIONS = dict(
 PLUGINS = {
     "A control law": Law,
     "A joint driver": JointDriver,
+    "A driver of servos on a serial line": JointDriver,
     "A camera driver": CameraDriver,
     "A detector": Detector,
+}
+
+OPTIONS: dict[str, dict[str, Any]] = {
+    "A driver of servos on a serial line": {"servo": [{"name": "shoulder", "id": 1}]}
 }
 
 
@@ -63,19 +68,20 @@ def executed(name: str, source: str) -> ModuleType:
 
 
 def contract_suite(heading: str) -> type:
-    """The contract suite of a recipe, on the recipe's own module."""
-    module, suite = blocks(heading)
+    """The contract suite of a recipe, on the recipe's own modules."""
+    *modules, suite = blocks(heading)
     try:
-        executed(*module)
+        for module in modules:
+            executed(*module)
         (found,) = (value for name, value in vars(executed(*suite)).items() if name.startswith("Test"))
     finally:
-        for name, _ in (module, suite):
-            sys.modules.pop(name, None)
+        sys.modules.pop(suite[0], None)
     return found
 
 
 TestLaw = contract_suite("A control law")
 TestJointDriver = contract_suite("A joint driver")
+TestServos = contract_suite("A driver of servos on a serial line")
 TestCameraDriver = contract_suite("A camera driver")
 TestDetector = contract_suite("A detector")
 
@@ -93,8 +99,8 @@ def entry(heading: str, monkeypatch: pytest.MonkeyPatch) -> tuple[ModuleType, An
 
 def test_every_recipe_has_its_blocks():
     assert list(SECTIONS) == [
-        "A control law", "A motion source", "A monitor", "A joint driver", "A camera driver", "A detector",
-        "An experiment",
+        "A control law", "A motion source", "A monitor", "A joint driver",
+        "A driver of servos on a serial line", "A camera driver", "A detector", "An experiment",
     ]  # fmt: skip
     assert all(blocks(heading) for heading in SECTIONS)
     assert sum(len(blocks(heading)) for heading in SECTIONS) == PAGE.read_text().count("```python")
@@ -115,7 +121,8 @@ def test_a_plugin_is_found_by_the_entry_point_of_its_recipe(heading, tmp_path, m
     found = plugins.load(group, name)
     monkeypatch.delitem(sys.modules, module)
     if PLUGINS[heading] is not Law:
-        found = found({}, DriverContext(VirtualClock(), "c", tmp_path, tmp_path, camera="left"))
+        options = OPTIONS.get(heading, {})
+        found = found(options, DriverContext(VirtualClock(), "c", tmp_path, tmp_path, camera="left"))
     assert isinstance(found, PLUGINS[heading])
     assert (
         plugins.list_plugins(group)[[p.name for p in plugins.list_plugins(group)].index(name)].distribution

@@ -10,6 +10,9 @@ LEARNS_S = 0.2
 """Time constant in which the offset under load follows what a standing joint shows."""
 STANDS_SHARE = 0.02
 """Of the largest velocity: below it a joint counts as standing."""
+LEARNT_SHARE = 0.1
+"""Of the lead: an offset that is known so well counts as learnt."""
+_NEARLY = 1.0 - 1e-9
 
 
 class PositionOutput:
@@ -18,8 +21,9 @@ class PositionOutput:
     An order is the integral of the commanded velocities, and is led no farther than ``lead`` (n,) ahead of where the
     joint stands, offset under load included: a joint whose orders end goes no further than this. The joint never drags
     its order along, so that one that gives way under load is held. The offset, by which a stiff drive stays behind its
-    order under load, is learnt while the joint stands, up to ``largest_offset`` (n,). ``largest_velocities`` (n,),
-    ``period_s``: of the orders.
+    order under load, is learnt while the joint stands, up to ``largest_offset`` (n,). A joint whose order has reached
+    the lead is taken for blocked once it stands or is commanded back: its order then begins anew where it stands, with
+    the offset of before. ``largest_velocities`` (n,), ``period_s``: of the orders.
     """
 
     def __init__(
@@ -33,6 +37,9 @@ class PositionOutput:
         self.offsets = np.zeros(len(lead))
         self._slow = np.full(len(lead), np.nan)
         self._last = np.full(len(lead), np.nan)
+        self._load = np.full(len(lead), np.nan)
+        self._pressed = np.zeros(len(lead))
+        self._rested_s = np.zeros(len(lead))
 
     def follow(self, positions: FloatArray, held: BoolArray) -> FloatArray:
         """Orders of joints at ``positions`` (n,) that are commanded nowhere: they stand where they are; those that are
@@ -42,6 +49,8 @@ class PositionOutput:
         self.orders = np.where(free, positions, self.orders)
         self.offsets = np.where(free, 0.0, self.offsets)
         self._slow = np.where(free, positions, self._slow)
+        self._load = np.where(free, np.nan, self._load)
+        self._pressed = np.where(free, 0.0, self._pressed)
         self._last = positions.copy()
         return self.orders
 
@@ -54,7 +63,12 @@ class PositionOutput:
         """
         if np.isnan(self.orders).any():
             self.follow(positions, ~np.isnan(self.orders))
-        self._learn_offsets(positions)
+        moves = np.abs(positions - self._slow) >= self._standing * LEARNS_S
+        standing = ~moves & (np.abs(positions - self._last) < self._standing * self._period_s)
+        self._slow = self._slow + self._period_s / LEARNS_S * (positions - self._slow)
+        self._last = positions.copy()
+        self._learn_offsets(positions, standing)
+        self._release(velocities, positions, standing, moves)
         level = positions + self.offsets
         ahead = np.where(velocities > 0.0, np.maximum(self.orders, level + self._lead), np.inf)
         behind = np.where(velocities < 0.0, np.minimum(self.orders, level - self._lead), -np.inf)
@@ -64,12 +78,30 @@ class PositionOutput:
         self.orders = np.clip(wanted, np.maximum(behind, floor), np.minimum(ahead, ceiling))
         return self.orders
 
-    def _learn_offsets(self, positions: FloatArray) -> None:
-        share = self._period_s / LEARNS_S
-        fastest = np.maximum(
-            np.abs(positions - self._last) / self._period_s, np.abs(positions - self._slow) / LEARNS_S
-        )
-        self._last = positions.copy()
-        self._slow = self._slow + share * (positions - self._slow)
-        error = np.where(fastest < self._standing, self.orders - positions - self.offsets, 0.0)
-        self.offsets = np.clip(self.offsets + share * error, -self._largest_offset, self._largest_offset)
+    def _learn_offsets(self, positions: FloatArray, standing: BoolArray) -> None:
+        error = np.where(standing, self.orders - positions - self.offsets, 0.0)
+        learnt = self.offsets + self._period_s / LEARNS_S * error
+        self.offsets = np.clip(learnt, -self._largest_offset, self._largest_offset)
+
+    def _release(
+        self, velocities: FloatArray, positions: FloatArray, standing: BoolArray, moves: BoolArray
+    ) -> None:
+        """Let go of what blocks a joint: what a joint that presses stands off its order is no load.
+
+        Not before its load is known: one that sinks under a new load would be let go, too.
+        """
+        sign = np.sign(velocities)
+        turned = self._pressed * sign < 0.0
+        released = turned | ((self._pressed != 0.0) & (sign == 0.0) & standing)
+        load = np.clip(self._load, -self._largest_offset, self._largest_offset)
+        self.orders = np.where(released, positions + self._load, self.orders)
+        self.offsets = np.where(released, load, self.offsets)
+        stands_off = self.orders - positions
+        presses = (stands_off - self._load) * sign >= self._lead * _NEARLY
+        self._pressed = np.where(sign == 0.0, self._pressed * ~released, sign * presses)
+        learnt = np.abs(stands_off - self.offsets) < LEARNT_SHARE * self._lead
+        rests = standing & (sign == 0.0) & (self._pressed == 0.0) & learnt
+        self._rested_s = np.where(rests, self._rested_s + self._period_s, 0.0)
+        moves = moves & ~np.isnan(self._load)
+        known = np.where(self._rested_s >= LEARNS_S, stands_off, self._load)
+        self._load = np.where(moves, self.offsets, known)

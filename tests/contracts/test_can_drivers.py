@@ -65,7 +65,7 @@ def emulator(request: pytest.FixtureRequest) -> Iterator[None]:
     drives = make_bus_emulator(
         options, DrivesSettings(plant="ideal", brake_ms=10.0), t_ns=time.monotonic_ns()
     )
-    with BusServer(drives, endpoint):
+    with BusServer(drives, endpoint) as suite.server:
         yield
 
 
@@ -75,6 +75,8 @@ class CanContract(JointDriverContract):
 
     real_time = True
     brake_s = 0.3
+    fault_s = 3.0
+    server: ClassVar[BusServer]
     options: ClassVar[dict[str, Any]] = CIA_402
     interface: ClassVar[str] = "stereoservo_slcan"
     bus: ClassVar[str]
@@ -83,12 +85,17 @@ class CanContract(JointDriverContract):
     def make_driver(self, context: DriverContext) -> JointDriver:
         return CanJointDriver(self.given, context)
 
-    @pytest.fixture
-    def configured(self, driver: JointDriver) -> JointDriver:
-        """A configured driver, without the faults that a stall of the machine in an earlier test has left latched."""
+    def configure(self, driver: JointDriver) -> None:
+        """Configured, without the faults that a stall of the machine in an earlier test has left latched."""
         driver.configure()
         driver.configure()
-        return driver
+
+    def unplug(self, driver: JointDriver) -> bool:
+        self.server.order("cable out")
+        return True
+
+    def plug_in(self, driver: JointDriver) -> None:
+        self.server.order("cable in")
 
 
 class TestCia402OnVirtual(CanContract):

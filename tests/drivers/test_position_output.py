@@ -67,6 +67,35 @@ def test_a_joint_that_is_blocked_is_pressed_no_harder_than_lead_and_offset_allow
     assert float(order[0]) == pytest.approx(0.09)
 
 
+@pytest.mark.parametrize("sag", [0.0, np.radians(2.5)])
+@pytest.mark.parametrize(("then", "orders"), [(-0.05, 1), (0.0, 200)], ids=["reversed", "stopped"])
+@pytest.mark.parametrize("blocked_s", [0.5, 5.0])
+def test_a_joint_that_was_blocked_is_let_go_when_its_command_ends_or_turns(sag, then, orders, blocked_s):
+    """Led by 0.1 rad and 0.06 of a load that it is not, it pressed on for 3 s at 0.05 rad/s."""
+    servo = Servo(output(), sag)
+    servo.run(3.0)
+    servo.run(0.5, 0.4)
+    for _ in range(round(blocked_s / PERIOD)):
+        order = servo.output.step(np.array([0.4]), np.array([servo.position]), *LIMITS)
+    assert float(order[0]) - servo.position >= 0.099 + sag
+    for _ in range(orders):
+        order = servo.output.step(np.array([then]), np.array([servo.position]), *LIMITS)
+    assert float(order[0]) - servo.position == pytest.approx(sag, abs=2e-3)
+    start = servo.position
+    servo.run(2.0, -0.1)
+    servo.run(1.0)
+    assert servo.position - start == pytest.approx(-0.2, abs=0.004)
+
+
+def test_a_joint_whose_load_is_not_known_yet_is_not_let_go():
+    servo = Servo(output(lead=0.03), np.radians(2.5))
+    servo.run(0.1)
+    servo.run(0.1, 0.4)
+    stands_off = servo.order - servo.position
+    servo.run(PERIOD, -0.05)
+    assert servo.order - servo.position == pytest.approx(stands_off, abs=2e-3)
+
+
 def test_orders_end_at_a_limit_and_lead_back_from_beyond_it():
     servo = Servo(output())
     low, high = np.array([-3.0]), np.array([0.1])

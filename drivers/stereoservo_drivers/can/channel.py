@@ -26,6 +26,24 @@ SEND_TIMEOUT_S = 0.05
 BATCH = 512
 """Most frames that one ``receive`` gives: a babbling node must not hold the caller for ever."""
 _KEPT_ERRORS = 256
+NEEDS = {
+    "canalystii": "the package canalystii (`pip install canalystii`)",
+    "cantact": "the package cantact (`pip install cantact`)",
+    "etas": "ETAS's BOA library, which is for Windows",
+    "gs_usb": "the packages gs-usb and pyusb (`pip install 'python-can[gs_usb]'`) and libusb; on Linux, take socketcan",
+    "iscan": "Thorsis's library iscandrv",
+    "ixxat": "HMS's VCI driver, which is for Windows",
+    "kvaser": "Kvaser's CANlib (libcanlib.so of the package linuxcan); on Linux, socketcan does without",
+    "neousys": "Neousys's library wdt_dio",
+    "neovi": "the packages python-ics and filelock (`pip install 'python-can[neovi]'`)",
+    "nican": "National Instruments' NI-CAN driver, which is for Windows",
+    "nixnet": "the package nixnet (`pip install 'python-can[nixnet]'`) and NI-XNET, which is for Windows",
+    "pcan": "PEAK's PCAN-Basic library (libpcanbasic.so of the package pcanbasic); on Linux, socketcan does without",
+    "systec": "SYS TEC's USB-CANmodul library, which is for Windows",
+    "usb2can": "the package pywin32 and 8devices' usb2can library, which are for Windows",
+    "vector": "Vector's XL Driver Library, which is for Windows",
+}
+"""Interface of python-can -> what it needs beside python-can."""
 _FULL = (errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT)
 
 
@@ -204,6 +222,8 @@ class Channel:
             remedy = "That is no serial port; they are listed by `ls -l /dev/serial/by-id`"
         elif isinstance(error.__cause__ or error, socket.gaierror):
             remedy = "No such host: check the name, or give its address"
+        elif number is None and self._options.interface in NEEDS and not isinstance(error, TypeError):
+            remedy = f"It needs {NEEDS[self._options.interface]}: is it installed?"
         elif isinstance(error, TypeError):
             remedy = (
                 f"Check `interface_options` ({', '.join(self._options.interface_options) or 'none given'}) against "

@@ -239,21 +239,22 @@ class Cia402Codec:
             np.array([joint.max_velocity for joint in joints]),
             self._period_s,
         )
-        self.arrange(options.feedback)
+        self.arrange([options.feedback] * len(self.axes))
 
-    def arrange(self, feedback: tuple[str, ...]) -> None:
-        """Expect ``feedback`` beside status words and positions, from all drives."""
+    def arrange(self, feedback: list[tuple[str, ...]]) -> None:
+        """Expect ``feedback`` of each drive beside its status word and position; but for switches all send the same."""
         count = len(self.axes)
         self.feedback = Feedback(
             positions=np.full(count, np.nan),
             velocities=np.full(count, np.nan),
-            efforts=np.full(count, np.nan) if "effort" in feedback else None,
-            following_errors=np.full(count, np.nan) if "following_error" in feedback else None,
+            efforts=np.full(count, np.nan) if "effort" in feedback[0] else None,
+            following_errors=np.full(count, np.nan) if "following_error" in feedback[0] else None,
         )
         self._takers: dict[int, Callable[[bytes], int]] = {}
         bits: list[tuple[int, str]] = []
-        for axis in self.axes:
-            self._register(axis, tpdo_feedback(feedback), bits)
+        for axis, sent in zip(self.axes, feedback, strict=True):
+            axis.switches = None
+            self._register(axis, tpdo_feedback(sent), bits)
         self.expected = (1 << len(bits)) - 1
         self.bit_axis = tuple(index for index, _ in bits)
         self.bit_name = tuple(name for _, name in bits)

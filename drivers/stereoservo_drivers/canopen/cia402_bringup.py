@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,15 @@ from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     ABORT_OPTION,
+    INTERPOLATION_EXPONENT,
+    INTERPOLATION_TIME,
     MODES,
     PDO_OFF,
     Capabilities,
     Setup,
     Write,
+    available_feedback,
     capabilities,
-    common_feedback,
     compose,
     eds_path,
     identifier_writes,
@@ -43,6 +46,7 @@ from stereoservo_drivers.canopen.cia402_presence import (
     unbroken,
 )
 from stereoservo_drivers.canopen.cia402_words import (
+    ABORT_READ_ONLY,
     FAULTY,
     OUT_OF_RANGE,
     ControlWord,
@@ -78,15 +82,12 @@ LOOK_S = 0.02
 
 
 class Cia402Bringup:
-    """Bring-up of the drives of one bus. ``identities``, ``setups``: by node id, once connected; ``feedback``: what all
-    drives send beside status word and position.
-    """
+    """Bring-up of the drives of one bus. ``identities``, ``setups``: by node id, once connected."""
 
     def __init__(self, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> None:
         self.codec = codec
         self.identities: dict[int, Identity] = {}
         self.setups: dict[int, Setup] = {}
-        self.feedback: tuple[str, ...] = options.feedback
         self._options = options
         self._eds = eds_path(options, cell_dir)
         self._dictionary: canopen.ObjectDictionary | None = None
@@ -196,10 +197,10 @@ class Cia402Bringup:
             found.append(capabilities(drive))
             self.setups[drive.node_id] = compose(drive, self._options, found[-1])
         check_load(self._options, sum("guarding" in setup.watches for setup in self.setups.values()))
-        self.feedback = common_feedback(self._options, found)
-        self.codec.arrange(self.feedback)
-        for drive in drives:
-            self._configure(link, drive, self.setups[drive.node_id])
+        feedback = available_feedback(self._options, found)
+        self.codec.arrange(feedback)
+        for drive, sent in zip(drives, feedback, strict=True):
+            self._configure(link, drive, sent)
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
         """Bring a drive that was left enabled to rest and switch it off. A fault stays as it is."""
@@ -217,27 +218,52 @@ class Cia402Bringup:
                 node_id=drive.node_id,
             )
 
-    def _configure(self, link: Link, drive: RemoteDrive, setup: Setup) -> None:
+    def _configure(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> None:
         """Write the whole configuration, then read it back. Raises DriverError (``read_back``)."""
-        options, joint = self._options, drive.axis.joint
+        options, joint, setup = self._options, drive.axis.joint, self.setups[drive.node_id]
         parameters = [write for write in parameter_writes(options, joint, setup) if not _fixed(drive, write)]
         identifiers = [write for write in identifier_writes(drive.node_id) if self._differs(drive, write)]
-        unused = unused_pdos(self.feedback, drive.dictionary)
+        unused = unused_pdos(feedback, drive.dictionary)
         off = [write for index in unused for write in self._off(drive, index)]
         # Without guarding from before: a life time that runs out now would make a fault.
         first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
         for write in (*first, *identifiers, *off, *parameters):
             drive.write(write.index, write.subindex, write.value, write.option)
         mode = self._choose_mode(link, drive, setup)
-        period = period_writes(options, joint, setup, mode)
-        pdos = pdo_writes(options, drive.node_id, setup, mode, self.feedback)
-        for write in (*period, *pdos):
+        period = self._write_period(drive, mode)
+        pdos = pdo_writes(options, drive.node_id, setup, mode, feedback)
+        for write in pdos:
             drive.write(write.index, write.subindex, write.value, write.option)
         for write in {
             write.key: write for write in (*identifiers, *off, *parameters, *period, *pdos)
         }.values():
             self._compare(drive, write)
         self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
+
+    def _write_period(self, drive: RemoteDrive, mode: CommandMode) -> list[Write]:
+        """Write the period of set-points; returns what was written.
+
+        A drive that is led by velocities may keep another one, which is told as a loss. Raises DriverError where
+        positions are interpolated.
+        """
+        setup = self.setups[drive.node_id]
+        writes = period_writes(self._options, drive.axis.joint, setup, mode)
+        try:
+            for write in writes:
+                drive.write(write.index, write.subindex, write.value, write.option)
+        except DriverError as error:
+            if mode != "csv" or error.data.get("abort_code") != ABORT_READ_ONLY:
+                raise
+            value, exponent = (
+                setup.capabilities.values.get(key, 0) for key in (INTERPOLATION_TIME, INTERPOLATION_EXPONENT)
+            )
+            kept = (
+                f"0x60C2 is fixed at {value * 10.0 ** (exponent + 3):g} ms, and a cycle has "
+                f"{1e3 / self._options.rate_hz:g} ms: the drive may ramp between set-points or miss some"
+            )
+            self.setups[drive.node_id] = replace(setup, losses=(*setup.losses, kept))
+            return []
+        return writes
 
     def _choose_mode(self, link: Link, drive: RemoteDrive, setup: Setup) -> CommandMode:
         """Set the best mode that the drive takes. Raises DriverError (``read_back``) where it takes none."""

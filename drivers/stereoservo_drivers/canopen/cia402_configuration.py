@@ -7,6 +7,7 @@ and the very modes are optional. An EDS may be wrong or of another firmware, so 
 from __future__ import annotations
 
 import configparser
+import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,9 +56,14 @@ LOSSES = {
     QUICK_STOP_RAMP: "0x6085 is not there: how hard a quick stop brakes is its maker's choice",
 }
 """What is lost with an object that a drive lacks, for people; of the objects by which it stops."""
+NO_SWITCHES = "0x60FD is not there: a limit switch is not told from another limit of the drive"
 NO_WATCH = (
-    "the drive watches nothing of this computer: it has no consumer heartbeat (0x1016:1), no node guarding (0x100C, "
-    "0x100D) and no deadline of commands (0x1400:5, or rpdo_deadline_ms is 0)"
+    "the drive watches nothing of this computer that must stop it: it has no consumer heartbeat (0x1016:1) and no node "
+    "guarding (0x100C, 0x100D)"
+)
+ONLY_DEADLINE = (
+    "; its deadline of commands (0x1400:5) is set, but CiA 301 asks no more of it than that the drive notices, and "
+    "CiA 402 has no object for what it does then"
 )
 
 
@@ -110,17 +116,20 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
     reaction = drive.variable(*FAULT_REACTION)
     if reaction is not None and not reaction.writable and has.values.get(FAULT_REACTION) == 0:
         losses.append("0x605E is fixed at 0: at a fault of its own it lets its axis run out")
+    if "switches" in options.feedback and not has.has((FEEDBACK_INDEX["switches"], 0)):
+        losses.append(NO_SWITCHES)
     watches = _watches(options, has)
-    if not watches:
+    if not set(watches) - {"deadline"}:
+        unwatched = NO_WATCH + ONLY_DEADLINE * bool(watches)
         if "watch" not in joint.accept_missing:
             raise DriverError(
                 "no_watch",
-                f"{drive.name}: {NO_WATCH}. If this computer dies, it goes on with the last command that it got. Cut "
+                f"{drive.name}: {unwatched}. If this computer dies, it goes on with the last command that it got. Cut "
                 'its power by a safety relay, and say that you know: accept_missing = ["watch"] of this joint',
                 node_id=drive.node_id,
                 joint=joint.name,
             )
-        losses.insert(0, f"{NO_WATCH}, as accept_missing acknowledges")
+        losses.insert(0, f"{unwatched}, as accept_missing acknowledges")
     return Setup(has, _modes(drive, options, has), watches, tuple(losses))
 
 
@@ -161,11 +170,13 @@ def usable(mode: CommandMode, has: Capabilities) -> bool:
     return stated and has.has(TARGETS[mode])
 
 
-def common_feedback(options: CanOptions, drives: list[Capabilities]) -> tuple[str, ...]:
-    """Of the feedback asked for, what every drive has."""
-    return tuple(
-        what for what in options.feedback if all(has.has((FEEDBACK_INDEX[what], 0)) for has in drives)
-    )
+def available_feedback(options: CanOptions, drives: list[Capabilities]) -> list[tuple[str, ...]]:
+    """Of the feedback asked for, what each drive is to send: switches where it has them, the rest where all have it."""
+
+    def sends(drive: Capabilities, what: str) -> bool:
+        return all(has.has((FEEDBACK_INDEX[what], 0)) for has in ([drive] if what == "switches" else drives))
+
+    return [tuple(what for what in options.feedback if sends(drive, what)) for drive in drives]
 
 
 def interpolation_time(rate_hz: float) -> tuple[int, int]:
@@ -177,6 +188,12 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
         if 1 <= round(period_s * 10.0**-exponent) <= 255
     ]
     return min(candidates, key=lambda pair: abs(pair[0] * 10.0 ** pair[1] - period_s))
+
+
+def periods_agree(options: CanOptions, value: int, exponent: int) -> bool:
+    """Whether a period of set-points as 0x60C2 has it is that of the cycle, within what 0x60C2 can tell."""
+    due = interpolation_time(options.rate_hz)
+    return math.isclose(value * 10.0**exponent, due[0] * 10.0 ** due[1], rel_tol=1e-9)
 
 
 def lead_words(joint: CanJoint) -> str:
@@ -281,10 +298,13 @@ def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list
 def period_writes(options: CanOptions, joint: CanJoint, setup: Setup, mode: CommandMode) -> list[Write]:
     """Writes of the period of set-points in the modes that interpolate, where the drive can be told."""
     told = {parse_object(name, joint.name) for name in joint.sdo}
-    if mode == "pv" or not setup.capabilities.has(INTERPOLATION_TIME) or INTERPOLATION_TIME in told:
+    has = setup.capabilities.values
+    if mode == "pv" or INTERPOLATION_TIME not in has or INTERPOLATION_TIME in told:
         return []
     value, exponent = interpolation_time(options.rate_hz)
-    held = setup.capabilities.values.get(INTERPOLATION_EXPONENT, exponent)
+    held = has.get(INTERPOLATION_EXPONENT, exponent)
+    if periods_agree(options, has[INTERPOLATION_TIME], held):
+        return []
     if held == exponent:
         return [Write(*INTERPOLATION_TIME, value, option="rate_hz")]
     return [

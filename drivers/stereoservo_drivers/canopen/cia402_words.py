@@ -246,6 +246,7 @@ def is_communication_error(code: int) -> bool:
     return code >> 8 in (0x81, 0x82) or code == 0x8700
 
 
+ABORT_READ_ONLY = 0x06010002
 ABORT_NO_OBJECT = 0x06020000
 ABORT_NO_SUBINDEX = 0x06090011
 OUT_OF_RANGE = (0x06090030, 0x06090031, 0x06090032)
@@ -265,7 +266,7 @@ ABORT_CODES: dict[int, tuple[str, str]] = {
     0x05040005: ("out of memory", "power the drive off and on"),
     0x06010000: ("unsupported access to an object", _FIT),
     0x06010001: ("read of a write-only object", _FIT),
-    0x06010002: ("write to a read-only object", _FIT),
+    ABORT_READ_ONLY: ("write to a read-only object", _FIT),
     0x06020000: ("object does not exist", _FIT),
     0x06040041: ("object cannot be mapped", "choose other [feedback], or does the EDS fit this drive?"),
     0x06040042: ("mapped objects exceed the PDO's length", "the drive takes fewer bytes in a PDO"),

@@ -62,7 +62,7 @@ class CanJointDriver:
         self._context = context
         self._life = DriverLifecycle(f"joint driver {DRIVER!r}")
         self._codec = make_codec(self.options)
-        self._bringup = make_bringup(self.options, self._codec, context.cell_dir)
+        self.bringup = make_bringup(self.options, self._codec, context.cell_dir)
         self.master = Master(self._codec, MasterSettings.of(self.options))
         self.bus: BusThread | None = None
         self._reported_fault: MasterFault | None = None
@@ -111,7 +111,7 @@ class CanJointDriver:
         self._release()
         self.bus = BusThread(Channel(self.options), self.master)
         try:
-            self._bringup.connect(self.bus)
+            self.bringup.connect(self.bus)
             self._begin_cycle(self.bus)
         except BaseException as error:  # nothing else would stop a thread that keeps sending heartbeats
             self._release()
@@ -146,7 +146,7 @@ class CanJointDriver:
         self._await_rest()
         self.bus.end_cycle()
         try:
-            self._bringup.reset(self.bus)
+            self.bringup.reset(self.bus)
         except DriverError as error:
             if self.bus.alive:
                 self.bus.begin_cycle()
@@ -223,7 +223,7 @@ class CanJointDriver:
             self._wait(lambda: self.master.stands() is True, self.master.stop_limit_s)
             try:
                 bus.end_cycle()
-                self._bringup.release(bus)
+                self.bringup.release(bus)
             except DriverError as error:
                 self.master.latch(MasterFault(error.code, str(error)))
         self._release()

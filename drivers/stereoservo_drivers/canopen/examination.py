@@ -18,6 +18,7 @@ from stereoservo_drivers.canopen.bringup import listening
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
 from stereoservo_drivers.canopen.node_checks import examine_nodes
+from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.unit_checks import (
@@ -125,6 +126,8 @@ def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[ExaminationFindi
     yield ExaminationFinding(
         "configuration", True, "every drive took its settings, and gave them back as written"
     )
+    if isinstance(driver.bringup, OdriveBringup):
+        yield from odrive_findings(driver.bringup)
     positions = yield from _watch(driver)
     fault = driver.master.fault
     if fault is not None:
@@ -138,6 +141,16 @@ def _run(driver: CanJointDriver, may_move: MayMove) -> Iterator[ExaminationFindi
         usable.append(place.ok is True)
     if fault is None:
         yield from _jog_all(driver, usable, may_move)
+
+
+def odrive_findings(bringup: OdriveBringup) -> Iterator[ExaminationFinding]:
+    """Findings on what is known of each axis's watchdog, limit and ramp."""
+    for axis in bringup.codec.axes:
+        well, told = bringup.safety[axis.node_id]
+        remedy = (
+            "" if well else "name flat_endpoints.json of its release in endpoints; or pull the cable once"
+        )
+        yield ExaminationFinding(f"{axis.name} settings", True if well else None, told, remedy)
 
 
 def _watch(driver: CanJointDriver) -> Iterator[ExaminationFinding]:

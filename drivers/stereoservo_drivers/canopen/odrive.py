@@ -24,7 +24,15 @@ from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale
 
-VERSION, HEARTBEAT, GET_ERROR, ADDRESS, SET_AXIS_STATE = 0x00, 0x01, 0x03, 0x06, 0x07
+VERSION, HEARTBEAT, GET_ERROR, RX_SDO, TX_SDO, ADDRESS, SET_AXIS_STATE = (
+    0x00,
+    0x01,
+    0x03,
+    0x04,
+    0x05,
+    0x06,
+    0x07,
+)
 GET_ENCODER_ESTIMATES, SET_CONTROLLER_MODE, SET_INPUT_VEL = 0x09, 0x0B, 0x0D
 SET_LIMITS, CLEAR_ERRORS, GET_TORQUES = 0x0F, 0x18, 0x1C
 IDLE, CLOSED_LOOP_CONTROL = 1, 8
@@ -124,7 +132,7 @@ def check_options(options: CanOptions) -> None:
             _refuse(joint, "sdo", dict(joint.sdo), "left out")
 
 
-class _Axis:
+class Axis:
     """Last known state of one axis, in turns."""
 
     def __init__(self, index: int, joint: CanJoint, rate_hz: float) -> None:
@@ -161,7 +169,7 @@ class OdriveCodec:
 
     def __init__(self, options: CanOptions) -> None:
         check_options(options)
-        self.axes = tuple(_Axis(k, joint, options.rate_hz) for k, joint in enumerate(options.joint))
+        self.axes = tuple(Axis(k, joint, options.rate_hz) for k, joint in enumerate(options.joint))
         count = len(self.axes)
         self._efforts = np.full(count, np.nan) if "effort" in options.feedback else None
         self.feedback = Feedback(np.full(count, np.nan), np.full(count, np.nan), self._efforts)
@@ -207,10 +215,10 @@ class OdriveCodec:
             return NOT_CYCLIC
         return take(axis, frame.data)
 
-    def _event(self, axis: _Axis, code: str, message: str, value: int | None = None) -> None:
+    def _event(self, axis: Axis, code: str, message: str, value: int | None = None) -> None:
         self._events.append(AxisFault(axis.index, code, f"{axis.name}: {message}", value))
 
-    def _take_estimates(self, axis: _Axis, data: bytes) -> int:
+    def _take_estimates(self, axis: Axis, data: bytes) -> int:
         position, velocity = _F32X2.unpack(data)
         if not (math.isfinite(position) and math.isfinite(velocity)):
             self._event(axis, "feedback", f"encoder estimates {position} turns, {velocity} turns/s")
@@ -219,16 +227,16 @@ class OdriveCodec:
         self.feedback.velocities[axis.index] = velocity / axis.turns_per_unit
         return axis.index
 
-    def _take_heartbeat(self, axis: _Axis, data: bytes) -> int:
+    def _take_heartbeat(self, axis: Axis, data: bytes) -> int:
         axis.errors, axis.state = _STATE.unpack_from(data)
         return NOT_CYCLIC
 
-    def _take_errors(self, axis: _Axis, data: bytes) -> int:
+    def _take_errors(self, axis: Axis, data: bytes) -> int:
         active, disarm_reason = _U32X2.unpack(data)
         axis.errors = active | disarm_reason
         return NOT_CYCLIC
 
-    def _take_torques(self, axis: _Axis, data: bytes) -> int:
+    def _take_torques(self, axis: Axis, data: bytes) -> int:
         """Torques [N m] at the motor, converted to the joint [N m], or [N] of a prismatic one, by the gear without
         losses.
         """
@@ -244,7 +252,7 @@ class OdriveCodec:
         events, self._events = self._events, []
         return (*events, *(self._drive_fault(axis) for axis in self.axes if axis.errors))
 
-    def _drive_fault(self, axis: _Axis) -> AxisFault:
+    def _drive_fault(self, axis: Axis) -> AxisFault:
         return AxisFault(
             axis.index,
             "drive_fault",

@@ -1,9 +1,10 @@
 """Bring-up of ODrives over CANSimple: presence, unique node ids, velocity control, and reset of errors on request.
 
-What CANSimple cannot do: the axis watchdog (``axis0.config.enable_watchdog``, ``watchdog_timeout``), which disarms an
-axis when velocities cease, and the rates of cyclic messages are configured over USB. The watchdog is all that stops
-a joint when this host or the cable dies, and its setting cannot be read here: pull the cable once, arm at low
-speed, before you trust it. Nor can limits and the controller's mode be read back.
+The axis watchdog (``axis0.config.enable_watchdog``, ``watchdog_timeout``), which disarms an axis when velocities cease,
+and the rates of cyclic messages are configured over USB. The watchdog is all that stops a joint when this host or the
+cable dies. It, the limit of the velocity and the controller's mode are read back by RxSdo and TxSdo where the cell file
+has the endpoints of the drive's release (``flat_endpoints.json``), whose numbers change with every release; else they
+are unknown, and told so: pull the cable once, arm at low speed, before you trust them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
+
+from stereoservo.messages.decoding import decoding
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen import odrive
@@ -29,6 +33,16 @@ QUIET_S = 0.05
 PROTOCOL_VERSION = 2
 ALL_NODES = tuple(range(63))
 
+WATCHDOG, WATCHDOG_S = "axis0.config.enable_watchdog", "axis0.config.watchdog_timeout"
+SPEED, RAMP = "axis0.controller.config.vel_limit", "axis0.controller.config.vel_ramp_rate"
+CONTROL_MODE, INPUT_MODE = "axis0.controller.config.control_mode", "axis0.controller.config.input_mode"
+CHECKED = (WATCHDOG, WATCHDOG_S, SPEED, RAMP, CONTROL_MODE, INPUT_MODE)
+TYPES = {
+    "bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "float": "f",
+}  # fmt: skip
+LEAST_CYCLES = 2.0
+"""Velocities that may be missing before the watchdog disarms: a shorter one trips by a single late cycle."""
+
 Heard = dict[int, list[CanFrame]]
 """Data frames by node id."""
 
@@ -39,12 +53,54 @@ def _listening(link: Link, nodes: tuple[int, ...], command: int) -> Iterator[Hea
         yield {node: received[frame_id(node, command)] for node in nodes}
 
 
+class DriveProperty(msgspec.Struct, frozen=True):
+    """A property of a release: its number on the wire and its type."""
+
+    id: int = 0
+    type: str = ""
+
+
+class Release(msgspec.Struct, frozen=True):
+    """``flat_endpoints.json``: properties of one firmware for one hardware, by path."""
+
+    fw_version: str
+    hw_version: str
+    endpoints: dict[str, DriveProperty]
+
+
+def load_release(path: Path) -> Release:
+    """Read a ``flat_endpoints.json``. Raises DriverError (``endpoints``)."""
+    with decoding(lambda cause: DriverError("endpoints", f"endpoints: {path} {cause}", path=str(path))):
+        release = msgspec.json.decode(path.read_bytes(), type=Release)
+    unfit = [name for name in CHECKED if _layout(release, name) is None]
+    if unfit:
+        raise DriverError(
+            "endpoints",
+            f"endpoints: {path} has no {', '.join(unfit)}, or not as a number; take flat_endpoints.json of the release",
+            path=str(path),
+        )
+    return release
+
+
+def _layout(release: Release, name: str) -> tuple[int, struct.Struct] | None:
+    endpoint = release.endpoints.get(name)
+    if endpoint is None or endpoint.type not in TYPES or not 0 < endpoint.id <= 0xFFFF:
+        return None
+    return endpoint.id, struct.Struct("<BHB" + TYPES[endpoint.type])
+
+
 class OdriveBringup:
-    """Bring-up of the axes of one bus. ``firmware``: version by node id, once connected."""
+    """Bring-up of the axes of one bus. ``firmware``, ``safety``: by node id, once connected: version, and what is known
+    of the watchdog, limit and ramp, as text with whether all of it is.
+    """
 
     def __init__(self, options: CanOptions, codec: OdriveCodec, cell_dir: Path) -> None:
         self.codec = codec
         self.firmware: dict[int, str] = {}
+        self.safety: dict[int, tuple[bool, str]] = {}
+        self._options = options
+        self._hardware: dict[int, str] = {}
+        self._releases = [load_release(cell_dir / name) for name in options.endpoints]
         self._axes = {axis.node_id: axis for axis in codec.axes}
         self._nodes = tuple(self._axes)
 
@@ -53,7 +109,7 @@ class OdriveBringup:
 
         Errors of drives are not cleared: the codec reports them. Raises DriverError: ``node_missing``, ``no_answer``,
         ``duplicate_node``, ``identity``, ``version``, ``cyclic_messages``, ``no_feedback``, ``not_idle``,
-        ``second_master``.
+        ``second_master``, ``no_watch``, ``watchdog``, ``limit``, ``mode``.
         """
         self._check_alone(link)
         # Whom a master that died has left moving: before anything that can fail, and long before the idle state.
@@ -63,6 +119,7 @@ class OdriveBringup:
         self._check_versions(link)
         self._check_estimates(link)
         self._set_up(link)
+        self._check_settings(link)
         self._await_idle(link)
 
     def reset(self, link: Link) -> None:
@@ -72,6 +129,7 @@ class OdriveBringup:
         """
         self._await_heartbeats(link)
         self._set_up(link)
+        self._check_settings(link)
         link.send([CanFrame(frame_id(node, odrive.CLEAR_ERRORS), bytes(8)) for node in self._nodes])
         link.wait(STEP_S)
         for node, answers in self._ask(link, odrive.GET_ERROR).items():
@@ -171,6 +229,7 @@ class OdriveBringup:
                     node_id=node,
                 )
             self.firmware[node] = ".".join(str(number) for number in data[4:7])
+            self._hardware[node] = ".".join(str(number) for number in data[1:4])
 
     def _check_estimates(self, link: Link) -> None:
         """Check that an estimate comes only on request (in the cycle others would look like a second drive's)."""
@@ -204,6 +263,38 @@ class OdriveBringup:
                 limits = struct.pack("<ff", axis.velocity_max, axis.joint.current_limit)
                 link.send([CanFrame(frame_id(node, odrive.SET_LIMITS), limits)])
 
+    def _check_settings(self, link: Link) -> None:
+        """Read back what keeps each axis safe, where its release is known. Raises DriverError where it does not."""
+        for node, axis in self._axes.items():
+            firmware, hardware = self.firmware[node], self._hardware[node]
+            known = [r for r in self._releases if (r.fw_version, r.hw_version) == (firmware, hardware)]
+            told = (
+                f"watchdog, velocity limit and ramp are unknown (firmware {firmware}, hardware {hardware}): "
+            )
+            if not known:
+                told += "endpoints lists no flat_endpoints.json of this release"
+                self.safety[node] = (False, told)
+                continue
+            values = {name: self._read(link, node, known[0], name) for name in CHECKED}
+            silent = [name for name, value in values.items() if value is None]
+            if silent:
+                self.safety[node] = (False, f"{told}no answer on {', '.join(silent)}")
+                continue
+            found = {name: value for name, value in values.items() if value is not None}
+            self.safety[node] = check_settings(axis, found, self._options)
+
+    def _read(self, link: Link, node: int, release: Release, name: str) -> float | None:
+        """One property by RxSdo; None where no answer comes."""
+        layout = _layout(release, name)
+        assert layout is not None  # as load_release has checked
+        number, answer = layout
+        with _listening(link, (node,), odrive.TX_SDO) as received:
+            request = struct.pack("<BHBI", 0, number, 0, 0)
+            link.send([CanFrame(frame_id(node, odrive.RX_SDO), request)])
+            until(link, lambda: bool(_answers(received[node], number, answer)), ANSWER_WAIT_S, STEP_S)
+            answers = _answers(received[node], number, answer)
+        return answers[-1] if answers else None
+
     def _await_idle(self, link: Link) -> None:
         """Wait for a new heartbeat of every axis that reports idle."""
 
@@ -227,6 +318,60 @@ class OdriveBringup:
                 f"after {HEARTBEAT_WAIT_S} s not all axes say that they are idle: {words}",
                 retry=True,
             )
+
+
+def _answers(frames: list[CanFrame], number: int, answer: struct.Struct) -> list[float]:
+    unpacked = [answer.unpack_from(frame.data) for frame in frames if len(frame.data) >= answer.size]
+    return [float(value) for _, endpoint, _, value in unpacked if endpoint == number]
+
+
+def check_settings(axis: odrive.Axis, values: dict[str, float], options: CanOptions) -> tuple[bool, str]:
+    """Judge what an axis has set; returns whether all is well, and what is set, as text.
+
+    Raises DriverError: ``no_watch``, ``watchdog`` (shorter than the cycle or longer than ``heartbeat_timeout_ms``),
+    ``limit`` (below the joint's largest velocity), ``mode`` (not the one that was set).
+    """
+    data = {"node_id": axis.node_id, "joint": axis.joint.name}
+    on, timeout_s = bool(values[WATCHDOG]), values[WATCHDOG_S]
+    if not (on and timeout_s > 0.0) and "watch" not in axis.joint.accept_missing:
+        raise DriverError(
+            "no_watch",
+            f"{axis.name}: its watchdog is off ({WATCHDOG} = {on}, {WATCHDOG_S} = {timeout_s:g} s): if this computer "
+            "dies, it goes on with the last velocity. Set both over USB and save, or say that a safety relay cuts its "
+            'power: accept_missing = ["watch"] of this joint',
+            **data,
+        )
+    least, most = LEAST_CYCLES / options.rate_hz, options.heartbeat_timeout_ms * 1e-3
+    if on and timeout_s > 0.0 and not least <= timeout_s <= most * (1.0 + 1e-6):
+        raise DriverError(
+            "watchdog",
+            f"{axis.name}: {WATCHDOG_S} = {timeout_s:g} s; valid: {least:g} s, {LEAST_CYCLES:g} cycles at rate_hz, to "
+            f"{most:g} s, heartbeat_timeout_ms. Set it over USB",
+            value=timeout_s,
+            **data,
+        )
+    speed, scale = values[SPEED], abs(axis.turns_per_unit)
+    if speed < axis.velocity_max * (1.0 - 1e-5):
+        raise DriverError(
+            "limit",
+            f"{axis.name}: {SPEED} = {speed:g} turns/s, {speed / scale:.3g} rad/s or m/s at the joint, is below "
+            f"max_velocity {axis.joint.max_velocity:g}; lower max_velocity, or set current_limit here: "
+            "the driver then sets both",
+            value=speed,
+            **data,
+        )
+    modes = int(values[CONTROL_MODE]), int(values[INPUT_MODE])
+    if modes != (odrive.VELOCITY_CONTROL, odrive.PASSTHROUGH):
+        raise DriverError(
+            "mode",
+            f"{axis.name}: control mode and input mode read {modes}, set were "
+            f"{(odrive.VELOCITY_CONTROL, odrive.PASSTHROUGH)} (velocity, passthrough)",
+            **data,
+        )
+    watchdog = f"watchdog {timeout_s:g} s" if on else "no watchdog, as accept_missing acknowledges"
+    told = f"{watchdog}; velocity limit {speed:g} turns/s, {speed / scale:.3g} rad/s or m/s at the joint; ramps are "
+    told += f"this driver's (its own, {values[RAMP]:g} turns/s², is not used in passthrough)"
+    return on, told
 
 
 def _duplicate(node: int, told: str) -> DriverError:

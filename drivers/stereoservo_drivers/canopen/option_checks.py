@@ -37,6 +37,7 @@ def check_options(options: CanOptions) -> None:
     if not options.joint:
         raise _refusal("joint", "[]", "at least one [[joints.options.joint]] with its name and node_id")
     _check_bus(options)
+    _check_protocol(options)
     _check_unique(options, "node_id", lambda joint: joint.node_id)
     _check_unique(options, "name", lambda joint: joint.name)
     for joint in options.joint:
@@ -81,6 +82,11 @@ def _check_bus(options: CanOptions) -> None:
     for code in options.emcy_ignore:
         if not 1 <= code <= 0xFFFF:
             raise _refusal("emcy_ignore", f"{code:#x}", "codes of 16 bits, 0x1 to 0xffff, e.g. 0x4210")
+
+
+def _check_protocol(options: CanOptions) -> None:
+    if options.endpoints and options.protocol != "odrive":
+        raise _refusal("endpoints", list(options.endpoints), "left out: they are an ODrive's")
 
 
 def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:

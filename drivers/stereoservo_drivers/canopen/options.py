@@ -93,6 +93,8 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     ``mode``: cyclic or profile velocity, cyclic or interpolated position; ``auto`` takes for each drive the first of
     them that it has. ``rpdo_deadline_ms``: where the drives have such a timer; 0 leaves it off. ``emcy_ignore``:
     emergency codes that do not trip.
+    ``endpoints``: of protocol ``odrive``, ``flat_endpoints.json`` of the releases that the drives run, beside the cell
+    file.
     ``command_timeout_s``: without a command for so long the joints are brought to rest (they stay enabled);
     ``loop_timeout_ms``: without any call for so long, while enabled, the driver latches a fault.
     """
@@ -114,6 +116,7 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     abort_option: Literal[1, 2, 3] = 3
     emcy_ignore: tuple[int, ...] = ()
     eds: str = ""
+    endpoints: tuple[str, ...] = ()
     feedback: tuple[Feedback, ...] = ("velocity", "effort")
     command_timeout_s: Positive = 0.1
     loop_timeout_ms: Annotated[int, Meta(ge=20, le=5000)] = 100

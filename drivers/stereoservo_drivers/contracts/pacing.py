@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,48 +9,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.ports.clock import MonotonicClock, VirtualClock
 from stereoservo.ports.devices import DriverContext
+from stereoservo_drivers.kit.bench import Paced, call_times_us
 
 
-class PacedSuite:
+class PacedSuite(Paced):
     """Common base of the contract tests. Override :attr:`real_time` and :meth:`make_context` where a device needs
     it.
     """
-
-    real_time = False
-    """True: the device lives in real time (hardware, another process). False: it follows the context's
-    clock.
-    """
-
-    def make_context(self, tmp_path: Path) -> DriverContext:
-        """The context given to the driver."""
-        clock = MonotonicClock() if self.real_time else VirtualClock()
-        return DriverContext(clock=clock, cell="contract", runtime_dir=tmp_path, cell_dir=tmp_path, seed=1)
 
     @pytest.fixture
     def context(self, tmp_path: Path) -> DriverContext:
         """A context of its own for each test."""
         return self.make_context(tmp_path)
 
-    def wait(self, context: DriverContext, seconds: float) -> None:
-        """Let ``seconds`` pass on the driver's clock."""
-        if isinstance(context.clock, VirtualClock):
-            context.clock.advance_to(context.clock.now_ns() + round(seconds * 1e9))
-        else:
-            time.sleep(seconds)
-
 
 def measure(
     calls: int, call: Callable[[], Any], before: Callable[[], Any] = lambda: None
 ) -> dict[str, float]:
     """Median, 99th percentile and maximum [us] of ``calls`` calls, each after an untimed ``before``."""
-    times = np.empty(calls)
-    for i in range(calls):
-        before()
-        start = time.perf_counter_ns()
-        call()
-        times[i] = (time.perf_counter_ns() - start) * 1e-3
+    times = call_times_us(calls, call, before)
     median, p99 = np.percentile(times, [50, 99])
     return {"median_us": float(median), "p99_us": float(p99), "max_us": float(times.max())}
 

@@ -323,6 +323,20 @@ def test_what_is_no_adapter_is_told_as_such(interface, channel, cure):
     assert cure in str(refused(ChannelSettings(interface, channel)))
 
 
+@pytest.mark.parametrize(
+    ("interface", "channel", "needed"),
+    [
+        ("pcan", "PCAN_USBBUS1", "PCAN-Basic library (libpcanbasic.so"),
+        ("kvaser", 0, "libcanlib.so"),
+        ("canalystii", 0, "pip install canalystii"),
+        ("gs_usb", 0, "python-can[gs_usb]"),
+    ],
+)
+def test_an_interface_without_its_package_says_which_it_needs(interface, channel, needed):
+    """As python-can of this computer raises it, if it has no such adapter."""
+    assert needed in str(refused(ChannelSettings(interface, channel)))
+
+
 def test_whatever_the_interface_of_another_raises_is_told(monkeypatch):
     def broken(**_: object) -> None:
         raise NameError("name 'canGetNumberOfChannels' is not defined")
@@ -330,7 +344,7 @@ def test_whatever_the_interface_of_another_raises_is_told(monkeypatch):
     monkeypatch.setattr(can, "Bus", broken)
     error = refused(ChannelSettings("kvaser", 0))
     assert "canGetNumberOfChannels" in str(error)
-    assert "not installed" in str(error)
+    assert "libcanlib" in str(error)
 
 
 def test_a_host_that_is_not_known(monkeypatch):

@@ -64,8 +64,9 @@ class MakerDrive:
     """
 
     def __init__(
-        self, node_id: int, eds: Path, values: dict[tuple[int, int], int], lacking: tuple[int, ...] = ()
-    ) -> None:
+        self, node_id: int, eds: Path, values: dict[tuple[int, int], int], lacking: tuple[int, ...] = (),
+        fixed: tuple[int, ...] = (),
+    ) -> None:  # fmt: skip
         self.wire = Wire()
         self.node = canopen.LocalNode(node_id, canopen.import_od(str(eds), node_id))
         self.node_id = node_id
@@ -82,6 +83,9 @@ class MakerDrive:
                     variable.default = 0
         for (index, subindex), value in values.items():
             self.put(index, subindex, value)
+        for index in fixed:
+            for variable in dictionary[index].values():
+                variable.access_type = "ro"
         self.node.associate_network(self.wire)
         self.node.add_read_callback(self._live)
         self.node.nmt.send_command(0)

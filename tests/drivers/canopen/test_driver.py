@@ -274,7 +274,7 @@ def test_a_bring_up_that_fails_with_a_defect_leaves_no_pump_behind(
         raise KeyError("a defect")
 
     with monkeypatch.context() as patch:
-        patch.setattr(arm.driver._bringup, "connect", broken)
+        patch.setattr(arm.driver.bringup, "connect", broken)
         with pytest.raises(KeyError, match="a defect"):
             arm.driver.configure()
     assert arm.driver.bus is None

@@ -58,10 +58,12 @@ class Bench:
 
     def __init__(
         self, path: Path, modes: tuple[int, ...], *, lacking: tuple[int, ...] = (), axis: CanJoint | None = None,
-        **options: object,
+        period: tuple[int, int] | None = None, **options: object,
     ) -> None:  # fmt: skip
         values = {(0x1000, 0): 0x00020192, (0x6502, 0): sum(1 << mode - 1 for mode in modes), (0x6060, 0): 0}
-        self.drive = MakerDrive(5, path, values, lacking)
+        if period is not None:
+            values |= {(0x60C2, 1): period[0], (0x60C2, 2): period[1]}
+        self.drive = MakerDrive(5, path, values, lacking, (0x60C2,) * (period is not None))
         of = self.drive.node.object_dictionary.device_information
         for sub, number in ((1, of.vendor_number), (2, of.product_number)):
             if number:
@@ -135,6 +137,8 @@ def test_a_drive_without_any_watch_is_refused_until_the_cell_file_says_that_it_i
     with pytest.raises(DriverError, match=r"accept_missing = \[\"watch\"\]") as refusal:
         Bench(SHIPPED_EDS, (3, 9), **deaf).run()
     assert refusal.value.code == "no_watch"
+    with pytest.raises(DriverError, match=r"deadline of commands \(0x1400:5\) is set, but CiA 301"):
+        Bench(SHIPPED_EDS, (3, 9), lacking=lacking).run()
     bench = Bench(SHIPPED_EDS, (3, 9), **deaf, axis=joint(accept_missing=("watch",)))
     bench.run()
     assert "acknowledges" in bench.bringup.setups[5].losses[0]
@@ -211,3 +215,34 @@ def test_the_interpolation_period_follows_the_rate(rate_hz, value, exponent):
     bench = Bench(SHIPPED_EDS, (9,), rate_hz=rate_hz)
     bench.run()
     assert (bench.drive.get(0x60C2, 1), bench.drive.get(0x60C2, 2)) == (value, exponent)
+
+
+def test_a_fixed_interpolation_period_is_used_where_it_fits_and_told_where_it_does_not():
+    fits = Bench(SHIPPED_EDS, (9,), period=(40, -4))
+    fits.run()
+    assert fits.bringup.setups[5].losses == ()
+    other = Bench(SHIPPED_EDS, (9,), period=(2, -3))
+    other.run()
+    assert "0x60C2 is fixed at 2 ms, and a cycle has 4 ms" in other.bringup.setups[5].safety()
+    with pytest.raises(DriverError, match=r"0x60C2.*rate_hz"):
+        Bench(SHIPPED_EDS, (8,), period=(2, -3)).run()
+
+
+def test_switches_are_taken_from_the_drives_that_have_them():
+    joints = (joint(), joint(name="wrist", node_id=6))
+    options = CanOptions(interface="virtual", channel="x", joint=joints, feedback=("velocity", "switches"))
+    values = {(0x1000, 0): 0x00020192, (0x6502, 0): 1 << 8}
+    drives = [
+        MakerDrive(5, SHIPPED_EDS, values, (0x60FD,)),
+        MakerDrive(6, SHIPPED_EDS, values | {(0x60FD, 0): 2}),
+    ]
+    codec = Cia402Codec(options)
+    master = Master(codec, MasterSettings.of(options))
+    bringup, bus = Cia402Bringup(options, codec, Path()), MakerBus(drives, master)
+    bringup.connect(bus)
+    bus.begin_cycle()
+    bus.velocities = np.zeros(2)
+    bus.wait(0.1)
+    assert master.fault is None
+    assert [axis.switches for axis in codec.axes] == [None, 2]
+    assert ["0x60FD" in bringup.setups[node].safety() for node in (5, 6)] == [True, False]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from pathlib import Path
@@ -215,6 +216,7 @@ class Drives:
         self.state = 1
         self.stubborn = 0
         self.unasked = False
+        self.properties = {}
 
     def deliver(self, frame):
         for can_id, frames in self.heard:
@@ -228,6 +230,12 @@ class Drives:
             if frame.remote and node in self.nodes:
                 for data in self.table.get(command, []):
                     self.deliver(CanFrame(frame.id, data))
+            elif command == 4 and frame.data[0] == 0 and frame.data[3] == 0:
+                number = frame.data[2] << 8 | frame.data[1]
+                if number in self.properties:
+                    self.deliver(
+                        CanFrame(node * 32 + 5, bytes([0, *frame.data[1:3], 0]) + self.properties[number])
+                    )
             elif command == 7:
                 self.state = frame.data[0]
             elif command == 0x18:
@@ -351,3 +359,92 @@ def test_axes_that_were_left_moving_are_stopped_though_one_is_missing():
     stops = [f for f in link.sent if f.id & 31 == 0x0D]
     assert [(f.id >> 5, struct.unpack("<ff", f.data)) for f in stops] == [(3, (0.0, 0.0)), (4, (0.0, 0.0))]
     assert states_asked(link.sent, 3) == []
+
+
+PROPERTIES = {
+    "axis0.config.enable_watchdog": (300, "bool", b"\x01"),
+    "axis0.config.watchdog_timeout": (301, "float", struct.pack("<f", 0.1)),
+    "axis0.controller.config.vel_limit": (400, "float", struct.pack("<f", 10.0)),
+    "axis0.controller.config.vel_ramp_rate": (401, "float", struct.pack("<f", 3.0)),
+    "axis0.controller.config.control_mode": (402, "uint8", b"\x02"),
+    "axis0.controller.config.input_mode": (403, "uint8", b"\x01"),
+}
+"""Of a release: numbers, types and values of its drive."""
+
+
+def with_endpoints(folder, *, firmware="0.6.10", hardware="4.4.58", axis=None, **changed):
+    """A drive with these properties, and a bring-up that has its release's file."""
+    link = Drives()
+    link.properties = {
+        number: changed.get(path.split(".")[-1], value) for path, (number, _, value) in PROPERTIES.items()
+    }
+    endpoints = {path: {"id": n, "type": kind, "access": "rw"} for path, (n, kind, _) in PROPERTIES.items()}
+    endpoints["save_configuration"] = {"id": 9, "type": "function", "inputs": [], "outputs": []}
+    release = {"fw_version": firmware, "hw_version": hardware, "endpoints": endpoints}
+    (folder / "flat_endpoints.json").write_text(json.dumps(release))
+    chosen = options(axis or joint(), endpoints=("flat_endpoints.json",))
+    return link, OdriveBringup(chosen, OdriveCodec(chosen), folder)
+
+
+def test_watchdog_limit_and_mode_are_read_back_where_the_release_is_known(tmp_path):
+    link, start = with_endpoints(tmp_path)
+    start.connect(link)
+    well, told = start.safety[3]
+    assert well
+    assert "watchdog 0.1 s; velocity limit 10 turns/s, 1.26 rad/s" in told
+    assert not [f for f in link.sent if f.id & 31 == 4 and f.data[0] != 0]  # nothing is written
+
+
+@pytest.mark.parametrize(
+    ("changed", "code", "words"),
+    [
+        ({"enable_watchdog": b"\x00"}, "no_watch", "accept_missing"),
+        ({"watchdog_timeout": struct.pack("<f", 0.0)}, "no_watch", "0 s"),
+        ({"watchdog_timeout": struct.pack("<f", 2.0)}, "watchdog", "heartbeat_timeout_ms"),
+        ({"watchdog_timeout": struct.pack("<f", 0.005)}, "watchdog", "cycles"),
+        ({"watchdog_timeout": struct.pack("<f", math.nan)}, "no_watch", "nan"),
+        ({"vel_limit": struct.pack("<f", 2.0)}, "limit", "0.251 rad/s"),
+        ({"input_mode": b"\x02"}, "mode", r"\(2, 2\)"),
+    ],
+)
+def test_settings_that_do_not_keep_an_axis_safe_are_refused(tmp_path, changed, code, words):
+    link, start = with_endpoints(tmp_path, **changed)
+    with pytest.raises(DriverError, match=words) as refusal:
+        start.connect(link)
+    assert refusal.value.code == code
+    assert not states_asked(link.sent, 3).count(8)
+
+
+def test_an_axis_without_watchdog_is_used_where_the_cell_file_says_that_it_is_known(tmp_path):
+    link, start = with_endpoints(tmp_path, axis=joint(accept_missing=("watch",)), enable_watchdog=b"\x00")
+    start.connect(link)
+    assert start.safety[3][0] is False
+    assert "accept_missing" in start.safety[3][1]
+
+
+@pytest.mark.parametrize("release", [{"firmware": "0.6.9"}, {"hardware": "5.2.0"}])
+def test_settings_of_another_release_are_unknown_and_told_so(tmp_path, release):
+    link, start = with_endpoints(tmp_path, **release)
+    start.connect(link)
+    assert start.safety[3][0] is False
+    assert "unknown (firmware 0.6.10, hardware 4.4.58)" in start.safety[3][1]
+    assert not [f for f in link.sent if f.id & 31 == 4]
+
+
+def test_a_drive_that_does_not_answer_on_its_settings_is_told(tmp_path):
+    link, start = with_endpoints(tmp_path)
+    link.properties = {}
+    start.connect(link)
+    assert start.safety[3][0] is False
+    assert "no answer on axis0.config.enable_watchdog" in start.safety[3][1]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[1]", '{"fw_version": "0.6.10", "hw_version": "4.4.58", "endpoints": {}}']
+)
+def test_a_file_that_is_no_list_of_endpoints_is_refused(tmp_path, text):
+    (tmp_path / "flat.json").write_text(text)
+    chosen = options(endpoints=("flat.json",))
+    with pytest.raises(DriverError, match=r"flat\.json") as refusal:
+        OdriveBringup(chosen, OdriveCodec(chosen), tmp_path)
+    assert refusal.value.code == "endpoints"

@@ -1,0 +1,221 @@
+"""The bench of joint drivers under check: what is known of the device, and calls whose answers are verified."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.clock import MonotonicClock, VirtualClock
+from stereoservo.ports.devices import CommandReport, DriverContext, JointDriver, JointState
+
+FUTURE_NS = 1_000_000
+"""Several reads at one time of a virtual clock may carry growing stamps."""
+
+
+class CheckFailedError(Exception):
+    """A check has failed; the text has what was found and what is required."""
+
+
+class CheckNotRunError(Exception):
+    """A check cannot be run here; the text says why."""
+
+
+class Paced:
+    """Time and context of a device under check."""
+
+    real_time = False
+    """True: the device lives in real time (hardware, another process). False: it follows the context's
+    clock.
+    """
+
+    def make_context(self, folder: Path) -> DriverContext:
+        """The context given to the driver."""
+        clock = MonotonicClock() if self.real_time else VirtualClock()
+        return DriverContext(clock=clock, cell="contract", runtime_dir=folder, cell_dir=folder, seed=1)
+
+    def wait(self, context: DriverContext, seconds: float) -> None:
+        """Let ``seconds`` pass on the driver's clock."""
+        if isinstance(context.clock, VirtualClock):
+            context.clock.advance_to(context.clock.now_ns() + round(seconds * 1e9))
+        else:
+            time.sleep(seconds)
+
+
+class JointDriverSetup(Paced):
+    """What the checks of a joint driver need to know: override :meth:`make_driver`, and what else differs."""
+
+    speed = 0.05
+    """Fraction of each joint's largest velocity at which the checks move the arm."""
+    rest_velocity = 1e-3
+    """Below this [rad/s or m/s] the arm counts as at rest."""
+    brake_s = 1.0
+    """Time in which the arm must come to rest from ``speed``."""
+    enforces_timeout = True
+    """Whether the device stops by itself when commands cease. Every device should; set False only with a
+    reason.
+    """
+    fault_s = 1.0
+    """Time in which a device that has gone must be reported."""
+    whole_range: bool | None = None
+    """Whether joints may be driven to their limits (None: where the device is simulated)."""
+
+    def make_driver(self, context: DriverContext) -> JointDriver:
+        """A new driver, connected to nothing."""
+        raise NotImplementedError("override make_driver(context)")
+
+    def configure(self, driver: JointDriver) -> None:
+        """Configure a driver; more where a device needs it."""
+        driver.configure()
+
+    def unplug(self, driver: JointDriver) -> bool:
+        """Make the device disappear, as if its cable were pulled; returns whether that was done."""
+        return False
+
+    def plug_in(self, driver: JointDriver) -> None:
+        """Undo :meth:`unplug`, once the driver is closed."""
+
+    def device_writes(self, driver: JointDriver) -> int | None:
+        """How many writes the device has received so far; None where nobody counts them."""
+        return None
+
+
+class JointBench:
+    """Drivers under check, whose answers are verified with every call. ``close`` closes them."""
+
+    def __init__(self, setup: JointDriverSetup, context: DriverContext) -> None:
+        self.setup = setup
+        self.context = context
+        self._drivers: list[JointDriver] = []
+        self._last: dict[int, JointState] = {}
+
+    def new(self) -> JointDriver:
+        """A driver that is connected to nothing."""
+        driver = self.setup.make_driver(self.context)
+        self._drivers.append(driver)
+        return driver
+
+    def configured(self) -> JointDriver:
+        """A configured driver."""
+        driver = self.new()
+        self.setup.configure(driver)
+        return driver
+
+    def active(self) -> JointDriver:
+        """An active driver."""
+        driver = self.configured()
+        driver.activate()
+        return driver
+
+    def close(self) -> None:
+        """Close all drivers."""
+        for driver in self._drivers:
+            driver.close()
+        self._drivers.clear()
+
+    def now_ns(self) -> int:
+        """Time of the driver's clock."""
+        return self.context.clock.now_ns()
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        self.setup.wait(self.context, seconds)
+
+    def read(self, driver: JointDriver) -> JointState:
+        """A joint sample. Raises CheckFailedError where it has another shape, is not finite, or goes back in time."""
+        state = driver.read_state()
+        count = len(driver.describe().joints)
+        self._verify_arrays(state, count)
+        ahead_ns = state.t_ns - self.now_ns()
+        require(ahead_ns <= FUTURE_NS, f"a sample is stamped {ahead_ns} ns in the future")
+        before = self._last.get(id(driver))
+        if before is not None:
+            require(
+                state.t_ns >= before.t_ns, f"stamps go back by {before.t_ns - state.t_ns} ns between samples"
+            )
+            require(state.seq >= before.seq, f"sequence numbers go back from {before.seq} to {state.seq}")
+        self._last[id(driver)] = state
+        return state
+
+    @staticmethod
+    def _verify_arrays(state: JointState, count: int) -> None:
+        arrays: dict[str, Any] = {"positions": state.positions, "velocities": state.velocities}
+        arrays |= {
+            name: value
+            for name in ("efforts", "following_errors")
+            if (value := getattr(state, name)) is not None
+        }
+        for name, array in arrays.items():
+            require(
+                isinstance(array, np.ndarray) and array.shape == (count,) and array.dtype == np.float64,
+                f"{name} of a sample are {array!r}; float64 of shape ({count},) are required",
+            )
+            require(bool(np.isfinite(array).all()), f"{name} of a sample are {array.tolist()}, not finite")
+
+    def write(self, driver: JointDriver, velocity: FloatArray) -> CommandReport:
+        """Command velocities (n,). Raises CheckFailedError where the report does not say what was asked."""
+        report = driver.write_velocity(velocity)
+        require(
+            isinstance(report, CommandReport) and np.array_equal(report.asked, velocity),
+            f"write_velocity({velocity.tolist()}) reports {report!r}",
+        )
+        return report
+
+    def slow(self, driver: JointDriver) -> FloatArray:
+        """A small velocity of every joint (n,), away from its nearer limit."""
+        joints = driver.describe().joints
+        positions = self.read(driver).positions
+        middle = np.array([(j.position_min + j.position_max) / 2 for j in joints])
+        signs = np.where(positions <= middle, 1.0, -1.0)
+        return signs * self.setup.speed * np.array([j.velocity_max for j in joints])
+
+    def drive(self, driver: JointDriver, velocity: FloatArray, seconds: float) -> list[JointState]:
+        """Command ``velocity`` (n,) at the driver's rate for ``seconds``; returns the samples."""
+        period = 1.0 / driver.describe().rate_hz
+        states = []
+        for _ in range(max(round(seconds / period), 1)):
+            states.append(self.read(driver))
+            self.write(driver, velocity)
+            self.wait(period)
+        return states
+
+    def settle(self, driver: JointDriver, seconds: float) -> JointState:
+        """Read only, for ``seconds``; returns the last sample."""
+        period = 1.0 / driver.describe().rate_hz
+        for _ in range(max(round(seconds / period), 1)):
+            self.wait(period)
+            state = self.read(driver)
+        return state
+
+    def require_rest(self, driver: JointDriver, after: str) -> None:
+        """Raise CheckFailedError where the arm does not stand."""
+        before = self.read(driver)
+        state = self.settle(driver, 0.1)
+        speed = float(np.abs(state.velocities).max())
+        travel = float(np.abs(state.positions - before.positions).max())
+        steps = max(joint.resolution for joint in driver.describe().joints)
+        require(
+            speed < self.setup.rest_velocity and travel < 1e-4 + steps,
+            f"{after} the arm still moves: {speed:.3g} rad/s or m/s, {travel:.3g} rad or m in 0.1 s",
+        )
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise CheckFailedError unless ``condition``."""
+    if not condition:
+        raise CheckFailedError(message)
+
+
+def call_times_us(calls: int, call: Callable[[], Any], before: Callable[[], Any]) -> FloatArray:
+    """Durations [us] of ``calls`` calls (calls,), each after an untimed ``before``."""
+    times = np.empty(calls)
+    for i in range(calls):
+        before()
+        start = time.perf_counter_ns()
+        call()
+        times[i] = (time.perf_counter_ns() - start) * 1e-3
+    return times

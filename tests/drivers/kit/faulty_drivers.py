@@ -1,0 +1,334 @@
+"""A small correct driver of a simulated device, and what people get wrong in theirs: one fault each."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from stereoservo.ports.devices import (
+    CommandReport,
+    DriverError,
+    JointDriverDescription,
+    JointSpec,
+    JointState,
+)
+from stereoservo_drivers.kit.bench import JointDriverSetup
+from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
+
+CREATED, CONFIGURED, ACTIVE, CLOSED = LifecycleState
+LOW, HIGH, FASTEST, TIMEOUT_S, STEP = np.full(2, -1.0), np.full(2, 1.0), np.full(2, 1.0), 0.1, 1e-4
+
+
+class Device:
+    """Two axes that follow velocities at once, for 0.1 s after the last one (``forever``: without end)."""
+
+    def __init__(self, clock: Any, forever: bool = False) -> None:
+        self.clock, self.forever = clock, forever
+        self.positions, self.velocities = np.zeros(2), np.zeros(2)
+        self.now_ns = self.until_ns = clock.now_ns()
+        self.writes = 0
+        self.gone = False
+
+    def exchange(self, velocities: Any = None) -> None:
+        if self.gone:
+            raise OSError("unplugged")
+        now_ns = self.clock.now_ns()
+        moving_ns = now_ns - self.now_ns if self.forever else max(0, min(now_ns, self.until_ns) - self.now_ns)
+        self.positions = self.positions + self.velocities * moving_ns * 1e-9
+        if now_ns >= self.until_ns and not self.forever:
+            self.velocities = np.zeros(2)
+        self.now_ns = now_ns
+        if velocities is not None:
+            self.writes += 1
+            self.velocities, self.until_ns = velocities, now_ns + round(TIMEOUT_S * 1e9)
+
+
+class Driver:
+    """The correct one. Faults override its small methods."""
+
+    forever = False
+    resolution = STEP
+
+    def __init__(self, options: Any, context: Any) -> None:
+        self.context = context
+        self.life = DriverLifecycle("joint driver 'small'")
+        self.device: Device | None = None
+        self.reads = self.writes = 0
+
+    def describe(self) -> JointDriverDescription:
+        joints = tuple(
+            JointSpec(name, "revolute", -1.0, 1.0, 1.0, 100.0, self.resolution) for name in ("a", "b")
+        )
+        return JointDriverDescription("small", joints, 250.0, "clock", TIMEOUT_S, 500.0)
+
+    def configure(self) -> None:
+        self.life.require("configure()", CREATED)
+        self.device = Device(self.context.clock, self.forever)
+        self.life.state = CONFIGURED
+
+    def activate(self) -> None:
+        self.life.require("activate()", CONFIGURED)
+        self.life.state = ACTIVE
+
+    def read_state(self) -> JointState:
+        self.life.require("read_state()", CONFIGURED, ACTIVE)
+        assert self.device is not None
+        self.exchange()
+        self.reads += 1
+        positions = np.round(self.device.positions / STEP) * STEP
+        return JointState(
+            self.number(), self.stamp(), self.told(positions), self.told_speeds(self.device.velocities.copy())
+        )
+
+    def write_velocity(self, qd: Any) -> CommandReport:
+        self.life.require("write_velocity()", ACTIVE)
+        assert self.device is not None
+        asked = np.array(qd, dtype=np.float64)
+        self.verify(asked)
+        sent = self.limited(np.clip(asked, -FASTEST, FASTEST))
+        self.exchange(self.sent(sent))
+        self.writes += 1
+        reasons = ("limit",) if (sent != asked).any() else ()
+        return CommandReport(self.writes, self.context.clock.now_ns(), asked, sent, reasons)
+
+    def stop(self) -> None:
+        try:
+            if self.device is not None and self.life.state in (CONFIGURED, ACTIVE):
+                self.exchange(np.zeros(2))
+        except DriverError:
+            self.lost = True
+
+    def deactivate(self) -> None:
+        if self.life.state is ACTIVE:
+            self.stop()
+            self.life.state = CONFIGURED
+
+    def close(self) -> None:
+        self.deactivate()
+        self.life.state = CLOSED
+
+    def exchange(self, velocities: Any = None) -> None:
+        assert self.device is not None
+        try:
+            self.device.exchange(velocities)
+        except OSError as error:
+            raise DriverError("connection_lost", str(error)) from error
+
+    def number(self) -> int:
+        return self.reads
+
+    def stamp(self) -> int:
+        return self.context.clock.now_ns()
+
+    def told(self, positions: Any) -> Any:
+        return positions
+
+    def told_speeds(self, velocities: Any) -> Any:
+        return velocities
+
+    def sent(self, velocities: Any) -> Any:
+        return velocities
+
+    def verify(self, asked: Any) -> None:
+        if asked.shape != (2,) or not np.isfinite(asked).all():
+            raise DriverError("command", f"two finite velocities are needed, not {asked.tolist()}")
+
+    def limited(self, velocities: Any) -> Any:
+        assert self.device is not None
+        outward = ((self.device.positions >= HIGH) & (velocities > 0.0)) | (
+            (self.device.positions <= LOW) & (velocities < 0.0)
+        )
+        return np.where(outward, 0.0, velocities)
+
+
+class StaleStamps(Driver):
+    def stamp(self) -> int:
+        return self.context.clock.now_ns() - 300_000_000
+
+
+class FrozenStamps(Driver):
+    def stamp(self) -> int:
+        self.first = getattr(self, "first", self.context.clock.now_ns())
+        return self.first
+
+
+class SequenceGoesBack(Driver):
+    def number(self) -> int:
+        return self.reads % 8
+
+
+class IgnoredStop(Driver):
+    forever = True
+
+    def stop(self) -> None:
+        return
+
+
+class RaisingStop(Driver):
+    def stop(self) -> None:
+        self.exchange(np.zeros(2))
+
+
+class BlockingRead(Driver):
+    def read_state(self) -> JointState:
+        time.sleep(0.03)
+        return super().read_state()
+
+
+class Degrees(Driver):
+    def told(self, positions: Any) -> Any:
+        return np.degrees(positions)
+
+    def told_speeds(self, velocities: Any) -> Any:
+        return np.degrees(velocities)
+
+
+class DegreesCommanded(Driver):
+    def sent(self, velocities: Any) -> Any:
+        return np.radians(velocities)
+
+
+class SignFlipped(Driver):
+    def told(self, positions: Any) -> Any:
+        return positions * [1.0, -1.0]
+
+    def told_speeds(self, velocities: Any) -> Any:
+        return velocities * [1.0, -1.0]
+
+
+class VelocityOfTheMotor(Driver):
+    def told_speeds(self, velocities: Any) -> Any:
+        return 100.0 * velocities
+
+
+class WritesAfterClose(Driver):
+    def stop(self) -> None:
+        if self.device is not None:
+            self.exchange(np.zeros(2))
+
+
+class LeakedThread(Driver):
+    def configure(self) -> None:
+        super().configure()
+        self.ended = threading.Event()
+        threading.Thread(target=self.ended.wait, args=(8.0,), daemon=True, name="reader").start()
+
+
+class LeakedFile(Driver):
+    kept: tuple[Any, ...] = ()
+
+    def configure(self) -> None:
+        super().configure()
+        type(self).kept = (*self.kept, open("/dev/null"))  # noqa: SIM115
+
+
+class LimitsNotKept(Driver):
+    def limited(self, velocities: Any) -> Any:
+        return velocities
+
+
+class VelocityNotCut(Driver):
+    def write_velocity(self, qd: Any) -> CommandReport:
+        report = super().write_velocity(qd)
+        return CommandReport(report.seq, report.t_ns, report.asked, report.asked)
+
+
+class TimeOutNotKept(Driver):
+    forever = True
+
+
+class NotANumberWhileMoving(Driver):
+    def told_speeds(self, velocities: Any) -> Any:
+        return velocities if not velocities.any() else np.array([velocities[0], math.nan])
+
+
+class NotANumberAccepted(Driver):
+    def verify(self, asked: Any) -> None:
+        if asked.shape != (2,):
+            raise DriverError("command", "two velocities are needed")
+
+
+class SharedArrays(Driver):
+    def __init__(self, options: Any, context: Any) -> None:
+        super().__init__(options, context)
+        self.buffer = np.zeros(2)
+
+    def told(self, positions: Any) -> Any:
+        self.buffer[:] = positions
+        return self.buffer
+
+
+class CoarseEncoder(Driver):
+    def told(self, positions: Any) -> Any:
+        return np.round(positions / 0.0015) * 0.0015
+
+
+class LostDeviceUnnoticed(Driver):
+    def exchange(self, velocities: Any = None) -> None:
+        assert self.device is not None
+        if not self.device.gone:
+            super().exchange(velocities)
+
+
+class LostDeviceAsOSError(Driver):
+    def exchange(self, velocities: Any = None) -> None:
+        assert self.device is not None
+        self.device.exchange(velocities)
+
+
+class CommandsBeforeActivate(Driver):
+    def activate(self) -> None:
+        self.life.state = ACTIVE
+
+    def write_velocity(self, qd: Any) -> CommandReport:
+        if self.life.state is CONFIGURED:
+            self.activate()
+        return super().write_velocity(qd)
+
+
+FAULTY = {
+    StaleStamps: "numbers and stamps its samples",
+    FrozenStamps: "numbers and stamps its samples",
+    SequenceGoesBack: "numbers and stamps its samples",
+    IgnoredStop: "stops",
+    RaisingStop: "stop raises nothing unconnected",
+    BlockingRead: "answers in time",
+    Degrees: "moves as told",
+    DegreesCommanded: "moves as told",
+    SignFlipped: "moves as told",
+    VelocityOfTheMotor: "agrees with its velocities",
+    WritesAfterClose: "is silent once closed",
+    LeakedThread: "leaves nothing behind",
+    LeakedFile: "leaves nothing behind",
+    LimitsNotKept: "keeps position limits",
+    VelocityNotCut: "cuts velocities at the limits",
+    TimeOutNotKept: "stops when commands cease",
+    NotANumberWhileMoving: "moves as told",
+    NotANumberAccepted: "refuses bad commands",
+    SharedArrays: "keeps samples apart",
+    CoarseEncoder: "states its resolution",
+    LostDeviceUnnoticed: "reports a lost device",
+    LostDeviceAsOSError: "reports a lost device",
+    CommandsBeforeActivate: "refuses commands unless active",
+}
+"""Driver -> the check that is to catch its fault."""
+
+
+class SmallSetup(JointDriverSetup):
+    """The device's own counter and cable."""
+
+    driver: type[Driver] = Driver
+
+    def make_driver(self, context: Any) -> Any:
+        return self.driver({}, context)
+
+    def unplug(self, driver: Any) -> bool:
+        driver.device.gone = True
+        return True
+
+    def device_writes(self, driver: Any) -> int:
+        return driver.device.writes

@@ -1,0 +1,93 @@
+"""The checks of joint drivers pass a correct driver and catch what people get wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereoservo_drivers.commands.driver_check import driver_check
+from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
+
+from .faulty_drivers import FAULTY, Driver, SmallSetup
+
+
+@pytest.mark.parametrize("check", JOINT_CHECKS, ids=lambda check: check.name)
+def test_a_correct_driver_passes(check, tmp_path):
+    result = run_check(check, SmallSetup(), tmp_path)
+    assert (result.verdict, result.remedy) == ("passed", ""), result
+    assert result.measured
+
+
+@pytest.mark.parametrize(("faulty", "name"), FAULTY.items(), ids=[driver.__name__ for driver in FAULTY])
+def test_a_planted_fault_is_caught_by_its_check_with_a_remedy(faulty, name, tmp_path):
+    assert issubclass(faulty, Driver)
+    setup = SmallSetup()
+    setup.driver = faulty
+    (check,) = (check for check in JOINT_CHECKS if check.name == name)
+    result = run_check(check, setup, tmp_path)
+    assert result.verdict == "failed", result
+    assert result.measured
+    assert result.remedy == check.remedy
+
+
+def command(*arguments):
+    app = typer.Typer()
+    app.command()(driver_check)
+    result = CliRunner().invoke(app, [*arguments, "--json"])
+    return result.exit_code, json.loads(result.stdout) if result.stdout else result.exception
+
+
+@pytest.fixture
+def here(monkeypatch):
+    monkeypatch.chdir(Path(__file__).parent)
+
+
+@pytest.mark.usefixtures("here")
+def test_without_a_device_nothing_is_connected_and_the_rest_is_told_as_not_run():
+    code, report = command("faulty_drivers:Driver")
+    assert code == 0
+    assert report["summary"] == {"passed": 3, "not run": len(JOINT_CHECKS) - 3}
+    code, report = command("faulty_drivers:RaisingStop")
+    assert (code, report["error"]["message"]) == (1, "stop raises nothing unconnected")
+    (failed,) = (check for check in report["checks"] if check["verdict"] == "failed")
+    assert failed["remedy"] == "stop() must do nothing there"
+
+
+@pytest.mark.usefixtures("here")
+def test_a_setup_brings_its_own_cable_and_counter_and_a_driver_class_does_without():
+    code, report = command("faulty_drivers:SmallSetup", "--simulated")
+    assert (code, report["summary"]) == (0, {"passed": len(JOINT_CHECKS)})
+    code, report = command("faulty_drivers:Driver", "--simulated")
+    assert (code, report["summary"]) == (0, {"passed": len(JOINT_CHECKS) - 2, "not run": 2})
+    assert command("fake", "--simulated", "--options", '{"rate_hz": 100}')[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["no_such_module:Driver"], "ModuleNotFoundError"),
+        (["json:loads"], "a driver class"),
+        (["nobody"], "there are:"),
+        (["fake", "--options", "[1]"], "is valid"),
+        (["fake", "--options", "{"], "no JSON"),
+        (["fake", "--pull"], "--hardware"),
+        (["fake", "--hardware", "--simulated"], "exclude"),
+    ],
+)
+def test_bad_arguments_are_refused_with_what_is_valid(arguments, words):
+    code, error = command(*arguments)
+    assert code == 1
+    assert words in str(error)
+
+
+@pytest.mark.usefixtures("here")
+def test_hardware_is_moved_only_after_a_yes():
+    app = typer.Typer()
+    app.command()(driver_check)
+    result = CliRunner().invoke(app, ["faulty_drivers:Driver", "--hardware"], input="n\n")
+    assert result.exit_code == 1
+    assert "nothing was done" in str(result.exception)
