@@ -17,6 +17,7 @@ diagnosis needs two rounds of the last three.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
 from typing import NamedTuple
@@ -33,6 +34,7 @@ from stereoservo.core.monitor_state import (
     MOVED,
     STALE_PERIODS,
     CameraMonitor,
+    DriveDelays,
     ModelDiagnosis,
     ModelMonitor,
 )
@@ -43,6 +45,12 @@ from stereoservo.core.monitors.fault_isolation import (
     bench_now,
     diagnosed_beside_joint_errors,
     without_joint_errors,
+)
+from stereoservo.core.monitors.following import (
+    account_silence,
+    account_travel,
+    measure_delays,
+    unknown_delays,
 )
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
@@ -244,7 +252,7 @@ def _forget(contact: Contact, sample: JointState) -> None:
 
 MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
 LAG_S = 0.15  # a healthy drive lags by less than this at full speed
-SILENCE_S = 0.2  # of motion after which a reading has answered, whatever the drive's lag
+SILENCE_S = 0.25  # of motion after which a reading has answered, whatever the drive's lag
 PLAY = {"revolute": 0.06, "prismatic": 0.005}  # [rad, m] sent before a healthy joint's reading answers
 ANSWERS = {
     "revolute": 1e-3,
@@ -259,55 +267,63 @@ def detect_following_error(
     """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
 
     ``state.command`` is still that of the last step. A joint's missing travel is its commanded minus its measured one,
-    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed. What is sent to a joint whose reading does not
-    change at all is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new joint sample
-    nothing is concluded: stale samples are the safety stage's affair.
+    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What is
+    sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
+    ends, too. Without a new joint sample nothing is concluded: stale samples are the safety stage's affair.
     """
-    state.untold_travel = state.untold_travel + state.command * dt_s
-    _account_for_silence(state, settings, q, dt_s)
-    keep = max(0.0, 1.0 - dt_s / MEMORY_S)
-    if state.last_joints_ns == state.last_followed_ns:
-        state.missing_travel = keep * state.missing_travel
-        return None
-    state.last_followed_ns = state.last_joints_ns
-    last = q if state.last_positions is None else state.last_positions
-    state.missing_travel = keep * (state.missing_travel + state.untold_travel - (q - last))
-    state.untold_travel[:] = 0.0
-    state.last_positions = q.copy()
-    return _not_following(state, settings) or _silent(state, settings)
-
-
-def _account_for_silence(state: CoreState, settings: CoreSettings, q: FloatArray, dt_s: float) -> None:
-    """Add up what each joint was sent, and for how long, since its reading changed; friction may hold the rest back."""
+    delays = state.delays
+    if delays is None:
+        delays = state.delays = unknown_delays(settings)
     if state.silent_from is None:
         state.silent_from, state.silent_travel, state.silent_s = q.copy(), np.zeros_like(q), np.zeros_like(q)
-    _, moved, friction = _by_kind(settings.joint_kinds)
-    if settings.resolution:
-        moved = np.maximum(moved, 1.5 * np.array(settings.resolution))  # one step to and fro is no motion
-    answered = np.abs(q - state.silent_from) > moved
-    felt = state.command - np.clip(state.command, -friction, friction)
-    state.silent_travel = np.where(answered, 0.0, state.silent_travel + felt * dt_s)
-    state.silent_s = np.where(answered, 0.0, state.silent_s + (felt != 0.0) * dt_s)
-    state.silent_from = np.where(answered, q, state.silent_from)
-
-
-def _not_following(state: CoreState, settings: CoreSettings) -> Reason | None:
-    allowed = LAG_S * settings.limits.velocity_max
-    joint = int((np.abs(state.missing_travel) / allowed).argmax())
-    missing, limit = float(state.missing_travel[joint]), float(allowed[joint])
-    if abs(missing) <= limit:
+    _, answers, friction = _by_kind(settings.joint_kinds, settings.resolution)
+    measure_delays(
+        state.command, q, answers, dt_s, delays.sent, delays.onset, delays.samples, delays.delay_s
+    )
+    last = q if state.last_positions is None else state.last_positions
+    if state.last_positions is None:
+        delays.missing[:] = 0.0
+        delays.accounted = delays.sent.copy()
+    told = state.last_joints_ns != state.last_followed_ns
+    account_travel(
+        state.command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, 1.0 / settings.rate_hz, delays.steps,
+        (delays.delay_s, delays.sent, delays.past, delays.velocity, delays.under_way, delays.accounted, delays.missing),
+        state.untold_travel, state.missing_travel,
+    )  # fmt: skip
+    delays.steps += 1
+    account_silence(
+        q, delays.velocity, answers, friction, dt_s, state.silent_from, state.silent_travel, state.silent_s
+    )
+    if not told:
         return None
-    name, unit = settings.joint_names[joint], settings.joint_unit(joint)
+    state.last_followed_ns = state.last_joints_ns
+    state.last_positions = q.copy()
+    return _not_following(state, delays, settings) or _silent(state, settings)
+
+
+def _not_following(state: CoreState, delays: DriveDelays, settings: CoreSettings) -> Reason | None:
+    allowed = LAG_S * settings.limits.velocity_max
+    now, late = state.missing_travel, delays.missing
+    beyond = np.where(now * late > 0.0, np.minimum(np.abs(now), np.abs(late)), 0.0)
+    joint = int((beyond / allowed).argmax())
+    missing, limit = float(beyond[joint]), float(allowed[joint])
+    if missing <= limit:
+        return None
+    name, unit, signed = settings.joint_names[joint], settings.joint_unit(joint), float(now[joint])
+    delay_s = float(delays.delay_s[joint])
     state.missing_travel[:] = 0.0
+    delays.missing[:] = 0.0
+    known = f", {delay_s:.2f} s of delay apart" if delay_s > 0.0 else ""
     return Reason(
-        "JOINT_NOT_FOLLOWING", "fault", name, abs(missing), limit, unit,
-        f"joint {name} lacks {missing:+.3f} {unit} of the travel it was sent (up to {limit:.3f} is lag): "
-        "check its encoder, brake and drive; then reset and enable",
+        "JOINT_NOT_FOLLOWING", "fault", name, missing, limit, unit,
+        f"joint {name} lacks {math.copysign(missing, signed):+.3f} {unit} of the travel it was sent (up to {limit:.3f} "
+        f"is lag{known}): check its encoder, brake and drive; then reset and enable",
     )  # fmt: skip
 
 
 def _silent(state: CoreState, settings: CoreSettings) -> Reason | None:
-    share = np.abs(state.silent_travel) / _by_kind(settings.joint_kinds)[0] * (state.silent_s > SILENCE_S)
+    play, _, _ = _by_kind(settings.joint_kinds, settings.resolution)
+    share = np.abs(state.silent_travel) / play * (state.silent_s > SILENCE_S)
     joint = int(share.argmax())
     if share[joint] <= 1.0:
         return None
@@ -323,11 +339,15 @@ def _silent(state: CoreState, settings: CoreSettings) -> Reason | None:
 
 
 @lru_cache(maxsize=8)
-def _by_kind(kinds: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds; not to be written to."""
+def _by_kind(
+    kinds: tuple[str, ...], resolution: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds and encoder steps; not to be written to."""
     play, answers, friction = (
         np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION)
     )
+    if resolution:
+        answers = np.maximum(answers, 1.5 * np.array(resolution))  # one step to and fro is no motion
     for value in (play, answers, friction):
         value.setflags(write=False)
     return play, answers, friction

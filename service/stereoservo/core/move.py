@@ -231,7 +231,8 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
         known = state.friction = FrictionCompensation(
             subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
         )
-    known.sent = known.sent + state.command * context.dt_s
+    arrives = state.command if state.delays is None else state.delays.velocity
+    known.sent = known.sent + arrives * context.dt_s
     known.sent_s = known.sent_s + context.dt_s
     wanted = output.velocity
     if context.ingested.joints is not None and _fresh(output, context):
