@@ -12,7 +12,7 @@ import pytest
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state import PoseMeasurement, decode_state, encode_state
 from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, relocalize_from_events
 from stereoservo.kinematics.shutter_stamps import ShutterOffset
 from stereoservo.messages.goals import (
@@ -27,6 +27,7 @@ from stereoservo.messages.goals import (
     RenewGoal,
     Resume,
     RunGoal,
+    Teach,
 )
 
 DISPLACED = np.array([0.12, -0.1, 0.08, 0.2, -0.15, 0.25])
@@ -612,3 +613,47 @@ def test_state_taken_at_any_moment_of_it_gives_the_same_commands(cells: Any) -> 
             repeated = again.step(inputs)
             assert repeated.command.tobytes() == outputs.command.tobytes()
             assert repeated.status.health == outputs.status.health
+
+
+def looking(state: Any) -> tuple[Any, int]:
+    """What is being averaged, of pictures from when on; None where nothing is."""
+    if state.teaching is not None:
+        return state.teaching, state.teaching.started_ns
+    if state.reanchoring is not None and state.reanchoring.phase == "collect":
+        return state.reanchoring.sums, state.reanchoring.phase_ns
+    if isinstance(state.source, PoseMeasurement) and state.source.phase == "collect":
+        return state.source.sums, state.source.phase_ns
+    return None, 0
+
+
+@pytest.mark.parametrize("what", ["taught", "check_finished", "reanchored"])
+def test_no_picture_of_before_is_averaged_where_stamps_are_known_to_be_late(cells: Any, what: str) -> None:
+    late_ns = 15_000_000
+    cell = cells()
+    bench, state = cell.bench, cell.bench.core.state
+    offsets = tuple(ShutterOffset(name, -1e-9 * late_ns, 1e-4) for name in bench.names)
+    bench.step(model_update=ModelUpdate(msgspec.structs.replace(state.model, epoch=2, shutter_offsets=offsets)))
+    bench.stamped_late_ns = late_ns
+    bench.run(0.5)
+    averaged = 0
+    for begin in range(4):  # a camera has a picture in every fourth step
+        bench.run(0.2 + 0.01 * begin)
+        heard = len(bench.events)
+        command = {"taught": Teach("there", 2), "check_finished": Calibrate("00000015", check=True)}.get(what)
+        if command is None:
+            cell.bump(0, np.array([0.0, 1.0 + begin, 0.0]), np.zeros(3))
+        commands = [] if command is None else [command]
+        while what not in [event.kind for event in bench.events[heard:]]:
+            sums, _ = looking(state)
+            before = None if sums is None else sums.frames.copy()
+            cell.step(*commands)
+            commands = []
+            again, since_ns = looking(state)
+            if again is not sums or before is None:
+                continue
+            for observation in bench.log[-1][0].observations:
+                camera = bench.names.index(observation.camera)
+                if sums.frames[camera] > before[camera]:
+                    averaged += 1
+                    assert observation.t_shutter_ns - late_ns > since_ns - 1_000_000
+    assert averaged >= 16
