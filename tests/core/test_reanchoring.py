@@ -639,7 +639,7 @@ def test_no_picture_of_before_is_averaged_where_stamps_are_known_to_be_late(cell
     for begin in range(4):  # a camera has a picture in every fourth step
         bench.run(0.2 + 0.01 * begin)
         heard = len(bench.events)
-        command = {"taught": Teach("there", 2), "check_finished": Calibrate("00000015", check=True)}.get(what)
+        command = {"taught": Teach("there", 4), "check_finished": Calibrate("00000015", check=True)}.get(what)
         if command is None:
             cell.bump(0, np.array([0.0, 1.0 + begin, 0.0]), np.zeros(3))
         commands = [] if command is None else [command]
