@@ -277,9 +277,7 @@ def detect_following_error(
     if state.silent_from is None:
         state.silent_from, state.silent_travel, state.silent_s = q.copy(), np.zeros_like(q), np.zeros_like(q)
     _, answers, friction = _by_kind(settings.joint_kinds, settings.resolution)
-    measure_delays(
-        state.command, q, answers, dt_s, delays.sent, delays.onset, delays.samples, delays.delay_s
-    )
+    measure_delays(state.command, q, answers, dt_s, delays.sent, delays.onset, delays.samples, delays.delay_s)
     last = q if state.last_positions is None else state.last_positions
     if state.last_positions is None:
         delays.missing[:] = 0.0

@@ -458,9 +458,7 @@ def _verify(run: Relocalization, context: StepContext) -> None:
     watching = state.watching
     last = watching.last[-VERIFY_ROUNDS:]
     moved = _moved(run, context)
-    looked = all(
-        _after(c, run.phase_ns, state) and int(watching.sightings[c].seen.sum()) >= 3 for c in moved
-    )
+    looked = all(_after(c, run.phase_ns, state) and int(watching.sightings[c].seen.sum()) >= 3 for c in moved)
     if len(last) == VERIFY_ROUNDS and looked and all(verdict.kind == "ok" for verdict in last):
         _known_again(run, context)
         return

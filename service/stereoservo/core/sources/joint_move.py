@@ -192,7 +192,9 @@ def farthest(q: FloatArray, target: FloatArray, settings: CoreSettings) -> int:
 def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
     """One step of a joint move; it ends when it arrived and rested, or at its time limit."""
     ahead = joints_ahead(context)
-    still = arrived(context.q, move.target, context.settings) and arrived(ahead, move.target, context.settings)
+    still = arrived(context.q, move.target, context.settings) and arrived(
+        ahead, move.target, context.settings
+    )
     move.settled = move.settled + 1 if still else 0
     worst = farthest(context.q, move.target, context.settings)
     if move.settled >= ARRIVED_STEPS:
