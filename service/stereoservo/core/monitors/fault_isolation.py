@@ -37,8 +37,8 @@ FEWEST_ON_ARM = 4
 """Markers on the arm by which a camera may confirm that the arm is where its joints say."""
 WAYS_OUT = (
     "Where cameras moved: put them back and resume, or calibrate. Where joints are off: calibrate --check "
-    "--reset-zeros. Where the marker body moved on the arm: put it back and resume, or calibrate. Static markers in view "
-    "of every camera ([scene] static) tell them apart"
+    "--reset-zeros. Where the marker body moved on the arm: put it back and resume, or calibrate. Static markers in "
+    "view of every camera ([scene] static) tell them apart"
 )
 """What a person can do, cause by cause, where moved cameras and a moved arm cannot be told apart."""
 FEWEST_STATIC = 3

@@ -106,7 +106,7 @@ def account_travel(
     for j in range(command.shape[0]):
         untold[j] += command[j] * dt_s
         past[step % rows, j] = sent[j]
-        back = min(int(round(delay_s[j] / period_s)), rows - 2)
+        back = min(round(delay_s[j] / period_s), rows - 2)
         arrived = past[(step - back) % rows, j]
         under_way[j] = sent[j] - arrived
         velocity[j] = (arrived - past[(step - back - 1) % rows, j]) / dt_s if dt_s > 0.0 else 0.0

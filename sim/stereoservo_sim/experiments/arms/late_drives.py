@@ -1,9 +1,9 @@
 """Experiment: drives whose commands arrive 100 to 200 ms late, held by friction of up to 10 mrad/s, which nobody has
 stated: goals by the servo core with the model that the arm has learnt, and beside it with the true one.
 
-Cases are those of `random_rigs`, all joints alike. The model is fitted to the arm's own trial motions. Each goal is that
-of a core that has just been started with its model, and so knows no delay: what the trial motions have shown of it is
-forgotten. The overshoot is the farthest that a marker goes beyond its set-point in an image, along its way, over the
+Cases are those of `random_rigs`, all joints alike. The model is fitted to the arm's own trial motions. Each goal is
+that of a core that has just been started with its model, and so knows no delay: what the trial motions have shown of it
+is forgotten. The overshoot is the farthest that a marker goes beyond its set-point in an image, along its way, over the
 longest way of one. A range of seeds is continued with another.
 """
 
