@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.monitor import PLAY, SILENCE_S, detect_following_error
+from stereoservo.core.monitor import detect_following_error
+from stereoservo.core.monitors.following import PLAY, SILENCE_S
 from stereoservo.core.state import CoreState, initial_state
 from stereoservo.messages.goals import Enable, FeatureTarget, Jog, JointTarget, Reset
 from stereoservo.messages.reasons import Reason
