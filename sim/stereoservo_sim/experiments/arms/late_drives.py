@@ -21,9 +21,8 @@ from rich.console import Console
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.experiments.experiment import show_rows
+from stereoservo_sim.experiments.experiment import count_row, draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
-from stereoservo_sim.summaries import wilson
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX, DrivenCell, Imperfections
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.mechanics import Mechanics
@@ -119,13 +118,14 @@ def run_late_drives(seeds: int = 10, seed: int = 0, progress: ProgressCall | Non
         "seeds": seeds,
         "title": f"late-drives: cases {seed} to {seed + seeds - 1}, of those that the true model reaches",
         "rows": [
-            _row("reached, within tolerance", len(within), len(driven)),
-            _row("more overshoot", len(more), len(within)),
+            count_row("reached, within tolerance", len(within), len(driven)),
+            count_row("more overshoot", len(more), len(within)),
         ],
         "overshoot": {
             name: float(np.max([case.overshoot[name] for case in within])) if within else None
             for name in MODELS
         },
+        "overshoots": {name: [case.overshoot[name] for case in within] for name in MODELS},
         "ends": {name: dict(Counter(case.ends[name] for case in known)) for name in MODELS},
         "no_case": dict(Counter(case.code for case in cases if case.code)),
         "lost": [msgspec.to_builtins(case) for case in driven if case not in within]
@@ -135,14 +135,9 @@ def run_late_drives(seeds: int = 10, seed: int = 0, progress: ProgressCall | Non
     }
 
 
-def _row(name: str, count: int, of: int) -> dict[str, Any]:
-    low, high = wilson(count, of) if of else (0.0, 1.0)
-    return {"goals": name, "count": count, "of": of, "wilson_low": low, "wilson_high": high}
-
-
 def draw_late_drives(answer: dict[str, Any], folder: Path) -> list[Path]:
-    """Nothing: the answer is a table of counts."""
-    return []
+    """Overshoot with the model that was learnt and with the true one. Raises OSError."""
+    return draw_sorted(answer["overshoots"], "overshoot, of the longest way", folder / "late_drives.png")
 
 
 def show_late_drives(answer: dict[str, Any], console: Console) -> None:
