@@ -7,6 +7,7 @@ import pytest
 
 from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
+from stereoservo.control.laws.cartesian3 import LONGEST_STEP
 from stereoservo.control.primitives_kernel import normal_frame, stacked_singular
 from stereoservo.control.step_correction import SINGULAR, damped_step, rigid_motions
 from stereoservo.kinematics.composition import Composition
@@ -115,3 +116,13 @@ def test_the_damped_step_is_exact_where_the_arm_can_and_bounded_where_it_cannot(
     lost = damped_step(operators, V, values, np.ascontiguousarray(rigid[5]), 1.0)
     np.testing.assert_allclose(np.tensordot(lost, operators, axes=1), 0.0, atol=1e-6)  # the body stays
     assert 0.1 < np.abs(lost).max() <= 0.5
+
+
+@pytest.mark.parametrize("law", BOTH)
+@pytest.mark.parametrize("wrist", [0.0, 5e-4, 1.5e-3])
+def test_no_joint_goes_farther_than_a_radian_in_one_step(virtual, law, wrist):
+    """A long step with a high gain asks for more of the motions that the arm can hardly make."""
+    _, world, _ = singular_arm(virtual, 4, wrist)
+    T_star = world.plate_pose(world.q + np.array([0.4, -0.3, 0.3, 1.2, 0.6, -1.0]))
+    step = LAWS[law].step(*arranged(virtual, world, T_star), Options(20.0, 0.5))
+    assert 0.5 < 0.5 * np.abs(step.velocity).max() <= LONGEST_STEP * (1.0 + 1e-12)

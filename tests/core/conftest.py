@@ -228,6 +228,8 @@ class Bench:
     """By how much [rad], to either side, a motor with its encoder may stand off its joint before it takes it along."""
     dead_speed: float = 0.0
     """Of every motor [rad/s]: friction makes it slower by so much, and holds it below."""
+    delay_s: float = 0.0
+    """By which every drive answers late."""
     resolution: float = 0.0
     """Step of every encoder [rad]."""
     stamped_late_ns: int = 0
@@ -275,8 +277,10 @@ class Bench:
             self._shutter()
         if outputs.command is not None:
             self.commands.append(outputs.command)
-            held = np.clip(outputs.command, -self.dead_speed, self.dead_speed)
-            self._drive((outputs.command - held) * period_ns * 1e-9)
+            late = round(self.delay_s * self.settings.rate_hz)
+            arrives = self.commands[-1 - late] if late < len(self.commands) else np.zeros(6)
+            held = np.clip(arrives, -self.dead_speed, self.dead_speed)
+            self._drive((arrives - held) * period_ns * 1e-9)
         return outputs
 
     def _drive(self, way: np.ndarray) -> None:

@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.monitor import PLAY, SILENCE_S, detect_following_error
-from stereoservo.core.state import initial_state
-from stereoservo.messages.goals import Enable, Jog, Reset
+from stereoservo.core.monitor import detect_following_error
+from stereoservo.core.monitors.following import PLAY, SILENCE_S
+from stereoservo.core.state import CoreState, initial_state
+from stereoservo.messages.goals import Enable, FeatureTarget, Jog, JointTarget, Reset
 from stereoservo.messages.reasons import Reason
 
 RATE_HZ = 250.0
@@ -20,12 +21,12 @@ Encoder = Callable[[np.ndarray], np.ndarray]
 
 
 def watched(
-    settings: Any, commands: np.ndarray, readings: np.ndarray, every: int = 1
+    settings: Any, commands: np.ndarray, readings: np.ndarray, every: int = 1, state: CoreState | None = None
 ) -> tuple[Reason | None, int]:
     """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,) in every so many
-    steps, and when.
+    steps, and when. ``state``: what it remembers.
     """
-    state = initial_state(settings)
+    state = initial_state(settings) if state is None else state
     for k, command in enumerate(commands):
         q = np.zeros(len(settings.joint_names))
         q[0] = readings[k - k % every]
@@ -58,6 +59,12 @@ def test_an_arm_whose_encoder_stands_still_goes_less_than_0_17_rad_at_any_speed(
 def delayed(commands: np.ndarray, delay_s: float) -> np.ndarray:
     steps = round(delay_s * RATE_HZ)
     return travelled(np.concatenate([np.zeros(steps), commands[: len(commands) - steps]]))
+
+
+def setting_out(speed: float, seconds: float, acceleration: float = 4.0) -> np.ndarray:
+    """At rest for half a second, then up to a speed, and on."""
+    t = np.arange(round((0.5 + seconds) * RATE_HZ)) * DT_S - 0.5
+    return np.clip(acceleration * t, 0.0, speed)
 
 
 def with_play(positions: np.ndarray, play: float) -> np.ndarray:
@@ -193,3 +200,73 @@ def test_a_reset_begins_anew(bench: Any) -> None:
     outputs = bench.run(1.0)
     assert outputs.status.lifecycle == "active"
     assert bench.q[2] - start[2] > 0.012
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.4, 1.0])
+@pytest.mark.parametrize("delay_s", [0.1, 0.15, 0.2])
+@pytest.mark.parametrize("friction", [0.0, 0.01])
+def test_the_delay_of_a_drive_is_measured_where_it_sets_out(bench, speed, delay_s, friction):
+    settings = at_the_rate_of_these_tests(bench.settings)
+    state, commands = initial_state(settings), setting_out(speed, 2.0)
+    readings = delayed(commands - np.clip(commands, -friction, friction), delay_s)
+    assert watched(settings, commands, readings, state=state) == (None, len(commands))
+    assert state.delays is not None
+    assert abs(state.delays.delay_s[0] - delay_s) < 0.02
+    assert not state.delays.delay_s[1:].any()
+
+
+def at_the_rate_of_these_tests(settings: Any) -> Any:
+    return msgspec.structs.replace(settings, rate_hz=RATE_HZ)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0])
+@pytest.mark.parametrize("delay_s", [0.0, 0.1, 0.2])
+def test_a_late_joint_that_is_blocked_on_its_way_is_found_as_fast_as_a_prompt_one(bench, speed, delay_s):
+    settings = at_the_rate_of_these_tests(bench.settings)
+    commands, blocked = setting_out(speed, 3.0), round(1.5 * RATE_HZ)
+    readings = delayed(commands, delay_s)
+    readings[blocked:] = readings[blocked]
+    reason, k = watched(settings, commands, readings)
+    assert reason is not None
+    assert reason.code == "JOINT_NOT_FOLLOWING"
+    assert (k - blocked) * DT_S <= (0.175 if speed == 1.0 else 0.26)
+
+
+def test_a_drive_that_has_become_faster_is_not_blamed(bench):
+    settings = at_the_rate_of_these_tests(bench.settings)
+    state = initial_state(settings)
+    slow = setting_out(1.0, 1.0)
+    assert watched(settings, slow, delayed(slow, 0.2), state=state)[0] is None
+    assert state.delays is not None
+    assert state.delays.delay_s[0] == pytest.approx(0.2, abs=0.01)
+    steady = np.full(round(2.0 * RATE_HZ), 1.0)
+    began = delayed(slow, 0.2)[-1]
+    assert watched(settings, steady, began + travelled(steady), state=state)[0] is None
+
+
+def test_a_drive_that_is_later_than_a_quarter_of_a_second_does_not_follow(bench):
+    settings = at_the_rate_of_these_tests(bench.settings)
+    commands = setting_out(1.0, 1.0)
+    reason, _ = watched(settings, commands, delayed(commands, 0.3))
+    assert reason is not None
+    assert reason.code == "JOINT_NOT_FOLLOWING"
+
+
+@pytest.mark.parametrize("by", ["joints", "images"])
+@pytest.mark.parametrize("delay_s", [0.1, 0.2])
+def test_goals_are_reached_by_late_drives_and_not_overshot(bench: Any, by: str, delay_s: float) -> None:
+    bench.ready()
+    bench.delay_s = delay_s
+    start, target = bench.q.copy(), bench.q + np.array([0.3, -0.25, 0.2, 0.3, -0.2, 0.35])
+    joints = JointTarget(dict(zip(bench.settings.joint_names, target.tolist(), strict=True)))
+    wanted = joints if by == "joints" else FeatureTarget(bench.features(target))
+    assert bench.reply(bench.goal(wanted)).accepted
+    farthest, since = 0.0, len(bench.events)
+    while not [e for e in bench.events[since:] if e.kind in ("goal_reached", "goal_aborted", "fault")]:
+        bench.step()
+        beyond = (bench.q - target) * np.sign(target - start)
+        farthest = max(farthest, float(beyond.max()))
+    assert bench.events[-1].kind == "goal_reached"
+    bench.run(0.5)
+    assert farthest < 0.01 * 0.35 or by == "images"
+    assert bench.error_px(target) < 2.0 * bench.settings.tolerance_px

@@ -17,8 +17,8 @@ diagnosis needs two rounds of the last three.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,13 +38,25 @@ from stereoservo.core.monitor_state import (
 )
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, stated_thresholds, worst_contact
-from stereoservo.core.monitors.diagnosis import camera_moved_findings, emit_diagnosis, mask_marker
+from stereoservo.core.monitors.diagnosis import (
+    camera_moved_findings,
+    emit_diagnosis,
+    mask_marker,
+    unmask_returned,
+)
 from stereoservo.core.monitors.fault_isolation import (
     bench_now,
     diagnosed_beside_joint_errors,
-    without_joint_errors,
 )
-from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.monitors.following import (
+    LAG_S,
+    MEMORY_S,
+    SILENCE_S,
+    not_following,
+    of_kinds,
+    silent,
+)
+from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays, unknown_delays
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
@@ -60,6 +72,7 @@ from stereoservo.core.state import CalibrationMotion, Contact, CoreState
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import JointState
 
 Findings = Iterable[Finding]
@@ -242,95 +255,87 @@ def _forget(contact: Contact, sample: JointState) -> None:
     _clear(contact)
 
 
-MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
-LAG_S = 0.15  # a healthy drive lags by less than this at full speed
-SILENCE_S = 0.2  # of motion after which a reading has answered, whatever the drive's lag
-PLAY = {"revolute": 0.06, "prismatic": 0.005}  # [rad, m] sent before a healthy joint's reading answers
-ANSWERS = {
-    "revolute": 1e-3,
-    "prismatic": 1e-4,
-}  # [rad, m] by which a reading answers, where its step is no coarser
-FRICTION = {"revolute": 0.01, "prismatic": 0.001}  # [rad/s, m/s] below which a healthy joint may stick
-
-
 def detect_following_error(
     state: CoreState, settings: CoreSettings, q: FloatArray, dt_s: float
 ) -> Reason | None:
     """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
 
     ``state.command`` is still that of the last step. A joint's missing travel is its commanded minus its measured one,
-    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed. What is sent to a joint whose reading does not
-    change at all is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new joint sample
-    nothing is concluded: stale samples are the safety stage's affair.
+    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What is
+    sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
+    ends, too. Without a new joint sample nothing is concluded: stale samples are the safety stage's affair.
     """
-    state.untold_travel = state.untold_travel + state.command * dt_s
-    _account_for_silence(state, settings, q, dt_s)
-    keep = max(0.0, 1.0 - dt_s / MEMORY_S)
-    if state.last_joints_ns == state.last_followed_ns:
-        state.missing_travel = keep * state.missing_travel
-        return None
-    state.last_followed_ns = state.last_joints_ns
-    last = q if state.last_positions is None else state.last_positions
-    state.missing_travel = keep * (state.missing_travel + state.untold_travel - (q - last))
-    state.untold_travel[:] = 0.0
-    state.last_positions = q.copy()
-    return _not_following(state, settings) or _silent(state, settings)
-
-
-def _account_for_silence(state: CoreState, settings: CoreSettings, q: FloatArray, dt_s: float) -> None:
-    """Add up what each joint was sent, and for how long, since its reading changed; friction may hold the rest back."""
+    delays = state.delays
+    if delays is None:
+        delays = state.delays = unknown_delays(settings)
     if state.silent_from is None:
         state.silent_from, state.silent_travel, state.silent_s = q.copy(), np.zeros_like(q), np.zeros_like(q)
-    _, moved, friction = _by_kind(settings.joint_kinds)
-    if settings.resolution:
-        moved = np.maximum(moved, 1.5 * np.array(settings.resolution))  # one step to and fro is no motion
-    answered = np.abs(q - state.silent_from) > moved
-    felt = state.command - np.clip(state.command, -friction, friction)
-    state.silent_travel = np.where(answered, 0.0, state.silent_travel + felt * dt_s)
-    state.silent_s = np.where(answered, 0.0, state.silent_s + (felt != 0.0) * dt_s)
-    state.silent_from = np.where(answered, q, state.silent_from)
-
-
-def _not_following(state: CoreState, settings: CoreSettings) -> Reason | None:
-    allowed = LAG_S * settings.limits.velocity_max
-    joint = int((np.abs(state.missing_travel) / allowed).argmax())
-    missing, limit = float(state.missing_travel[joint]), float(allowed[joint])
-    if abs(missing) <= limit:
-        return None
-    name, unit = settings.joint_names[joint], settings.joint_unit(joint)
-    state.missing_travel[:] = 0.0
-    return Reason(
-        "JOINT_NOT_FOLLOWING", "fault", name, abs(missing), limit, unit,
-        f"joint {name} lacks {missing:+.3f} {unit} of the travel it was sent (up to {limit:.3f} is lag): "
-        "check its encoder, brake and drive; then reset and enable",
+    play, answers, friction = of_kinds(settings.joint_kinds, settings.resolution)
+    measure_delays(state.command, q, answers, dt_s, delays.sent, delays.onset, delays.samples, delays.delay_s)
+    last = q if state.last_positions is None else state.last_positions
+    if state.last_positions is None:
+        delays.missing[:] = 0.0
+        delays.accounted = delays.sent.copy()
+    told = state.last_joints_ns != state.last_followed_ns
+    account_travel(
+        state.command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, 1.0 / settings.rate_hz, delays.steps,
+        (delays.delay_s, delays.sent, delays.past, delays.velocity, delays.under_way, delays.accounted, delays.missing),
+        state.untold_travel, state.missing_travel,
     )  # fmt: skip
-
-
-def _silent(state: CoreState, settings: CoreSettings) -> Reason | None:
-    share = np.abs(state.silent_travel) / _by_kind(settings.joint_kinds)[0] * (state.silent_s > SILENCE_S)
+    delays.steps += 1
+    account_silence(
+        q, delays.velocity, answers, friction, dt_s, state.silent_from, state.silent_travel, state.silent_s
+    )
+    if not told:
+        return None
+    state.last_followed_ns = state.last_joints_ns
+    state.last_positions = q.copy()
+    allowed = LAG_S * settings.limits.velocity_max
+    joint, missing = worst_follower(allowed, state.missing_travel, delays.missing)
+    if joint >= 0:
+        state.missing_travel[:] = 0.0
+        delays.missing[:] = 0.0
+        return not_following(joint, missing, float(allowed[joint]), float(delays.delay_s[joint]), settings)
+    share = np.abs(state.silent_travel) / play * (state.silent_s > SILENCE_S)
     joint = int(share.argmax())
     if share[joint] <= 1.0:
         return None
-    name, unit = settings.joint_names[joint], settings.joint_unit(joint)
-    sent, since_s = float(state.silent_travel[joint]), float(state.silent_s[joint])
-    limit = PLAY[settings.joint_kinds[joint]]
     state.silent_from = None
-    return Reason(
-        "JOINT_NOT_FOLLOWING", "fault", name, abs(sent), limit, unit,
-        f"the reading of joint {name} stood still for {since_s:.2f} s while it was sent {sent:+.3f} {unit} of travel "
-        f"(up to {limit:g} may be play): check its encoder, brake and drive; then reset and enable",
-    )  # fmt: skip
+    return silent(joint, float(state.silent_travel[joint]), float(state.silent_s[joint]), settings)
 
 
-@lru_cache(maxsize=8)
-def _by_kind(kinds: tuple[str, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds; not to be written to."""
-    play, answers, friction = (
-        np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION)
-    )
-    for value in (play, answers, friction):
-        value.setflags(write=False)
-    return play, answers, friction
+@kernel
+def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tuple[int, float]:
+    """The joint that lacks most of its travel, over what is ``allowed`` (n,), and how much, with its sign; -1: none.
+
+    What it was sent as of ``now`` and as of its delay (``late``, (n,) each) bounds where it should be.
+    """
+    worst, most = -1, 1.0
+    missing = 0.0
+    for j in range(allowed.shape[0]):
+        beyond = min(abs(now[j]), abs(late[j])) if now[j] * late[j] > 0.0 else 0.0
+        if beyond > most * allowed[j]:
+            worst, most, missing = j, beyond / allowed[j], math.copysign(beyond, now[j])
+    return worst, missing
+
+
+@kernel
+def account_silence(
+    q: FloatArray, velocity: FloatArray, answers: FloatArray, friction: FloatArray, dt_s: float,
+    silent_from: FloatArray, silent_travel: FloatArray, silent_s: FloatArray,
+) -> None:  # fmt: skip
+    """Add up what each joint was sent (``velocity`` (n,), as it arrives), and for how long, since its reading changed.
+
+    ``friction`` (n,) may hold the rest back.
+    """
+    for j in range(q.shape[0]):
+        if abs(q[j] - silent_from[j]) > answers[j]:
+            silent_from[j], silent_travel[j], silent_s[j] = q[j], 0.0, 0.0
+            continue
+        felt = velocity[j] - min(max(velocity[j], -friction[j]), friction[j])
+        silent_travel[j] += felt * dt_s
+        if felt != 0.0:
+            silent_s[j] += dt_s
 
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
@@ -390,8 +395,6 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
 
 AGREE, OF = 2, 3
 """Rounds of the last ones that must say the same."""
-BACK_ROUNDS = 30
-"""Rounds in which a masked marker must stand where it should, to be used again."""
 LATEST_S = 0.15
 """By which at most, where nothing but noise is left then."""
 LATEST_MODEL_PX = 0.1
@@ -422,7 +425,8 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
         *watching.last[1 - OF :],
         _judged(watching, known, arrays, context.settings, proven=proven),
     ]
-    _unmask_returned(watching, known, context)
+    if watching.masked.any():
+        unmask_returned(watching, known, context)
     return _changed(watching)
 
 
@@ -484,37 +488,6 @@ def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
         watching.verdict = verdict
         return verdict
     return None
-
-
-def _unmask_returned(watching: ModelMonitor, known: list[int], context: StepContext) -> None:
-    """A masked marker that stands where it should again, to every camera that sees it, is used again."""
-    arrays = context.arrays
-    assert arrays is not None
-    masked = np.flatnonzero(watching.masked > 0.0)
-    if not masked.size:
-        return
-    bench = bench_now(watching, known, arrays, context.settings)
-    found = without_joint_errors(bench, bench.weights)
-    innovation = bench.innovation if found is None else found[0]
-    for i in masked:
-        seen = [
-            (watching.sightings[c].spread, innovation[row])
-            for row, c in enumerate(known)
-            if watching.sightings[c].seen[i] > 0.0
-        ]
-        if not seen:
-            continue
-        only, alone = slice(i, i + 1), np.ones(1)
-        good = all(
-            camera_chi2(shown[only], spread[only], alone, MODEL_SIGMA_PX)[0] <= improbable(2.0)
-            for spread, shown in seen
-        )
-        watching.back[i] = watching.back[i] + 1 if good else 0
-        if watching.back[i] >= BACK_ROUNDS:
-            watching.masked[i] = 0.0
-            marker = arrays.marker_ids[int(i)]
-            message = f"marker {marker} is where it should be again: it is used again"
-            context.emit("health", message=message, name="ok")
 
 
 def _monitor_model(context: StepContext) -> Iterator[Finding]:

@@ -201,3 +201,24 @@ class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
     """(c, m, 2, 2)"""
     frames: IntArray
     """Frames taken, by camera."""
+
+
+class DriveDelays(msgspec.Struct, eq=False):
+    """How late the joints' drives are, and what they lack of their travel besides; see `core.move`.
+
+    ``delay_s`` (n,) as measured, 0 before and where it is no matter: the median of ``samples`` (k, n) [s]. ``onset``
+    (6, n): the measurement in progress. ``sent`` (n,) [rad or m] in all, and ``past`` (r, n) of the last r ``steps``.
+    ``velocity`` (n,): the commands that arrive now; ``under_way`` (n,): travel that is sent and has not arrived yet.
+    ``missing`` (n,): arrived less measured travel of late, ``accounted`` (n,): arrived when the joints last told.
+    """
+
+    delay_s: FloatArray
+    samples: FloatArray
+    onset: FloatArray
+    sent: FloatArray
+    past: FloatArray
+    velocity: FloatArray
+    under_way: FloatArray
+    accounted: FloatArray
+    missing: FloatArray
+    steps: int = 0

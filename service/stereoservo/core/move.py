@@ -8,10 +8,14 @@ What friction takes of the velocity of a source that works on a goal is added to
 small commands and the travel that they have brought: an integral action for a joint that stands, and none for one that
 follows. Play and sag wind nothing up, since the encoder of a motor that turns through its play does move; for encoders
 behind the play see `_bounds`.
+
+A drive may answer commands a while later, and nobody may have said so. The delay of each joint is measured where it
+sets out from rest: from when it was sent a small travel until its reading shows it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,6 +26,8 @@ import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.servoing import unplanned_report
+from stereoservo.core.monitor_state import DriveDelays
+from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step
 from stereoservo.core.sources.incidence import incidence_motion, incidence_report
@@ -53,6 +59,7 @@ from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 
 
 def _rest(source: Source, context: StepContext) -> SourceOutput:
@@ -187,7 +194,7 @@ RISE_S = 0.25
 LAG_S = 0.06
 """Of a healthy drive: its travel is compared over longer."""
 MOST = {"revolute": 0.015, "prismatic": 0.0015}
-"""[rad/s, m/s] Half as much again as the friction of a healthy joint; see `monitor.FRICTION`."""
+"""[rad/s, m/s] Half as much again as the friction of a healthy joint; see `monitors.following.FRICTION`."""
 SMALL = 2.0
 """Times ``MOST``, up to which a wanted velocity is small."""
 LEAST_TRAVEL = {"revolute": 2e-4, "prismatic": 2e-5}
@@ -231,7 +238,8 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
         known = state.friction = FrictionCompensation(
             subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
         )
-    known.sent = known.sent + state.command * context.dt_s
+    arrives = state.command if state.delays is None else state.delays.velocity
+    known.sent = known.sent + arrives * context.dt_s
     known.sent_s = known.sent_s + context.dt_s
     wanted = output.velocity
     if context.ingested.joints is not None and _fresh(output, context):
@@ -272,3 +280,108 @@ def _fresh(output: SourceOutput, context: StepContext) -> bool:
         return True
     newest_ns = max([estimate.accepted_ns for estimate in context.state.cameras], default=0)
     return (context.now_ns - newest_ns) * 1e-9 <= context.derived.features_fresh_s
+
+
+# -- late drives ------------------------------------------------------------------------------------------------
+
+LEAST_S, LONGEST_S = 0.04, 0.25
+"""Friction and play look like less; a drive that is later does not follow."""
+SAMPLES = 5
+"""Of a joint's delay, of which the median counts."""
+ONSET_S = 0.1
+"""In which a joint that sets out must be sent the travel that is timed; friction and play would count at less speed."""
+ONSET_TRAVEL = 2.0
+"""The travel that is timed, times that by which a reading answers."""
+WAITS, RESTS, SETS_OUT = 0.0, 1.0, 2.0
+"""Phases of a measurement."""
+PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S = range(6)
+"""Rows of `DriveDelays.onset`."""
+
+
+def unknown_delays(settings: CoreSettings) -> DriveDelays:
+    """Of joints of which nothing has been sent or seen."""
+    n = len(settings.joint_names)
+    return DriveDelays(
+        delay_s=np.zeros(n), samples=np.full((SAMPLES, n), np.nan), onset=np.zeros((6, n)), sent=np.zeros(n),
+        past=np.zeros((math.ceil(LONGEST_S * settings.rate_hz) + 2, n)), velocity=np.zeros(n),
+        under_way=np.zeros(n), accounted=np.zeros(n), missing=np.zeros(n),
+    )  # fmt: skip
+
+
+@kernel
+def measure_delays(
+    command: FloatArray, q: FloatArray, answers: FloatArray, dt_s: float, sent: FloatArray, onset: FloatArray,
+    samples: FloatArray, delay_s: FloatArray,
+) -> None:  # fmt: skip
+    """Account for ``dt_s`` [s] at the velocities ``command`` (n,), into the arrays of `DriveDelays`.
+
+    ``answers`` (n,): by which the readings ``q`` (n,) answer.
+    """
+    for j in range(q.shape[0]):
+        sent[j] += command[j] * dt_s
+        travel = ONSET_TRAVEL * answers[j]
+        onset[RESTED_S, j] = onset[RESTED_S, j] + dt_s if command[j] == 0.0 else 0.0
+        if onset[PHASE, j] == WAITS and onset[RESTED_S, j] >= LONGEST_S:
+            onset[PHASE, j] = RESTS
+        if onset[PHASE, j] == RESTS:
+            if command[j] == 0.0:
+                onset[STOOD_AT, j], onset[SENT_BEFORE, j] = q[j], sent[j]
+                continue
+            onset[PHASE, j], onset[SINCE_S, j], onset[PASSED_S, j] = SETS_OUT, 0.0, -1.0
+        if onset[PHASE, j] != SETS_OUT:
+            continue
+        onset[SINCE_S, j] += dt_s
+        was_sent, made = sent[j] - onset[SENT_BEFORE, j], q[j] - onset[STOOD_AT, j]
+        if onset[PASSED_S, j] >= 0.0:
+            onset[PASSED_S, j] += dt_s
+        elif abs(was_sent) >= travel:
+            onset[PASSED_S, j] = 0.0
+        late = onset[PASSED_S, j] > LONGEST_S or (onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S)
+        if abs(made) >= travel or late:
+            onset[PHASE, j] = WAITS
+            if not late and onset[PASSED_S, j] >= 0.0 and made * was_sent > 0.0:
+                _push(samples[:, j], onset[PASSED_S, j])
+                median_s = _median(samples[:, j])
+                delay_s[j] = median_s if median_s >= LEAST_S else 0.0
+
+
+@kernel
+def _push(samples: FloatArray, newest: float) -> None:
+    for k in range(samples.shape[0] - 1):
+        samples[k] = samples[k + 1]
+    samples[-1] = newest
+
+
+@kernel
+def _median(samples: FloatArray) -> float:
+    """Of those that are numbers: the middle one, of two the greater."""
+    known = np.sort(samples[np.isfinite(samples)])
+    return float(known[known.size // 2])
+
+
+@kernel
+def account_travel(
+    command: FloatArray, moved: FloatArray, told: bool, keep: float, dt_s: float, period_s: float, step: int,
+    delays: tuple[FloatArray, ...], untold: FloatArray, missing: FloatArray,
+) -> None:  # fmt: skip
+    """Account for ``dt_s`` [s] of travel, sent as of now in ``untold`` and ``missing`` (n,), as of the delays in
+    ``delays``: `DriveDelays`' ``delay_s``, ``sent``, ``past``, ``velocity``, ``under_way``, ``accounted``, ``missing``.
+
+    ``moved`` (n,): of the readings since they were last ``told``; ``keep``: share of what is missing that is kept.
+    """
+    delay_s, sent, past, velocity, under_way, accounted, missing_late = delays
+    rows = past.shape[0]
+    for j in range(command.shape[0]):
+        untold[j] += command[j] * dt_s
+        past[step % rows, j] = sent[j]
+        back = min(round(delay_s[j] / period_s), rows - 2)
+        arrived = past[(step - back) % rows, j]
+        under_way[j] = sent[j] - arrived
+        velocity[j] = (arrived - past[(step - back - 1) % rows, j]) / dt_s if dt_s > 0.0 else 0.0
+        if not told:
+            missing[j] *= keep
+            missing_late[j] *= keep
+            continue
+        missing[j] = keep * (missing[j] + untold[j] - moved[j])
+        missing_late[j] = keep * (missing_late[j] + arrived - accounted[j] - moved[j])
+        untold[j], accounted[j] = 0.0, arrived

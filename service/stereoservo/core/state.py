@@ -14,6 +14,7 @@ from stereoservo.control.faces import Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
 from stereoservo.core.cycle import WayFrame, decode_array, encode
 from stereoservo.core.monitor_state import (
+    DriveDelays,
     MobileCamera,
     ModelMonitor,
     ObservationStatistics,
@@ -443,8 +444,7 @@ class CoreState(msgspec.Struct, eq=False):
     driver_request: str
     missing_travel: FloatArray
     """Commanded less measured travel of late (n,) [rad or m]; see `core.monitor`."""
-    untold_travel: FloatArray
-    """Commanded since the last joint sample (n,)."""
+    untold_travel: FloatArray  # commanded since the last joint sample (n,)
     last_followed_ns: int
     last_positions: FloatArray | None
     correction: FloatArray
@@ -465,8 +465,8 @@ class CoreState(msgspec.Struct, eq=False):
     """Sent since (n,), with its sign, less what friction may hold back [rad or m]."""
     silent_s: FloatArray = msgspec.field(default_factory=lambda: np.zeros(0))
     """For how long (n,) more than that was sent since."""
-    friction: FrictionCompensation | None = None
-    """None while nothing works on a goal."""
+    friction: FrictionCompensation | None = None  # while nothing works on a goal
+    delays: DriveDelays | None = None  # before joints are watched
 
 
 def initial_state(settings: CoreSettings) -> CoreState:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.core.cycle import Event, StepInputs, StepOutputs
-from stereoservo.core.monitor import FRICTION
+from stereoservo.core.monitors.following import FRICTION
 from stereoservo.daemon.lockstep import LockstepCell, LockstepTimeoutError
 from stereoservo.messages.cell_file import CellFile, check_cell
 from stereoservo.messages.goals import Enable, FeatureTarget, Goal, JointTarget, Reset, Resume, RunGoal

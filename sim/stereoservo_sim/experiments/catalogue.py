@@ -100,9 +100,15 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
         Experiment(
             "late-drives",
-            "drives 100 to 150 ms late with friction, unstated: goals with the learnt model and with the true one",
+            "drives 100 to 200 ms late with friction, unstated: goals with the learnt model and with the true one",
             "arms.late_drives",
             (repetitions(10),),
+        ),
+        Experiment(
+            "preset-verdicts",
+            "every preset of mechanics at work for ten virtual minutes: what the watch says where nothing has happened",
+            "arms.preset_verdicts",
+            (repetitions(1),),
         ),
         Experiment(
             "inverse-kinematics",

@@ -27,6 +27,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.summaries import wilson
 
 LISTED, WIDEST = 200, 400
 """Rows of a table that a person still reads; its characters across at most."""
@@ -194,3 +195,34 @@ def cell_text(value: Any) -> str:
     if isinstance(value, list):
         return " to ".join(cell_text(item) for item in value)
     return "-" if value is None else str(value)
+
+
+def count_row(what: str, count: int, of: int) -> dict[str, Any]:
+    """A row of counts with its Wilson bounds at 95 %."""
+    low, high = wilson(count, of) if of else (0.0, 1.0)
+    return {"goals": what, "count": count, "of": of, "wilson_low": low, "wilson_high": high}
+
+
+def draw_sorted(
+    curves: Mapping[str, list[float]], quantity: str, path: Path, limit: float | None = None
+) -> list[Path]:
+    """Draw what share of the cases has at most so much of a ``quantity``, a curve for each list of values; the path of
+    the figure. Raises OSError.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
+    for name, values in curves.items():
+        axes.ecdf(values or [0.0], label=f"{name} ({len(values)})")
+    if limit is not None:
+        axes.axvline(limit, color="0.5", linestyle="--")
+    axes.set_xlabel(quantity)
+    axes.set_ylabel("share of the cases")
+    axes.legend()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return [path]

@@ -78,8 +78,8 @@ class GoalEnd:
 
 
 class DrivenCell:
-    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: where the joints stand, and
-    ``path``: where they stood after each cycle.
+    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: where the joints stand,
+    ``path``: where they stood after each cycle, ``verdicts``: what the watch over the model has told.
     """
 
     def __init__(
@@ -102,6 +102,7 @@ class DrivenCell:
         self._past: list[tuple[int, FloatArray]] = []
         self.command = np.zeros_like(q)
         self.path: list[FloatArray] = []
+        self.verdicts: list[str] = []
         self.step(model_update=None if model is None else ModelUpdate(with_groups(model)))
         self.step(Enable())
         for _ in range(round(FIRST_FRAMES_S * RATE_HZ)):
@@ -138,6 +139,9 @@ class DrivenCell:
                 model_update=model_update,
             )
         )  # fmt: skip
+        self.verdicts += [
+            event.name for event in outputs.events if event.kind == "health" and event.name != "ok"
+        ]
         if outputs.driver_request:
             self._active = outputs.driver_request == "activate"
         if self._seq % round(RATE_HZ / CAMERA_HZ) == 0:

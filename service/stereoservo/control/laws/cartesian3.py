@@ -205,14 +205,24 @@ def cartesian_step(
                     wanted[a, k] += steps[i] * parts.generators[i, a, k]
         velocity = damped_step(operators, V, values, wanted, dt_s if dt_s > 0.0 else 1.0)
         if dt_s > 0.0:
+            share = _shortened(velocity) / dt_s
             for j in range(n):
-                velocity[j] /= dt_s
+                velocity[j] *= share
     else:
         _exact_into(operators, composition, task, parts, steps, dt_s, velocity)
     if sight.hinge_first:
         errors[1] = sight.whole
         shown[1] = WAITS
     return velocity, errors, allowed, shown
+
+
+@kernel
+def _shortened(step: FloatArray) -> float:
+    """Share of a joint step (n,) that takes no joint farther than `LONGEST_STEP`."""
+    most = 0.0
+    for j in range(step.shape[0]):
+        most = max(most, abs(step[j]))
+    return 1.0 if not most > LONGEST_STEP else LONGEST_STEP / most
 
 
 @kernel
@@ -231,10 +241,7 @@ def _exact_into(
             velocity[j] += steps[i] * parts.screws[i, j]
     if not dt_s > 0.0:
         return
-    most = 0.0
-    for j in range(n):
-        most = max(most, abs(velocity[j]))
-    share = 1.0 if not most > LONGEST_STEP else LONGEST_STEP / most
+    share = _shortened(velocity)
     for j in range(n):
         velocity[j] *= share
     held, wanted = np.empty((4, 4)), np.empty((4, 4))

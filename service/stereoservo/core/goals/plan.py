@@ -143,13 +143,11 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
     path = context.derived.laws[source.law].path
     if path == "free" and not at_goal:
         return report
-    hint = ""
-    if not at_goal:
-        planned = LAWS.on_path("planned")
-        hint = (
-            f"; law {planned[0]!r} looks for another way" if path == "straight" and planned
-            else "; no other way was found either: go by another goal between"
-        )  # fmt: skip
+    hint, planned = "", LAWS.on_path("planned")
+    if path != "planned" and planned and not (at_goal and approaches[0].code == "NOT_REACHABLE"):
+        hint = f"; law {planned[0]!r} looks for another way, and for another posture at the goal"
+    elif not at_goal:
+        hint = "; no other way was found either: go by another goal between"
     reasons = tuple(
         Reason(a.code, "info", a.subject, a.value, a.limit, a.unit, text + (hint if k == 0 else ""))
         for k, (a, text) in enumerate(zip(approaches, texts, strict=True))

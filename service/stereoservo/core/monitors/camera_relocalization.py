@@ -224,7 +224,7 @@ def _moved_again(run: Relocalization, context: StepContext) -> bool:
     looked = False
     for c, camera in enumerate(context.settings.cameras):
         sighting = context.state.watching.sightings[c]
-        if sighting.t_ns <= run.phase_ns or not sighting.fresh:
+        if not (sighting.fresh and _after(c, run.phase_ns, context.state)):
             continue
         known = run.referred[c] > 0.0
         both = known & (sighting.seen > 0.0)
@@ -262,15 +262,26 @@ def _moved_again(run: Relocalization, context: StepContext) -> bool:
     return True
 
 
+def _moved(run: Relocalization, context: StepContext) -> list[int]:
+    """Numbers of the cameras that have moved."""
+    return [c for c, camera in enumerate(context.settings.cameras) if camera.name in run.cameras]
+
+
+def _after(camera: int, t_ns: int, state: CoreState) -> bool:
+    """Whether the shutter of a camera's newest frame opened after ``t_ns``, as far as its stamps are known."""
+    return state.watching.sightings[camera].t_ns + state.cameras[camera].offset_ns > t_ns
+
+
 def _look(run: Relocalization, context: StepContext) -> None:
-    for observation in context.observations:
-        at_shutter = joints_at(context.state.history, observation.t_shutter_ns)
+    for camera, observation in context.ingested.observations:
+        offset_ns = context.state.cameras[camera].offset_ns
+        at_shutter = joints_at(context.state.history, observation.t_shutter_ns + offset_ns)
         if at_shutter is not None and add_observation(
-            run.sums, context.settings, observation, FRAMES, run.phase_ns
+            run.sums, context.settings, observation, FRAMES, run.phase_ns - offset_ns
         ):
             run.joint_sum += at_shutter
             run.joint_frames += 1
-    wanted = [c for c, camera in enumerate(context.settings.cameras) if camera.name in run.cameras]
+    wanted = _moved(run, context)
     waited_s = (context.now_ns - run.phase_ns) * 1e-9
     if not bool((run.sums.frames[wanted] >= FRAMES).all()) and waited_s <= COLLECT_S:
         return
@@ -308,8 +319,8 @@ def _unproven(run: Relocalization, context: StepContext) -> bool:
     """Whether nothing proves that it was the cameras, and not the arm; then the goal stays held."""
     state, settings = context.state, context.settings
     assert context.arrays is not None
-    looked = [c for c, sighting in enumerate(state.watching.sightings) if sighting.t_ns > run.phase_ns]
-    moved = [c for c, camera in enumerate(settings.cameras) if camera.name in run.cameras]
+    looked = [c for c in range(len(settings.cameras)) if _after(c, run.phase_ns, state)]
+    moved = _moved(run, context)
     usable = [c for c in looked if (mobile := state.mobile[c]) is None or not mobile.moving]
     run.doubt = (
         doubt(bench_now(state.watching, usable, context.arrays, settings), moved, run.moved_px)
@@ -329,13 +340,11 @@ def _unproven(run: Relocalization, context: StepContext) -> bool:
 def _where_they_were(run: Relocalization, context: StepContext) -> bool:
     """Whether the cameras, looked at at rest, stand where they stood; then all goes on with the model of before."""
     state = context.state
-    seen = [
-        sighting
-        for camera, sighting in zip(context.settings.cameras, state.watching.sightings, strict=True)
-        if camera.name in run.cameras
-    ]
     last = state.watching.last[-VERIFY_ROUNDS:]
-    looked = all(s.t_ns > run.phase_ns and int(s.seen.sum()) >= FEWEST for s in seen)
+    looked = all(
+        _after(c, run.phase_ns, state) and int(state.watching.sightings[c].seen.sum()) >= FEWEST
+        for c in _moved(run, context)
+    )
     if not looked or len(last) < VERIFY_ROUNDS or any(verdict.kind != "ok" for verdict in last):
         return False
     state.reanchoring = None
@@ -358,10 +367,11 @@ def _known(sample: Sample, context: StepContext) -> list[int]:
 
 def _seen_now(run: Relocalization, context: StepContext) -> int:
     """Known points in the newest frames of the cameras that have moved; of all, where it is in doubt that they have."""
+    cameras = range(len(context.settings.cameras)) if run.doubt else _moved(run, context)
     return sum(
-        int(sighting.seen.sum())
-        for camera, sighting in zip(context.settings.cameras, context.state.watching.sightings, strict=True)
-        if (run.doubt or camera.name in run.cameras) and sighting.t_ns > run.phase_ns
+        int(context.state.watching.sightings[c].seen.sum())
+        for c in cameras
+        if _after(c, run.phase_ns, context.state)
     )
 
 
@@ -447,12 +457,8 @@ def _verify(run: Relocalization, context: StepContext) -> None:
     state = context.state
     watching = state.watching
     last = watching.last[-VERIFY_ROUNDS:]
-    seen = [
-        sighting
-        for camera, sighting in zip(context.settings.cameras, watching.sightings, strict=True)
-        if camera.name in run.cameras
-    ]
-    looked = all(s.t_ns > run.phase_ns and int(s.seen.sum()) >= 3 for s in seen)
+    moved = _moved(run, context)
+    looked = all(_after(c, run.phase_ns, state) and int(watching.sightings[c].seen.sum()) >= 3 for c in moved)
     if len(last) == VERIFY_ROUNDS and looked and all(verdict.kind == "ok" for verdict in last):
         _known_again(run, context)
         return
@@ -470,7 +476,7 @@ def _verify(run: Relocalization, context: StepContext) -> None:
         _forget(list(run.cameras), context)
         _enter(run, "brake", context)
         return
-    worst = max(sighting.rms_px for sighting in seen)
+    worst = max(watching.sightings[c].rms_px for c in moved)
     _fail(run, context, "frames of now contradict each model that was made", worst, "px")
 
 

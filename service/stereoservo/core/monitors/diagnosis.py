@@ -6,16 +6,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import (
     MOVED,
     ModelDiagnosis,
+    ModelMonitor,
     nothing_sighted,
 )
 from stereoservo.core.monitors import camera_relocalization
-from stereoservo.core.monitors.fault_isolation import LEAST_PX
+from stereoservo.core.monitors.fault_isolation import LEAST_PX, bench_now, without_joint_errors
 from stereoservo.core.move import MOTION_SOURCES
+from stereoservo.core.prediction import MODEL_SIGMA_PX, camera_chi2, improbable
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.messages.reasons import Reason
@@ -104,3 +108,38 @@ def camera_moved_findings(verdict: ModelDiagnosis, context: StepContext, *, fres
     context.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
     if source.runs_law:
         yield Finding("abort", reason, hint)
+
+
+BACK_ROUNDS = 30
+"""Rounds in which a masked marker must stand where it should, to be used again."""
+
+
+def unmask_returned(watching: ModelMonitor, known: list[int], context: StepContext) -> None:
+    """A masked marker that stands where it should again, to every camera that sees it, is used again."""
+    arrays = context.arrays
+    assert arrays is not None
+    masked = np.flatnonzero(watching.masked > 0.0)
+    if not masked.size:
+        return
+    bench = bench_now(watching, known, arrays, context.settings)
+    found = without_joint_errors(bench, bench.weights)
+    innovation = bench.innovation if found is None else found[0]
+    for i in masked:
+        seen = [
+            (watching.sightings[c].spread, innovation[row])
+            for row, c in enumerate(known)
+            if watching.sightings[c].seen[i] > 0.0
+        ]
+        if not seen:
+            continue
+        only, alone = slice(i, i + 1), np.ones(1)
+        good = all(
+            camera_chi2(shown[only], spread[only], alone, MODEL_SIGMA_PX)[0] <= improbable(2.0)
+            for spread, shown in seen
+        )
+        watching.back[i] = watching.back[i] + 1 if good else 0
+        if watching.back[i] >= BACK_ROUNDS:
+            watching.masked[i] = 0.0
+            marker = arrays.marker_ids[int(i)]
+            message = f"marker {marker} is where it should be again: it is used again"
+            context.emit("health", message=message, name="ok")

@@ -35,6 +35,12 @@ SUSPECT_MARKERS = 3
 """Of which each is left out in turn."""
 FEWEST_ON_ARM = 4
 """Markers on the arm by which a camera may confirm that the arm is where its joints say."""
+WAYS_OUT = (
+    "Where cameras moved: put them back and resume, or calibrate. Where joints are off: calibrate --check "
+    "--reset-zeros. Where the marker body moved on the arm: put it back and resume, or calibrate. Static markers in "
+    "view of every camera ([scene] static) tell them apart"
+)
+"""What a person can do, cause by cause, where moved cameras and a moved arm cannot be told apart."""
 FEWEST_STATIC = 3
 """Static points that must have moved in the picture of a camera to prove that the camera has: one or two may have been
 pushed themselves.
@@ -157,8 +163,7 @@ def doubt(bench: Bench, moved: list[int], px: float) -> str:
     )
     return (
         f"{disagree}: either {'all of them' if some else 'it'} moved, or {arm}; these cannot be told apart, "
-        f"for no other camera confirms the joints and {why}. Run calibrate --check, or calibrate; static markers in "
-        "view of every camera ([scene] static) tell them apart"
+        f"for no other camera confirms the joints and {why}. {WAYS_OUT}"
     )
 
 

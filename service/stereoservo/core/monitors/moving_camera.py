@@ -24,6 +24,7 @@ from stereoservo.core.monitors.fault_isolation import (
     FEWEST_ON_ARM,
     FEWEST_STATIC,
     LEAST_PX,
+    WAYS_OUT,
     named,
     thresholds_of,
 )
@@ -408,8 +409,8 @@ def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
         hint = (
             f"{named(names)} shows the arm {px:.3g} px rms from where its joints say: either the camera moved, or the "
             "arm stands elsewhere than its joints say (play, joint zeros, the marker body); no camera that stands sees "
-            f"the arm, and no {FEWEST_STATIC} static points moved, to tell them apart. Let a camera that stands see "
-            "the arm, run calibrate --check, or calibrate"
+            f"the arm, and no {FEWEST_STATIC} static points moved. {WAYS_OUT}, and a camera that stands and sees the "
+            "arm"
         )
         return (Reason("CAMERAS_OR_ARM", "hold", ", ".join(names), px, LEAST_PX, "px", hint),)
     lost = ", ".join(

@@ -170,6 +170,15 @@ def approach_velocity(
     return distance * min(float((speed / length).min()), APPROACH_GAIN)
 
 
+def joints_ahead(context: StepContext) -> FloatArray:
+    """Where the joints (n,) will be when late drives have made what they were sent, less what friction takes of it."""
+    delays, friction = context.state.delays, context.state.friction
+    if delays is None or not delays.delay_s.any():
+        return context.q
+    lost = 0.0 if friction is None else np.abs(friction.velocity) * delays.delay_s
+    return context.q + delays.under_way - np.clip(delays.under_way, -lost, lost)
+
+
 def arrived(q: FloatArray, target: FloatArray, settings: CoreSettings) -> bool:
     """Whether every joint is within its arrival tolerance of its target."""
     return bool((np.abs(target - q) < settings.arrival).all())
@@ -182,7 +191,10 @@ def farthest(q: FloatArray, target: FloatArray, settings: CoreSettings) -> int:
 
 def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
     """One step of a joint move; it ends when it arrived and rested, or at its time limit."""
-    still = arrived(context.q, move.target, context.settings)
+    ahead = joints_ahead(context)
+    still = arrived(context.q, move.target, context.settings) and arrived(
+        ahead, move.target, context.settings
+    )
     move.settled = move.settled + 1 if still else 0
     worst = farthest(context.q, move.target, context.settings)
     if move.settled >= ARRIVED_STEPS:
@@ -199,7 +211,7 @@ def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
         context.emit("goal_aborted", id=move.id, message="joint move not finished in time", reasons=(reason,))
         return SourceOutput(np.zeros_like(context.q), finished=True)
     return SourceOutput(
-        approach_velocity(context.q, move.target, context.settings, move.speed_scale),
+        approach_velocity(ahead, move.target, context.settings, move.speed_scale),
         speed_scale=move.speed_scale,
     )
 

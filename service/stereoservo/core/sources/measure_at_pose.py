@@ -16,7 +16,7 @@ from stereoservo.core.cycle import Sample
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.prediction import joints_at, rows_of
 from stereoservo.core.settings import CameraSettings, CoreSettings, TrialSettings
-from stereoservo.core.sources.joint_move import approach_velocity, arrived, farthest
+from stereoservo.core.sources.joint_move import approach_velocity, arrived, farthest, joints_ahead
 from stereoservo.core.state import PoseMeasurement
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -51,7 +51,7 @@ def add_observation(
     frames_wanted: int,
     after_ns: int,
 ) -> bool:
-    """Add one frame, when its shutter opened after ``after_ns`` and its camera still lacks frames; whether it was."""
+    """Add one frame, when it is stamped after ``after_ns`` and its camera still lacks frames; whether it was."""
     camera = next(i for i, c in enumerate(settings.cameras) if c.name == observation.camera)
     if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_wanted:
         return False
@@ -147,14 +147,16 @@ def enter(visit: PoseMeasurement, phase: Phase, context: StepContext) -> None:
 
 def at_target(visit: PoseMeasurement, context: StepContext) -> bool:
     """Whether the arm rests at the target."""
-    return arrived(context.q, visit.target, context.settings) and bool(
-        (np.abs(context.state.command) < AT_REST).all()
+    return (
+        arrived(context.q, visit.target, context.settings)
+        and arrived(joints_ahead(context), visit.target, context.settings)
+        and bool((np.abs(context.state.command) < AT_REST).all())
     )
 
 
 def continue_move(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> SourceOutput:
     """Towards the target."""
-    velocity = approach_velocity(context.q, visit.target, context.settings, trial.speed_scale)
+    velocity = approach_velocity(joints_ahead(context), visit.target, context.settings, trial.speed_scale)
     return SourceOutput(velocity, speed_scale=trial.speed_scale)
 
 
@@ -202,11 +204,14 @@ def collect_samples(
         if (context.now_ns - visit.phase_ns) * 1e-9 >= trial.settle_s:
             enter(visit, "collect", context)
         return None
-    for observation in context.observations:
-        at_shutter = joints_at(context.state.history, observation.t_shutter_ns)
+    for camera, observation in context.ingested.observations:
+        offset_ns = context.state.cameras[camera].offset_ns
+        at_shutter = joints_at(context.state.history, observation.t_shutter_ns + offset_ns)
         if at_shutter is None:
             continue
-        if add_observation(visit.sums, context.settings, observation, trial.frames, visit.phase_ns):
+        if add_observation(
+            visit.sums, context.settings, observation, trial.frames, visit.phase_ns - offset_ns
+        ):
             visit.joint_sum += at_shutter
             visit.joint_frames += 1
     silent = min(estimate.last_seq for estimate in context.state.cameras) < 0

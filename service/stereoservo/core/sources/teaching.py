@@ -57,8 +57,9 @@ def teach_step(context: StepContext) -> None:
     if state.reanchoring is not None or moving_cameras(state, settings):
         _give_up(teaching, context, "a camera moved")
         return
-    for observation in context.observations:
-        add_observation(teaching, settings, observation, teaching.frames_wanted, teaching.started_ns)
+    for camera, observation in context.ingested.observations:
+        after_ns = teaching.started_ns - state.cameras[camera].offset_ns
+        add_observation(teaching, settings, observation, teaching.frames_wanted, after_ns)
     if bool((teaching.frames >= teaching.frames_wanted).all()):
         state.teaching = None
         context.emit(

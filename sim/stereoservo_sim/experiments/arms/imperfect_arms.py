@@ -24,9 +24,8 @@ from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.arms.random_mechanics import driven_stops
-from stereoservo_sim.experiments.experiment import ExperimentError, show_rows
+from stereoservo_sim.experiments.experiment import ExperimentError, count_row, draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
-from stereoservo_sim.summaries import wilson
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX, DrivenCell, GoalEnd, Imperfections
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.mechanical_trials import mechanical_trials, synthetic_load
@@ -202,10 +201,14 @@ def run_imperfect_arms(
         "model": model,
         "title": f"imperfect-arms: cases {seed} to {seed + seeds - 1}, model {model}, tolerance {TOLERANCE_PX:g} px",
         "rows": [
-            _row("reached", len(reached), moved),
-            _row("falsely called reached", len(false), len(reached)),
-            _row("reversal in 60 s", sum(goal.reversals > 0 for goal in reached), len(reached)),
+            count_row("reached", len(reached), moved),
+            count_row("falsely called reached", len(false), len(reached)),
+            count_row("reversal in 60 s", sum(goal.reversals > 0 for goal in reached), len(reached)),
         ],
+        "errors_px": {
+            "when reached": [goal.error_px for goal in reached],
+            "a minute later": [goal.later_px for goal in reached],
+        },
         "error_px": _spread([goal.error_px for goal in reached]),
         "later_px": _spread([goal.later_px for goal in reached]),
         "seconds": _spread([goal.seconds for goal in reached]),
@@ -220,11 +223,6 @@ def run_imperfect_arms(
     }
 
 
-def _row(name: str, count: int, of: int) -> dict[str, Any]:
-    low, high = wilson(count, of) if of else (0.0, 1.0)
-    return {"goals": name, "count": count, "of": of, "wilson_low": low, "wilson_high": high}
-
-
 def _spread(values: list[float]) -> dict[str, float] | None:
     if not values:
         return None
@@ -232,8 +230,9 @@ def _spread(values: list[float]) -> dict[str, float] | None:
 
 
 def draw_imperfect_arms(answer: dict[str, Any], folder: Path) -> list[Path]:
-    """Nothing: the answer is a table of counts."""
-    return []
+    """True errors of goals called reached, then and a minute later, beside what would be false. Raises OSError."""
+    limit = FALSE * TOLERANCE_PX
+    return draw_sorted(answer["errors_px"], "true error [px]", folder / "imperfect_arms.png", limit)
 
 
 def show_imperfect_arms(answer: dict[str, Any], console: Console) -> None:

@@ -1,0 +1,65 @@
+"""Joints that do not follow: bounds and reasons of the watch in `core.monitor`.
+
+What a joint was sent is compared with its reading as of now and as of its drive's delay (`core.move.measure_delays`),
+and what lies between the two is not missing.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from stereoservo.core.settings import CoreSettings
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray
+
+MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
+LAG_S = 0.15  # a healthy drive lags by less than this at full speed
+SILENCE_S = 0.25  # of motion after which a reading has answered, whatever the drive's lag
+PLAY = {"revolute": 0.06, "prismatic": 0.005}  # [rad, m] sent before a healthy joint's reading answers
+ANSWERS = {
+    "revolute": 1e-3,
+    "prismatic": 1e-4,
+}  # [rad, m] by which a reading answers, where its step is no coarser
+FRICTION = {"revolute": 0.01, "prismatic": 0.001}  # [rad/s, m/s] below which a healthy joint may stick
+
+
+@lru_cache(maxsize=8)
+def of_kinds(
+    kinds: tuple[str, ...], resolution: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds and encoder steps; not to be written to."""
+    play, answers, friction = (
+        np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION)
+    )
+    if resolution:
+        answers = np.maximum(answers, 1.5 * np.array(resolution))  # one step to and fro is no motion
+    for value in (play, answers, friction):
+        value.setflags(write=False)
+    return play, answers, friction
+
+
+def not_following(joint: int, missing: float, limit: float, delay_s: float, settings: CoreSettings) -> Reason:
+    """That a joint lacks ``missing`` of its travel, with its sign, of which ``limit`` is lag."""
+    name, unit = settings.joint_names[joint], settings.joint_unit(joint)
+    known = f", {delay_s:.2f} s of delay apart" if delay_s > 0.0 else ""
+    return Reason(
+        "JOINT_NOT_FOLLOWING", "fault", name, abs(missing), limit, unit,
+        f"joint {name} lacks {missing:+.3f} {unit} of the travel it was sent (up to {limit:.3f} is lag{known}): check "
+        "its encoder, brake and drive; then reset and enable",
+    )  # fmt: skip
+
+
+def silent(joint: int, sent: float, since_s: float, settings: CoreSettings) -> Reason:
+    """That the reading of a joint stood still for ``since_s`` while it was ``sent`` travel."""
+    name, unit, limit = (
+        settings.joint_names[joint],
+        settings.joint_unit(joint),
+        PLAY[settings.joint_kinds[joint]],
+    )
+    return Reason(
+        "JOINT_NOT_FOLLOWING", "fault", name, abs(sent), limit, unit,
+        f"the reading of joint {name} stood still for {since_s:.2f} s while it was sent {sent:+.3f} {unit} of travel "
+        f"(up to {limit:g} may be play): check its encoder, brake and drive; then reset and enable",
+    )  # fmt: skip
