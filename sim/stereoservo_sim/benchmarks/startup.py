@@ -49,12 +49,12 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
     commands = _commands(repetitions, progress)
     with tempfile.TemporaryDirectory(prefix="stereoservo-startup-") as scratch:
         folder = Path(scratch)
-        environment = {
+        variables = {
             RUNTIME_VARIABLE: str(folder / "run"),
             STATE_VARIABLE: str(folder / "state"),
             "NUMBA_CACHE_DIR": str(folder / "cache"),
         }
-        with _environment(environment):
+        with environment(variables):
             starts = []
             for k, name in enumerate(("first", "second")):
                 progress("starts", k, 2)
@@ -74,7 +74,8 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
 
 
 @contextmanager
-def _environment(variables: dict[str, str]) -> Iterator[None]:
+def environment(variables: dict[str, str]) -> Iterator[None]:
+    """Context manager: environment variables of this process and of those that it starts."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

@@ -71,6 +71,12 @@ def _startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
     return run_startup(repetitions, seed, progress)
 
 
+def _wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.wire import run_wire
+
+    return run_wire(repetitions, seed, progress)
+
+
 BENCHES: dict[str, Bench] = {
     "calibration": _calibration,
     "can": _can,
@@ -81,6 +87,7 @@ BENCHES: dict[str, Bench] = {
     "soak": _soak,
     "soak-live": _soak_live,
     "startup": _startup,
+    "wire": _wire,
 }
 """By the name given on the command line."""
 

@@ -1,0 +1,174 @@
+"""``bench wire``: how long messages take between a client and the servo loop of a daemon, beside bare zenoh over the
+same router.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from stereoservo.client import Client, ClientError
+from stereoservo.client.events import EventWatch
+from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE
+from stereoservo.messages.discovery import DaemonError, DaemonProcess
+from stereoservo.messages.wire import FeaturesMessage, StateMessage, decode
+from stereoservo_sim.benchmarks.startup import environment
+from stereoservo_sim.benchmarks.timing import summary
+from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.progress import ProgressCall
+
+LIMITS = "\n".join(
+    f'[[safety.limit]]\njoint = "j{k}"\nmin = -1.7\nmax = 1.7\nvelocity = 0.8\nacceleration = 3.0'
+    for k in range(1, 7)
+)
+CELL = f"""
+schema = 1
+[cell]
+name = "wire"
+[joints]
+driver = "fake"
+[[camera]]
+name = "left"
+driver = "fake"
+[[camera]]
+name = "right"
+driver = "fake"
+[safety]
+{LIMITS}
+[calibration]
+base = {{ j1 = 0.0, j2 = -1.3, j3 = -0.4, j4 = 0.0, j5 = 0.0, j6 = 0.0 }}
+"""
+"""The drivers without physics and pictures: what is timed is the wire."""
+CALLS = 100
+"""Of each kind, for each repetition that is asked for."""
+GOALS = 10
+ECHO = """
+import sys, time
+from stereoservo.client.session import client_config, open_session
+session = open_session(client_config(sys.argv[1], None))
+queryable = session.declare_queryable("bench/echo", lambda query: query.reply("bench/echo", b"{}"))
+print("ready", flush=True)
+sys.stdin.read()
+session.close()
+"""
+"""A process that answers at once, until its standard input ends."""
+
+
+def run_wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """``query_us``: a question to and its answer from another process, by bare zenoh and from the gateway (``status``);
+    ``command_us``: with the servo loop between (``hold``). ``put_us``: what a put takes its caller. ``one_way_us``:
+    from a message's making (a cycle, or a frame's arrival) to a client that waits for it. ``goal_us``: from sending a
+    joint goal to the cycle of its first command, and to the reply.
+
+    Raises ExperimentError where the daemon does not come up.
+    """
+    calls = repetitions * CALLS
+    with tempfile.TemporaryDirectory(prefix="stereoservo-wire-") as scratch:
+        folder = Path(scratch)
+        path, log = folder / "wire.toml", folder / "daemon.log"
+        path.write_text(CELL)
+        variables = {RUNTIME_VARIABLE: str(folder / "run"), STATE_VARIABLE: str(folder / "state")}
+        try:
+            with (
+                environment(variables),
+                DaemonProcess(path, options=("--seed", str(seed)), log=log) as daemon,
+            ):
+                info = daemon.wait_ready()
+                with Client(info.cell) as client, _echo(info.endpoint):
+                    client.enable()
+                    progress("wire", 0, 4)
+                    query = {
+                        "bare_zenoh": _times(lambda: client.query("bench/echo"), calls),
+                        "status": _times(client.status, calls),
+                    }
+                    progress("wire", 1, 4)
+                    command = {"hold": _times(client.hold, calls)}
+                    client.resume()
+                    put = _times(lambda: client.session.put("bench/unheard", b"{}"), calls)
+                    progress("wire", 2, 4)
+                    features = f"{client.keys.prefix}/features/left"
+                    ways = {
+                        "state": _one_way(client, client.keys.state, _of_state, calls),
+                        "features": _one_way(client, features, _of_features, calls),
+                    }
+                    progress("wire", 3, 4)
+                    goals = _goals(client, repetitions * GOALS)
+                    rate_hz = client.status().loop.rate_hz
+                    progress("wire", 4, 4)
+        except (ClientError, DaemonError) as error:
+            raise ExperimentError("wire", f"{error}; {log.read_text()[-2000:]}") from error
+    return {
+        "rate_hz": rate_hz,
+        "query_us": {name: summary(samples, 1e6) for name, samples in query.items()},
+        "command_us": {name: summary(samples, 1e6) for name, samples in command.items()},
+        "put_us": summary(put, 1e6),
+        "one_way_us": {name: summary(samples, 1e6) for name, samples in ways.items()},
+        "goal_us": {name: summary(samples, 1e6) for name, samples in goals.items()},
+    }
+
+
+@contextmanager
+def _echo(endpoint: str) -> Iterator[None]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", ECHO, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield
+    finally:
+        process.communicate(timeout=20.0)
+
+
+def _times(call: Callable[[], object], count: int) -> list[float]:
+    """Seconds of each call, with a pause between them that is no multiple of the loop's period."""
+    samples = []
+    for _ in range(count):
+        time.sleep(0.0033)
+        began = time.perf_counter()
+        call()
+        samples.append(time.perf_counter() - began)
+    return samples
+
+
+def _of_state(data: bytes) -> int:
+    return decode(data, StateMessage).t_ns
+
+
+def _of_features(data: bytes) -> int:
+    return decode(data, FeaturesMessage).t_received_ns
+
+
+def _one_way(client: Client, key: str, stamp: Callable[[bytes], int], count: int) -> list[float]:
+    """Seconds from a message's stamp until a client that waits for it has it."""
+    samples = []
+    subscriber = client.session.declare_subscriber(key)
+    try:
+        while len(samples) < count:
+            data = subscriber.recv().payload.to_bytes()
+            arrived = time.monotonic_ns()
+            samples.append((arrived - stamp(data)) * 1e-9)
+    finally:
+        subscriber.undeclare()
+    return samples
+
+
+def _goals(client: Client, count: int) -> dict[str, list[float]]:
+    """Of joint goals, one after the other: seconds from sending to the cycle of the first command, and to the reply."""
+    begins, replies = [], []
+    joint, start = next(iter(client.status().joints.items()))
+    for k in range(count):
+        with closing(EventWatch(client)) as watch:
+            began = time.monotonic_ns()
+            handle = client.goal({joint: start + (0.02 if k % 2 == 0 else 0.0)}, lease_s=None)
+            replies.append((time.monotonic_ns() - began) * 1e-9)
+            started = watch.wait(lambda event: event.kind == "goal_started", "a goal that starts", 10.0)
+            begins.append((started.t_ns - began) * 1e-9)
+        handle.wait(20.0)
+    return {"first_command": begins, "reply": replies}
