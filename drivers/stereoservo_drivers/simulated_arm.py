@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import (
     CommandReport,
@@ -18,6 +19,7 @@ from stereoservo.ports.devices import (
     JointSpec,
     JointState,
 )
+from stereoservo_drivers.kit.auxiliary import AuxiliaryMotion
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
 from stereoservo_sim.world.mechanical_plant import MechanicalPlant
@@ -36,6 +38,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
     resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept. ``mechanics``: a preset, or
     what is not perfect by joint, see `stereoservo_sim.world.mechanics`; its ``encoder_step`` replaces ``encoder``.
+    ``auxiliary``: joints and outputs beside the arm's, which nothing shows.
     """
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
@@ -45,6 +48,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     encoder: NonNegative = 1e-6
     history: Annotated[int, Meta(ge=64, le=10_000_000)] = CAPACITY
     mechanics: MechanicsOption = "none"
+    auxiliary: tuple[AuxiliarySpec, ...] = ()
 
 
 class SimulatedArm:
@@ -85,6 +89,7 @@ class SimulatedArm:
         )
         self._start = _start(self.driver, joints, base, options.start)
         self._life = DriverLifecycle(f"joint driver {self.driver!r}")
+        self._auxiliary = AuxiliaryMotion(options.auxiliary)
         self._bank: DriveBank | None = None
         self._history: TrueJointHistory | None = None
         self._seq = 0
@@ -105,6 +110,7 @@ class SimulatedArm:
             command_timeout_s=self._options.command_timeout_s,
             call_budget_us=self.call_budget_us,
             home=tuple(self._start.tolist()),
+            auxiliary=self._options.auxiliary,
         )
 
     def configure(self) -> None:
@@ -163,8 +169,22 @@ class SimulatedArm:
         self._write_seq += 1
         return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
 
+    def write_auxiliary(self, values: Mapping[str, float]) -> None:
+        """Order auxiliary joints and outputs. Raises DriverError: not active, no such name, outside its limits."""
+        self._life.require("write_auxiliary()", LifecycleState.ACTIVE)
+        self._auxiliary.order(values, self._context.clock.now_ns())
+
+    def read_auxiliary(self) -> dict[str, float]:
+        """Auxiliary joints and outputs now."""
+        return self._auxiliary.values(self._context.clock.now_ns())
+
+    def stop_auxiliary(self) -> None:
+        """Auxiliary joints stand where they are."""
+        self._auxiliary.stop(self._context.clock.now_ns())
+
     def stop(self) -> None:
         """Brake to rest. Any state; never raises."""
+        self.stop_auxiliary()
         if self._bank is not None and self._life.state in (LifecycleState.CONFIGURED, LifecycleState.ACTIVE):
             self._bank.brake(self._context.clock.now_ns())
             self._record(self._bank)

@@ -37,6 +37,7 @@ PATIENT: dict[str, Any] = {
 }
 CIA_402: dict[str, Any] = PATIENT | {
     "feedback": ["velocity", "effort", "following_error"],
+    "output": [{"name": "light", "node_id": 2, "bit": 16}],
     "joint": [
         can_joint(1),
         can_joint(2, direction=-1, velocity_units_per_rev_s=60_000.0, offset_rad=0.3),

@@ -23,7 +23,11 @@ class TestFakeGantry(JointDriverContract):
             {"name": "x", "kind": "prismatic", "min": -0.5, "max": 0.5, "velocity": 0.3, "acceleration": 1.0},
             {"name": "turn", "velocity": 2.0, "acceleration": 8.0},
         ]
-        return FakeJointDriver({"joints": joints, "rate_hz": 500.0}, context)
+        auxiliary = [
+            {"name": "gripper", "kind": "prismatic", "low": 0.0, "high": 0.08, "velocity": 0.1},
+            {"name": "light", "kind": "digital"},
+        ]
+        return FakeJointDriver({"joints": joints, "rate_hz": 500.0, "auxiliary": auxiliary}, context)
 
 
 class TestPybulletArm(JointDriverContract):

@@ -32,7 +32,18 @@ from stereoservo.daemon.servo import GATEWAY_SILENCE_S, ServoProcess
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.goals import Command, Enable, Jog, Request, Reset, Resume
+from stereoservo.messages.goals import (
+    AuxiliarySpec,
+    Command,
+    Disable,
+    Enable,
+    Hold,
+    Jog,
+    OrderAuxiliary,
+    Request,
+    Reset,
+    Resume,
+)
 from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import VirtualClock
@@ -102,10 +113,32 @@ class StubArm:
         self.calls.append("close")
 
 
+class GrippingArm(StubArm):
+    """With a gripper beside the joints."""
+
+    gripper = 0.0
+
+    def describe(self) -> JointDriverDescription:
+        gripper = AuxiliarySpec("gripper", "prismatic", 0.0, 0.08, 0.1)
+        return msgspec.structs.replace(super().describe(), auxiliary=(gripper,))
+
+    def write_auxiliary(self, values: dict[str, float]) -> None:
+        self._call("write_auxiliary")
+        self.gripper = values["gripper"]
+
+    def read_auxiliary(self) -> dict[str, float]:
+        return {"gripper": self.gripper}
+
+    def stop_auxiliary(self) -> None:
+        self.calls.append("stop_auxiliary")
+
+
 class Bench:
     """A servo process, its arm, and a gateway's ends of its links, on virtual time."""
 
-    def __init__(self, directory: Path, *, dry_run: bool = False, kernels: Any = None) -> None:
+    def __init__(
+        self, directory: Path, *, dry_run: bool = False, kernels: Any = None, arm: type[StubArm] = StubArm
+    ) -> None:  # fmt: skip
         self.directories = CellDirectories("bench", directory, directory)
         create_stop_slot(self.directories.stop_slot)
         create_slot(self.directories.observation_slot("left"), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
@@ -124,7 +157,7 @@ class Bench:
             }
         )
         self.clock = VirtualClock()
-        self.arm = StubArm(self.clock)
+        self.arm = arm(self.clock)
         camera = CameraDescription("stub", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2))
         core = ServoCore(core_settings(cell, self.arm.describe(), (camera,)))
         self.links = ProcessLinks(self.directories, ("left",))
@@ -526,4 +559,64 @@ def test_kernels_are_loaded_at_rest_alone_and_told_until_they_are(tmp_path: Path
     assert len(kernels.asked) == 10
     assert not any(kernels.asked)
     assert "COMPILING" not in [reason.code for reason in bench.state().status.reasons]
+    bench.links.close()
+
+
+@pytest.fixture
+def gripping(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path, arm=GrippingArm)
+    bench.connect()
+    bench.process.configure()
+    bench.run(5)
+    yield bench
+    bench.links.close()
+
+
+CLOSE = OrderAuxiliary({"gripper": 0.03})
+
+
+def test_an_order_to_a_gripper_goes_to_the_driver_while_the_arm_is_on(gripping: Bench) -> None:
+    refused = gripping.ask(CLOSE)
+    assert (refused.accepted, refused.reasons[0].code) == (False, "NOT_ACTIVE")
+    enabled(gripping)
+    assert gripping.ask(CLOSE).accepted
+    gripping.run(10)
+    assert gripping.state().auxiliary == {"gripper": 0.03}
+    assert gripping.ask(Hold()).accepted
+    assert gripping.ask(CLOSE).accepted, "a held arm lets a gripper close"
+    assert gripping.arm.calls.count("write_auxiliary") == 2
+    assert gripping.ask(Disable()).accepted
+    gripping.run(2)
+    assert not gripping.ask(CLOSE).accepted
+
+
+def test_a_stop_stops_the_gripper_and_refuses_its_orders_until_resume(gripping: Bench) -> None:
+    enabled(gripping)
+    StopSlot(gripping.directories.stop_slot).raise_stop()
+    gripping.run(2)
+    assert gripping.arm.calls.count("stop_auxiliary") == 1
+    refused = gripping.ask(CLOSE)
+    assert (refused.accepted, refused.reasons[0].code) == (False, "STOPPED")
+    assert gripping.ask(Resume()).accepted
+    assert gripping.ask(CLOSE).accepted
+    assert gripping.arm.calls.count("write_auxiliary") == 1
+
+
+def test_a_driver_that_refuses_an_order_to_its_gripper_is_a_fault(gripping: Bench) -> None:
+    enabled(gripping)
+    gripping.arm.fail["write_auxiliary"] = DriverError("connection_lost", "unplugged")
+    gripping.ask(CLOSE)
+    gripping.run(3)
+    assert gripping.state().status.lifecycle == "fault"
+
+
+def test_a_dry_run_moves_no_gripper(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, dry_run=True, arm=GrippingArm)
+    bench.connect()
+    bench.process.configure()
+    bench.run(5)
+    assert bench.ask(Enable()).accepted
+    bench.run(3)
+    assert bench.ask(CLOSE).accepted
+    assert not {"write_auxiliary", "stop_auxiliary"} & set(bench.arm.calls)
     bench.links.close()

@@ -15,6 +15,7 @@ from stereoservo.gateway.validation import GoalContext, check_command, check_goa
 from stereoservo.messages.goals import (
     AcknowledgeGoal,
     AdaptiveGain,
+    AuxiliarySpec,
     Centre,
     DisplacementTarget,
     Feature,
@@ -25,6 +26,7 @@ from stereoservo.messages.goals import (
     IncidenceTarget,
     Jog,
     JointTarget,
+    OrderAuxiliary,
     PointTarget,
     TaughtTarget,
     Teach,
@@ -134,6 +136,24 @@ def test_jogs_are_checked_against_joints_and_their_limits() -> None:
     assert "-1 to 1 is valid" in check_command(Jog({"j1": 1.5}), CONTEXT)[0]
     assert "is empty" in check_command(Jog({}), CONTEXT)[0]
     assert check_command(Hold(), CONTEXT) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"gripper": 0.02, "light": 1.0}, ""),
+        ({"gripper": 0.09}, "0 to 0.08 m is valid"),
+        ({"light": 0.5}, "0 and 1 are valid"),
+        ({"j1": 0.1}, "no auxiliary joint or output 'j1'; there are: gripper, light"),
+        ({}, "is empty"),
+    ],
+)
+def test_orders_of_auxiliary_joints_are_checked_against_what_the_driver_declares(values, told) -> None:
+    specs = (AuxiliarySpec("gripper", "prismatic", 0.0, 0.08, 0.1), AuxiliarySpec("light", "digital"))
+    context = GoalContext(SETTINGS, (), None, specs)
+    found = check_command(OrderAuxiliary(values), context)
+    assert (told in found[0]) if told else found == []
+    assert "has none" in check_command(OrderAuxiliary({"gripper": 0.0}), CONTEXT)[0]
 
 
 SEEN = FeatureTarget({"left": GOOD, "right": GOOD})

@@ -17,6 +17,10 @@ from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo_sim.benchmarks.service_bench import processes_of
 
+AUXILIARY = (
+    '[{ name = "gripper", kind = "prismatic", low = 0.0, high = 0.08, velocity = 0.1 }, '
+    '{ name = "light", kind = "digital" }]'
+)
 CELL = "hil"
 QUICK_CALIBRATION = """
 [calibration]
@@ -77,7 +81,7 @@ def cell_file(roots: Path) -> Path:
     # On a shared machine a loop may stand for more than the 0.1 s that drives wait by default.
     head, found, rest = head.partition("# [joints.options]")
     assert found
-    head += f"[joints.options]\ncommand_timeout_s = 0.4\n{found}{rest}"
+    head += f"[joints.options]\ncommand_timeout_s = 0.4\nauxiliary = {AUXILIARY}\n{found}{rest}"
     world = demo_cell()
     names = [joint.name for joint in world.robot.joints]
     base = "\n".join(f"{name} = {float(q)!r}" for name, q in zip(names, world.base, strict=True))

@@ -106,6 +106,12 @@ def test_home_jog_and_cli_verbs(client: Client) -> None:
     code, state = cli("jog", CELL, "j2=0.1", "--seconds", "0.3")
     assert code == 0
     assert state["joints"]["j2"] > before + 0.01  # type: ignore[index]
+    code, state = cli("auxiliary", CELL, "gripper=0.02", "light=on")
+    assert code == 0
+    assert state["auxiliary"] == {"gripper": pytest.approx(0.02, abs=1e-3), "light": 1.0}
+    code, refused = cli("auxiliary", CELL, "gripper=0.2")
+    assert code == 1
+    assert "0 to 0.08 m is valid" in refused["error"]["message"]  # type: ignore[index]
     code, reached = cli("home", CELL)
     assert (code, reached["outcome"]) == (0, "reached")
     code, checked = cli("goal", CELL, "park", "--check")

@@ -6,7 +6,7 @@ read back. Nothing here enables a drive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -58,8 +58,9 @@ from stereoservo_drivers.canopen.cia402_words import (
     is_communication_error,
 )
 from stereoservo_drivers.canopen.option_checks import check_load
-from stereoservo_drivers.canopen.options import CanOptions, CommandMode
+from stereoservo_drivers.canopen.options import CanOptions, CanOutput, CommandMode
 from stereoservo_drivers.canopen.units import wrap_int32
+from stereoservo_drivers.kit.auxiliary import verify_order
 
 if TYPE_CHECKING:
     import canopen
@@ -77,8 +78,93 @@ SETTLE_S = 0.03
 """A cause that is still there trips a drive again within this time."""
 STANDS_SHARE = 0.01
 """Of the largest velocity: slower than this a drive is at rest."""
+SDO_ORDER_ID, SDO_ANSWER_ID = 0x600, 0x580
+DOWNLOAD_OUTPUTS = bytes([0x23, 0xFE, 0x60, 1])
+"""Head of an SDO download of four bytes to 0x60FE:1 (CiA 301, 7.2.4.3.3)."""
+DOWNLOADED = 0x60
 LOOK_S = 0.02
 """Time over which the positions of a drive that reports no velocity tell whether it is at rest."""
+
+
+OUTPUTS, OUTPUT_MASK = (0x60FE, 1), (0x60FE, 2)
+
+
+class DigitalOutputs:
+    """Digital outputs of the drives, written without waiting for the drives' answers; ``options``: their cell file's.
+
+    ``values``: by name, as the drives have confirmed them. Other bits of 0x60FE stay as they were found.
+    """
+
+    def __init__(self, outputs: tuple[CanOutput, ...]) -> None:
+        self._outputs = {output.name: output for output in outputs}
+        self._specs = tuple(output.spec() for output in outputs)
+        self._ordered: dict[int, int] = {}
+        self._confirmed: dict[int, int] = {}
+        self._waiting: dict[int, list[int]] = {}
+        self._answers: dict[int, list[CanFrame]] = {}
+
+    def prepare(self, drive: RemoteDrive) -> None:
+        """Read the outputs of a drive, and enable those that are used. Raises DriverError (``outputs``)."""
+        used = [output for output in self._outputs.values() if output.node_id == drive.node_id]
+        if not used:
+            return
+        found = drive.read_if_there(*OUTPUTS)
+        if found is None:
+            names = ", ".join(output.name for output in used)
+            raise DriverError(
+                "outputs",
+                f"{drive.name} has no digital outputs (0x60FE:1); leave out: {names}",
+                node_id=drive.node_id,
+            )
+        mask = drive.read_if_there(*OUTPUT_MASK)
+        if mask is not None:
+            drive.write(*OUTPUT_MASK, mask | sum(1 << output.bit for output in used), "output")
+        self._ordered[drive.node_id] = self._confirmed[drive.node_id] = found
+        self._waiting[drive.node_id] = []
+
+    def listen(self, link: Link) -> None:
+        """Take the drives' answers on ``link`` from now on."""
+        for node in self._ordered:
+            self._answers[node] = []
+            link.subscribe(SDO_ANSWER_ID + node, self._answers[node])
+
+    def write(self, link: Link, values: Mapping[str, float]) -> None:
+        """Switch outputs by name. Raises DriverError (``auxiliary``, ``connection_lost``)."""
+        verify_order(values, self._specs)
+        self._take_answers()
+        frames = []
+        for name, value in values.items():
+            output = self._outputs[name]
+            rest = self._ordered[output.node_id] & ~(1 << output.bit)
+            self._ordered[output.node_id] = rest | int(value) << output.bit
+        for node in dict.fromkeys(self._outputs[name].node_id for name in values):
+            bits = self._ordered[node]
+            frames.append(CanFrame(SDO_ORDER_ID + node, DOWNLOAD_OUTPUTS + bits.to_bytes(4, "little")))
+            self._waiting[node].append(bits)
+        link.send(frames)
+
+    def values(self) -> dict[str, float]:
+        """What the drives have confirmed, by name."""
+        self._take_answers()
+        return {
+            name: float(self._confirmed.get(output.node_id, 0) >> output.bit & 1)
+            for name, output in self._outputs.items()
+        }
+
+    def _take_answers(self) -> None:
+        """Match the drives' answers with what was written: confirmed, or refused and taken back."""
+        for node, answers in self._answers.items():
+            if not self._waiting[node]:
+                answers.clear()  # to what bring-up has asked
+            while answers and self._waiting[node]:
+                data = answers.pop(0).data
+                if data[1:4] != DOWNLOAD_OUTPUTS[1:]:
+                    continue
+                bits = self._waiting[node].pop(0)
+                if data[0] == DOWNLOADED:
+                    self._confirmed[node] = bits
+                else:
+                    self._ordered[node] = self._confirmed[node]
 
 
 class Cia402Bringup:
@@ -88,6 +174,7 @@ class Cia402Bringup:
         self.codec = codec
         self.identities: dict[int, Identity] = {}
         self.setups: dict[int, Setup] = {}
+        self.outputs = DigitalOutputs(options.output)
         self._options = options
         self._eds = eds_path(options, cell_dir)
         self._dictionary: canopen.ObjectDictionary | None = None
@@ -113,6 +200,7 @@ class Cia402Bringup:
                 find(link, drives, self._options)
                 self._prepare(link, drives)
                 self._start(link, drives)
+        self.outputs.listen(link)
 
     def reset(self, link: Link) -> None:
         """Configure again and clear the faults of all drives, by NMT reset communication where they were bus
@@ -239,6 +327,7 @@ class Cia402Bringup:
         }.values():
             self._compare(drive, write)
         self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
+        self.outputs.prepare(drive)
 
     def _write_period(self, drive: RemoteDrive, mode: CommandMode) -> list[Write]:
         """Write the period of set-points; returns what was written.

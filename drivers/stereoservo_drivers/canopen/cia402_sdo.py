@@ -45,7 +45,8 @@ SIZES: dict[tuple[int, int], tuple[int, bool]] = {
     (0x606C, 0): (4, True), (0x6077, 0): (2, True), (0x607A, 0): (4, True), (0x607F, 0): (4, False),
     (0x6080, 0): (4, False), (0x6083, 0): (4, False), (0x6084, 0): (4, False), (0x6085, 0): (4, False),
     (0x60C1, 1): (4, True), (0x60C2, 1): (1, False), (0x60C2, 2): (1, True), (0x60F4, 0): (4, True),
-    (0x60FD, 0): (4, False), (0x60FF, 0): (4, True), (0x6502, 0): (4, False),
+    (0x60FD, 0): (4, False), (0x60FE, 1): (4, False), (0x60FE, 2): (4, False), (0x60FF, 0): (4, True),
+    (0x6502, 0): (4, False),
 }  # fmt: skip
 """Bytes and sign of standard objects (CiA 301, CiA 402-2), for drives whose EDS leaves out what they have."""
 

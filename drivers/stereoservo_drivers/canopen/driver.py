@@ -78,6 +78,7 @@ class CanJointDriver:
             effort_units=tuple(_effort_unit(joint, self.options.protocol) for joint in self.options.joint),
             lacks=tuple(what for what, needed in _LOADS.items() if needed not in self.options.feedback),
             command_timeout_s=self.options.command_timeout_s,
+            auxiliary=tuple(output.spec() for output in self.options.output),
             call_budget_us=CALL_BUDGET_US,
         )
 
@@ -273,6 +274,21 @@ class CanJointDriver:
         self.master.set_command(asked, now_ns)
         self._write_seq += 1
         return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
+
+    def write_auxiliary(self, values: Mapping[str, float]) -> None:
+        """Switch digital outputs. Raises DriverError: not active, a latched fault, no such output."""
+        self._life.require("write_auxiliary()", LifecycleState.ACTIVE)
+        self._require_no_fault()
+        assert self.bus is not None
+        if isinstance(self.bringup, Cia402Bringup):
+            self.bringup.outputs.write(self.bus, values)
+
+    def read_auxiliary(self) -> dict[str, float]:
+        """Digital outputs as the drives have confirmed them."""
+        return self.bringup.outputs.values() if isinstance(self.bringup, Cia402Bringup) else {}
+
+    def stop_auxiliary(self) -> None:
+        """Digital outputs keep their state."""
 
     def _require_no_fault(self) -> None:
         fault = self.master.fault

@@ -87,6 +87,21 @@ def _check_bus(options: CanOptions) -> None:
 def _check_protocol(options: CanOptions) -> None:
     if options.endpoints and options.protocol != "odrive":
         raise _refusal("endpoints", list(options.endpoints), "left out: they are an ODrive's")
+    if options.output and options.protocol != "cia402":
+        raise _refusal(
+            "output", [output.name for output in options.output], "left out: they are a CiA 402 drive's"
+        )
+    nodes = [joint.node_id for joint in options.joint]
+    for k, output in enumerate(options.output):
+        who, before = f"output {output.name!r}", options.output[:k]
+        if output.node_id not in nodes:
+            raise _refusal(
+                f"{who}: node_id", output.node_id, f"that of a joint: {', '.join(map(str, nodes))}"
+            )
+        if any(other.name == output.name for other in before):
+            raise _refusal("output name", output.name, "one that no other output has")
+        if any((other.node_id, other.bit) == (output.node_id, output.bit) for other in before):
+            raise _refusal(f"{who}: bit", output.bit, "one that no other output of this drive has")
 
 
 def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.ports.devices import JointSpec
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -85,6 +86,21 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         )
 
 
+class CanOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One ``[[joints.options.output]]``: a digital output of a joint's drive.
+
+    ``bit``: of 0x60FE:1, in CiA 402-2 0 is the brake, and those of the maker are 16 to 31.
+    """
+
+    name: str
+    node_id: NodeId
+    bit: Annotated[int, Meta(ge=1, le=31)]
+
+    def spec(self) -> AuxiliarySpec:
+        """The output in the form of the joint driver port."""
+        return AuxiliarySpec(self.name, "digital")
+
+
 class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[joints.options]`` of driver ``canopen``.
 
@@ -95,6 +111,7 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     emergency codes that do not trip.
     ``endpoints``: of protocol ``odrive``, ``flat_endpoints.json`` of the releases that the drives run, beside the cell
     file.
+    ``output``: digital outputs of the drives.
     ``command_timeout_s``: without a command for so long the joints are brought to rest (they stay enabled);
     ``loop_timeout_ms``: without any call for so long, while enabled, the driver latches a fault.
     """
@@ -121,3 +138,4 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     command_timeout_s: Positive = 0.1
     loop_timeout_ms: Annotated[int, Meta(ge=20, le=5000)] = 100
     joint: tuple[CanJoint, ...]
+    output: tuple[CanOutput, ...] = ()

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from stereoservo.ports.devices import DriverError, JointDriver
+from stereoservo.ports.devices import AuxiliaryDriver, DriverError, JointDriver
 from stereoservo_drivers.kit.bench import (
     CheckFailedError,
     CheckNotRunError,
@@ -440,6 +440,45 @@ def keeps_position_limits(bench: JointBench) -> str:
     return f"{reached} joints driven to a limit, at most {float(beyond.max()):+.2g} rad or m beyond"
 
 
+def orders_auxiliary(bench: JointBench) -> str:
+    driver = bench.active()
+    specs = driver.describe().auxiliary
+    if not specs:
+        raise CheckNotRunError("it declares no auxiliary joints or outputs")
+    if not isinstance(driver, AuxiliaryDriver):
+        raise CheckFailedError("it declares auxiliary joints, and has not the methods of AuxiliaryDriver")
+    before = driver.read_auxiliary()
+    require(set(before) == {spec.name for spec in specs}, f"read_auxiliary() tells {before}")
+    ends = {s.name: s.high if before[s.name] - s.low < s.high - before[s.name] else s.low for s in specs}
+    refused(
+        lambda: driver.write_auxiliary({"nobody": 0.0}), "an order to an auxiliary joint that is not there"
+    )
+    for spec in specs:
+        too_far = {spec.name: spec.high + 1.0}
+        refused(lambda too_far=too_far: driver.write_auxiliary(too_far), f"{too_far} beyond its limits")
+    driver.write_auxiliary(ends)
+    bench.drive(driver, _zero(driver), 0.1)
+    driver.stop()
+    _stop(driver, "while an auxiliary joint moves")
+    bench.settle(driver, 0.2)
+    stopped = driver.read_auxiliary()
+    bench.settle(driver, 0.3)
+    after = driver.read_auxiliary()
+    for spec in specs:
+        toward = (stopped[spec.name] - before[spec.name]) * (ends[spec.name] - before[spec.name])
+        require(
+            toward > 0.0,
+            f"{spec.name} is at {stopped[spec.name]:g}, ordered to {ends[spec.name]:g}",
+        )
+        still = abs(after[spec.name] - stopped[spec.name]) <= 1e-3 * (spec.high - spec.low)
+        require(
+            still, f"{spec.name} moves on after stop(), from {stopped[spec.name]:g} to {after[spec.name]:g}"
+        )
+    driver.deactivate()
+    refused(lambda: driver.write_auxiliary(before), "an order to auxiliary joints of an arm that is off")
+    return ", ".join(f"{name} {value:.3g}" for name, value in after.items())
+
+
 def answers_in_time(bench: JointBench) -> str:
     driver = bench.active()
     description = driver.describe()
@@ -538,6 +577,10 @@ JOINT_CHECKS = (
         "the device's own watchdog, or positions within a lead of the joint (PositionOutput)",
     ),
     JointCheck("keeps position limits", keeps_position_limits, "at a limit, send velocities inward only"),
+    JointCheck(
+        "orders auxiliary joints", orders_auxiliary,
+        "kit.auxiliary.verify_order(); stop() holds auxiliary joints, too; require ACTIVE in write_auxiliary()",
+    ),
     JointCheck("answers in time", answers_in_time, "read in a thread, or state a call_budget_us that is kept"),
     JointCheck(
         "reports a lost device", reports_a_lost_device,

@@ -28,6 +28,7 @@ COMMANDS: dict[str, str] = {
     "goal": "goal.command:goal",
     "teach": "teach:teach",
     "jog": "jog:jog",
+    "auxiliary": "auxiliary:auxiliary",
     "home": "home:home",
     "calibrate": "calibrate.command:calibrate",
     "watch": "watch:watch",

@@ -65,6 +65,8 @@ def describe(state: StateMessage) -> str:
     lines += _health(state)
     if state.efforts or state.following_errors:
         lines.append("  loads   " + _loads(state))
+    if state.auxiliary:
+        lines.append("  beside  " + "  ".join(f"{name} {value:g}" for name, value in state.auxiliary.items()))
     if state.goal:
         progress_text = progress_words(state)
         lines.append(

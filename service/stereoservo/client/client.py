@@ -29,6 +29,7 @@ from stereoservo.messages.goals import (
     Home,
     Jog,
     JointTarget,
+    OrderAuxiliary,
     Reset,
     Resume,
     Target,
@@ -118,6 +119,13 @@ class Client(Connection):
     def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
         """Jog: joint velocities for ``lease_s``; call again within it to continue (a dead man's switch)."""
         return self.command("jog", Jog(dict(velocities), lease_s))
+
+    def auxiliary(self, values: Mapping[str, float]) -> Reply:
+        """Order auxiliary joints [rad or m] and digital outputs (0 or 1) by name; the state tells when they are there.
+
+        Raises RefusedError.
+        """
+        return self.command("auxiliary", OrderAuxiliary(dict(values)))
 
     def record(self, on: bool = True, images: bool = False) -> Reply:
         """Start or stop a flight recording; the reply's message is its file on the daemon's host.

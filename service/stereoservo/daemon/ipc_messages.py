@@ -116,6 +116,7 @@ class ServoState(msgspec.Struct, frozen=True, eq=False):
     """Reasons why the drives were sent something other than the core's command; empty where they were not."""
     notes: tuple[str, ...] = ()
     """Records of other processes that could not be read and were left out, by source."""
+    auxiliary: dict[str, float] = {}
 
 
 class Report(msgspec.Struct, frozen=True):

@@ -34,12 +34,12 @@ from stereoservo.daemon.seqlock import SlotError
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import CellFileError
 from stereoservo.messages.directories import DirectoryError
-from stereoservo.messages.goals import Hold, Request
+from stereoservo.messages.goals import Hold, OrderAuxiliary, Request
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path
 from stereoservo.messages.servo_state import LoopStatistics
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import Clock, DriverError, JointDriver, JointState
+from stereoservo.ports.devices import AuxiliaryDriver, Clock, DriverError, JointDriver, JointState
 from stereoservo.recording.step_records import StepStream
 
 GATEWAY_SILENCE_S = 0.5
@@ -86,6 +86,7 @@ class ServoProcess:
         self._beat = beat
         self._kernels = kernels
         self._stream = StepStream(core.settings, rate_hz)
+        self._auxiliary = driver if isinstance(driver, AuxiliaryDriver) else None
         self._configured = False
         self._active = False
         self._fault: DriverFault | None = None
@@ -153,6 +154,26 @@ class ServoProcess:
             return
         self._differences = report.reasons
 
+    def _order_auxiliary(self, inputs: StepInputs, outputs: StepOutputs, now_ns: int) -> None:
+        """Hand orders of auxiliary joints, which the core has accepted, to the driver; a stop stops them, too."""
+        if self._auxiliary is None or self._dry_run:
+            return
+        if inputs.stop or any(event.kind in ("stopped", "fault") for event in outputs.events):
+            self._auxiliary.stop_auxiliary()
+        for request in inputs.requests:
+            if not isinstance(request.command, OrderAuxiliary):
+                continue
+            if any(event.request == request.request and event.accepted for event in outputs.events):
+                try:
+                    self._auxiliary.write_auxiliary(request.command.values)
+                except DriverError as error:
+                    self._latch_fault(error, now_ns)
+
+    def _auxiliary_values(self) -> dict[str, float]:
+        if self._auxiliary is None or not self._configured or self._fault is not None:
+            return {}
+        return self._auxiliary.read_auxiliary()
+
     def _apply_driver_request(self, outputs: StepOutputs, now_ns: int) -> None:
         """Change the driver's state as the core requests; where the driver refuses, the next step sees a fault."""
         request = outputs.driver_request
@@ -204,6 +225,7 @@ class ServoProcess:
                 gateway=not self._silent and self._heard_ns > 0,
                 records_dropped=self._stream.dropped,
                 differences=self._differences,
+                auxiliary=self._auxiliary_values(),
             )
             self._links.publish_state(state)
         self._cycles += 1
@@ -234,6 +256,8 @@ class ServoProcess:
         self._stream.before(self._links.step_recorder(), self.core, now_ns)
         outputs = self.core.step(inputs)
         self._write(outputs, now_ns)
+        if self._auxiliary is not None and (inputs.requests or outputs.events):
+            self._order_auxiliary(inputs, outputs, now_ns)
         self._apply_driver_request(outputs, now_ns)
         self._moving = outputs.status.source != "hold" or bool(np.any(outputs.status.command))
         self._publish(outputs, pacing)

@@ -211,7 +211,7 @@ class Gateway:
     def _context(self) -> GoalContext:
         model = self._calibration.model
         markers = None if model is None else model.marker_ids
-        return GoalContext(self.settings, self._teaching.names, markers)
+        return GoalContext(self.settings, self._teaching.names, markers, self.plan.joints.auxiliary)
 
     # -- the loop -------------------------------------------------------------------------------------------
 

@@ -257,4 +257,5 @@ def cell_info(
         dry_run=plan.dry_run,
         commissioning=plan.commissioning,
         recording=recording,
+        auxiliary=plan.joints.auxiliary,
     )

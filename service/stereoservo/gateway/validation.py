@@ -16,6 +16,7 @@ from stereoservo.control.law_registry import LAWS, OPTIONS, UnknownLawError
 from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.messages.goals import (
     AdaptiveGain,
+    AuxiliarySpec,
     Command,
     DisplacementTarget,
     Feature,
@@ -24,6 +25,7 @@ from stereoservo.messages.goals import (
     IncidenceTarget,
     Jog,
     JointTarget,
+    OrderAuxiliary,
     PointTarget,
     Target,
     TaughtTarget,
@@ -178,6 +180,8 @@ def check_command(command: Command, context: GoalContext) -> list[str]:
     """The problems of a command; empty for a valid one."""
     if isinstance(command, Jog):
         return _check_jog(command, context.settings)
+    if isinstance(command, OrderAuxiliary):
+        return _check_auxiliary(command, context.auxiliary)
     if isinstance(command, UpdateGoal):
         return _check_target(command.target, context)
     if isinstance(command, Teach) and command.tool:
@@ -214,6 +218,22 @@ def _check_jog(command: Jog, settings: CoreSettings) -> list[str]:
     return problems
 
 
+def _check_auxiliary(command: OrderAuxiliary, known: tuple[AuxiliarySpec, ...]) -> list[str]:
+    names = listed(spec.name for spec in known) if known else "none: this cell's joint driver has none"
+    problems = [] if command.values else [f"values: is empty; auxiliary joints and outputs: {names}"]
+    specs = {spec.name: spec for spec in known}
+    for name, value in command.values.items():
+        spec = specs.get(name)
+        if spec is None:
+            problems.append(f"values.{name}: no auxiliary joint or output {name!r}; there are: {names}")
+        elif spec.kind == "digital" and value not in (0.0, 1.0):
+            problems.append(f"values.{name}: {value:g} for a digital output; 0 and 1 are valid")
+        elif not spec.low <= value <= spec.high:
+            unit = "rad" if spec.kind == "revolute" else "m"
+            problems.append(f"values.{name}: {value:g}; {spec.low:g} to {spec.high:g} {unit} is valid")
+    return problems
+
+
 def _said(value: object) -> str:
     """A value in the form in which a client wrote it."""
     return msgspec.json.encode(value).decode() if isinstance(value, msgspec.Struct) else repr(value)
@@ -244,6 +264,7 @@ class GoalContext:
     settings: CoreSettings
     taught: tuple[str, ...]
     model_markers: tuple[int, ...] | None
+    auxiliary: tuple[AuxiliarySpec, ...] = ()
 
 
 def listed(names: Iterable[object]) -> str:

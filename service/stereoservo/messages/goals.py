@@ -284,6 +284,28 @@ class Jog(msgspec.Struct, frozen=True, tag="jog", tag_field="command", forbid_un
     lease_s: Annotated[float, Meta(gt=0, le=1.0)] = 0.25
 
 
+class AuxiliarySpec(msgspec.Struct, frozen=True):
+    """An auxiliary joint (a gripper) or a digital output, as its driver declares it: outside the model and the laws.
+
+    ``kind``: ``revolute`` [rad], ``prismatic`` [m], or ``digital``, 0 or 1. ``low``, ``high``: what may be ordered;
+    ``velocity``: at which the driver moves the joint.
+    """
+
+    name: str
+    kind: Literal["revolute", "prismatic", "digital"]
+    low: float = 0.0
+    high: float = 1.0
+    velocity: float = 0.0
+
+
+class OrderAuxiliary(
+    msgspec.Struct, frozen=True, tag="auxiliary", tag_field="command", forbid_unknown_fields=True
+):
+    """Order positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name."""
+
+    values: dict[str, float]
+
+
 class Home(msgspec.Struct, frozen=True, tag="home", tag_field="command", forbid_unknown_fields=True):
     """Move every joint to the cell's home position."""
 
@@ -347,6 +369,7 @@ Command = (
     | Disable
     | Reset
     | Jog
+    | OrderAuxiliary
     | Home
     | Calibrate
     | Teach

@@ -13,6 +13,7 @@ VERBS = (
     "resume",
     "reset",
     "jog",
+    "auxiliary",
     "home",
     "calibrate",
     "teach",

@@ -83,6 +83,7 @@ class StateRecord(msgspec.Struct):
     records_dropped: int
     differences: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    auxiliary: dict[str, float] = {}
 
 
 class _Name(msgspec.Struct):
@@ -193,6 +194,7 @@ def state_message(
         effort_limits=_finite(names, status.effort_limits),
         following_limits=_finite(names, status.following_limits),
         health=status.health,
+        auxiliary={name: value for name, value in state.auxiliary.items() if math.isfinite(value)},
     )
 
 

@@ -15,6 +15,7 @@ from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import (
     LAW_TITLE,
     AcknowledgeGoal,
+    AuxiliarySpec,
     Calibrate,
     CancelGoal,
     Command,
@@ -26,6 +27,7 @@ from stereoservo.messages.goals import (
     Jog,
     MarkerId,
     Name,
+    OrderAuxiliary,
     PlanReport,
     RenewGoal,
     Reset,
@@ -55,6 +57,7 @@ COMMANDS: dict[str, type[Command]] = {
     "resume": Resume,
     "reset": Reset,
     "jog": Jog,
+    "auxiliary": OrderAuxiliary,
     "home": Home,
     "calibrate": Calibrate,
     "teach": Teach,
@@ -156,6 +159,8 @@ class CellInfo(msgspec.Struct, frozen=True):
     dry_run: bool = False
     commissioning: bool = False
     recording: str = ""
+    auxiliary: tuple[AuxiliarySpec, ...] = ()
+    """Auxiliary joints and digital outputs, which `command/auxiliary` orders."""
 
 
 class LoopInfo(msgspec.Struct, frozen=True):
@@ -213,6 +218,8 @@ class StateMessage(msgspec.Struct, frozen=True):
     """How large following errors may become before the arm stops for a contact."""
     health: Health = Health()
     """Whether the images agree with the model, by camera; what explains it where they do not, and what is done."""
+    auxiliary: dict[str, float] = {}
+    """Auxiliary joints [rad or m] and digital outputs (0 or 1), as the driver tells them."""
     refused_messages: int = 0
     """Messages that the gateway could not take since its start: not JSON, of a wrong shape, on a wrong key."""
 

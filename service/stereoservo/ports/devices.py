@@ -21,6 +21,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import msgspec
 
 from stereoservo.messages.cell_file import Mount
+from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
 
 JointKindName = Literal["revolute", "prismatic"]
@@ -71,6 +72,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     ``home``: a configuration in which the arm may well be (in joint order; empty: none is known).
     ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
     ``lacks``: which of ``efforts`` and ``following_errors`` its samples do not carry, as far as it is known beforehand.
+    ``auxiliary``: joints and outputs beside them, of an :class:`AuxiliaryDriver`.
     """
 
     driver: str
@@ -82,6 +84,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     home: tuple[float, ...] = ()
     effort_units: tuple[str, ...] = ()
     lacks: tuple[Literal["efforts", "following_errors"], ...] = ()
+    auxiliary: tuple[AuxiliarySpec, ...] = ()
 
 
 class CameraDescription(msgspec.Struct, frozen=True):
@@ -234,6 +237,25 @@ class JointDriver(Protocol):
 
     def close(self) -> None:
         """Release everything. Idempotent; never raises."""
+        ...
+
+
+@runtime_checkable
+class AuxiliaryDriver(Protocol):
+    """A joint driver with auxiliary joints (a gripper) or digital outputs; ``stop`` stops these joints, too."""
+
+    def write_auxiliary(self, values: Mapping[str, float]) -> None:
+        """Order positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name. Does not block; the
+        driver moves a joint there at its own velocity. Raises DriverError unless active.
+        """
+        ...
+
+    def read_auxiliary(self) -> dict[str, float]:
+        """The newest known values by name; any state, never raises."""
+        ...
+
+    def stop_auxiliary(self) -> None:
+        """Hold auxiliary joints where they are; outputs keep their state. Any state, never raises."""
         ...
 
 

@@ -16,7 +16,7 @@ from stereoservo_drivers.canopen.cia402 import Cia402Codec
 from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CanOutput
 
 from .maker_drive import MakerBus, MakerDrive
 
@@ -246,3 +246,43 @@ def test_switches_are_taken_from_the_drives_that_have_them():
     assert master.fault is None
     assert [axis.switches for axis in codec.axes] == [None, 2]
     assert ["0x60FD" in bringup.setups[node].safety() for node in (5, 6)] == [True, False]
+
+
+def output_bench(name: str = "valve", bit: int = 16, **changes: object) -> Bench:
+    outputs = (CanOutput(name=name, node_id=5, bit=bit), CanOutput(name="light", node_id=5, bit=17))
+    return Bench(SHIPPED_EDS, (9,), output=outputs, **changes)  # type: ignore[arg-type]
+
+
+def test_digital_outputs_are_switched_beside_the_cycle_and_told_once_confirmed():
+    bench = output_bench()
+    bench.drive.put(0x60FE, 1, 0x0008_0001)
+    bench.run()
+    outputs = bench.bringup.outputs
+    assert bench.drive.get(0x60FE, 2) == 0x0003_0000
+    assert outputs.values() == {"valve": 0.0, "light": 0.0}
+    outputs.write(bench.bus, {"valve": 1.0})
+    outputs.write(bench.bus, {"light": 1.0, "valve": 1.0})
+    assert outputs.values() == {"valve": 0.0, "light": 0.0}, "nothing has been confirmed yet"
+    bench.go(0.02, SPEED)
+    assert bench.drive.get(0x60FE, 1) == 0x000B_0001, "the other bits stay"
+    assert outputs.values() == {"valve": 1.0, "light": 1.0}
+    outputs.write(bench.bus, {"valve": 0.0})
+    bench.go(0.02, SPEED)
+    assert outputs.values() == {"valve": 0.0, "light": 1.0}
+    assert bench.master.fault is None
+    with pytest.raises(DriverError, match="valve, light"):
+        outputs.write(bench.bus, {"nobody": 1.0})
+
+
+def test_an_output_that_the_drive_refuses_is_not_told_as_switched():
+    bench = output_bench()
+    bench.run()
+    bench.drive.node.object_dictionary[0x60FE][1].access_type = "ro"
+    bench.bringup.outputs.write(bench.bus, {"valve": 1.0})
+    bench.go(0.02)
+    assert bench.bringup.outputs.values()["valve"] == 0.0
+
+
+def test_outputs_of_a_drive_without_any_are_refused():
+    with pytest.raises(DriverError, match=r"no digital outputs \(0x60FE:1\); leave out: valve, light"):
+        output_bench(lacking=(0x60FE,)).run()

@@ -55,6 +55,7 @@ from stereoservo.messages.goals import (
     Hold,
     Home,
     Jog,
+    OrderAuxiliary,
     PlanReport,
     ReanchorRefused,
     RenewGoal,
@@ -101,6 +102,13 @@ def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | N
 
 def require_motion_allowed(context: StepContext) -> None:
     """Raises RefusalError where the arm may not move now."""
+    _require_powered(context)
+    if context.state.held:
+        raise RefusalError("HELD", "the cell is held; resume it first")
+
+
+def _require_powered(context: StepContext) -> None:
+    """Raises RefusalError where the drives are off, or were stopped."""
     state = context.state
     if state.lifecycle != Lifecycle.ACTIVE:
         raise RefusalError(
@@ -110,8 +118,6 @@ def require_motion_allowed(context: StepContext) -> None:
         )
     if state.stopped:
         raise RefusalError("STOPPED", "the cell was stopped; resume it first")
-    if state.held:
-        raise RefusalError("HELD", "the cell is held; resume it first")
 
 
 def report_without_plan(source: Source, context: StepContext) -> PlanReport | None:
@@ -500,6 +506,12 @@ def _jog(command: Jog, request: Request, context: StepContext) -> str:
     return f"jogging for {command.lease_s} s"
 
 
+def _order_auxiliary(command: OrderAuxiliary, request: Request, context: StepContext) -> str:
+    """The servo process hands what is accepted here to the driver: it is no motion of the model's joints."""
+    _require_powered(context)
+    return "ordered: " + ", ".join(f"{name} {value:g}" for name, value in command.values.items())
+
+
 def _of_command(carry_out: Callable[[Any, StepContext], str]) -> Callable[[Any, Request, StepContext], str]:
     """A handler that needs nothing of the request but its command."""
     return lambda command, request, context: carry_out(command, context)
@@ -519,6 +531,7 @@ _HANDLERS: dict[type[Any], Callable[[Any, Request, StepContext], str | Accepted 
     ReanchorRefused: _of_command(camera_relocalization.refused),
     Teach: start_teaching,
     Jog: _jog,
+    OrderAuxiliary: _order_auxiliary,
     Home: _home,
     Calibrate: _calibrate,
 }

@@ -1,0 +1,60 @@
+"""Auxiliary joints and digital outputs of a driver: orders verified, and motion at the joints' own velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from stereoservo.messages.goals import AuxiliarySpec
+from stereoservo.ports.devices import DriverError
+
+
+def verify_order(values: Mapping[str, float], specs: tuple[AuxiliarySpec, ...]) -> None:
+    """Raises DriverError (``auxiliary``) for a name that is not there, or a value outside its limits."""
+    known = {spec.name: spec for spec in specs}
+    for name, value in values.items():
+        spec = known.get(name)
+        if spec is None:
+            raise DriverError(
+                "auxiliary", f"no auxiliary {name!r}; there are: {', '.join(known) or 'none'}", name=name
+            )
+        allowed = value in (0.0, 1.0) if spec.kind == "digital" else spec.low <= value <= spec.high
+        if not allowed:
+            raise DriverError(
+                "auxiliary",
+                f"{name}: {value:g}; {spec.low:g} to {spec.high:g} is valid",
+                name=name,
+                value=value,
+            )
+
+
+class AuxiliaryMotion:
+    """Simulated auxiliary joints, which go where they are ordered at their velocities, and outputs, at once.
+
+    Begins with every joint at the bound that is nearer to zero, and outputs off.
+    """
+
+    def __init__(self, specs: tuple[AuxiliarySpec, ...]) -> None:
+        self.specs = specs
+        self._values = {spec.name: min(max(0.0, spec.low), spec.high) for spec in specs}
+        self._orders = dict(self._values)
+        self._now_ns: int | None = None
+
+    def order(self, values: Mapping[str, float], now_ns: int) -> None:
+        """Take an order. Raises DriverError (``auxiliary``)."""
+        verify_order(values, self.specs)
+        self.values(now_ns)
+        self._orders |= values
+
+    def stop(self, now_ns: int) -> None:
+        """Joints stand where they are; outputs keep their state."""
+        self._orders = self.values(now_ns)
+
+    def values(self, now_ns: int) -> dict[str, float]:
+        """Positions and outputs at ``now_ns``, by name."""
+        dt = 0.0 if self._now_ns is None else max(now_ns - self._now_ns, 0) * 1e-9
+        self._now_ns = now_ns
+        for spec in self.specs:
+            value, order = self._values[spec.name], self._orders[spec.name]
+            step = abs(order - value) if spec.kind == "digital" else spec.velocity * dt
+            self._values[spec.name] = value + min(max(order - value, -step), step)
+        return dict(self._values)

@@ -1,0 +1,52 @@
+"""Command ``stereoservo auxiliary``: orders a gripper or other joints beside the arm's, and digital outputs."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+import typer
+
+from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, pairs
+from stereoservo.client import Client
+
+SWITCHED = {"on": "1", "off": "0"}
+SHARE = 0.01
+"""Of a joint's range: so near it has arrived, and so little it has not moved."""
+STANDS_S = 0.5
+POLL_S = 0.05
+
+
+def auxiliary(
+    cell: CellArgument,
+    values: Annotated[
+        list[str], typer.Argument(metavar="NAME=VALUE...", help="[rad] or [m] by joint; on or off by output.")
+    ],
+    wait: Annotated[
+        float,
+        typer.Option(help="Seconds to wait until they are there, or stand (a closed gripper).", min=0.0),
+    ] = 5.0,
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Move a gripper, switch an output: joints and outputs beside the arm's."""
+    words = [item.partition("=") for item in values]
+    ordered = pairs([f"{name}{equals}{SWITCHED.get(value, value)}" for name, equals, value in words], "value")
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        near = {spec.name: SHARE * (spec.high - spec.low) for spec in client.info().auxiliary}
+        client.auxiliary(ordered)
+        until = time.monotonic() + wait
+        state, moved_at = client.status(), time.monotonic()
+        while (now := time.monotonic()) < until and now - moved_at < STANDS_S:
+            if _near(state.auxiliary, ordered, near):
+                break
+            time.sleep(POLL_S)
+            before, state = state, client.status()
+            if not _near(state.auxiliary, before.auxiliary, near):
+                moved_at = time.monotonic()
+    emit(state, "  ".join(f"{name} {value:g}" for name, value in state.auxiliary.items()), json)
+
+
+def _near(values: dict[str, float], wanted: dict[str, float], near: dict[str, float]) -> bool:
+    return all(abs(values.get(name, float("inf")) - value) <= near[name] for name, value in wanted.items())
