@@ -11,8 +11,9 @@ import pytest
 
 from stereoservo.core.monitor import detect_following_error
 from stereoservo.core.monitors.following import PLAY, SILENCE_S
+from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import CoreState, initial_state
-from stereoservo.messages.goals import Enable, FeatureTarget, Jog, JointTarget, Reset
+from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Jog, JointTarget, Reset
 from stereoservo.messages.reasons import Reason
 
 RATE_HZ = 250.0
@@ -270,3 +271,16 @@ def test_goals_are_reached_by_late_drives_and_not_overshot(bench: Any, by: str, 
     bench.run(0.5)
     assert farthest < 0.01 * 0.35 or by == "images"
     assert bench.error_px(target) < 2.0 * bench.settings.tolerance_px
+
+
+def test_trial_motions_are_made_by_late_drives(bench: Any) -> None:
+    trials = msgspec.structs.replace(bench.settings.trials, stops=3, frames=1)
+    bench.settings = msgspec.structs.replace(bench.settings, trials=trials)
+    bench.core = ServoCore(bench.settings)
+    bench.ready()
+    bench.delay_s = 0.2
+    assert bench.reply(Calibrate("00000001")).accepted
+    ended = bench.until(lambda e: e.kind in ("calibration_finished", "calibration_aborted", "fault"), 200.0)
+    assert ended.kind == "calibration_finished", ended
+    delays = bench.core.state.delays.delay_s
+    np.testing.assert_allclose(delays, 0.2, atol=0.02)

@@ -377,7 +377,10 @@ def account_travel(
         back = min(round(delay_s[j] / period_s), rows - 2)
         arrived = past[(step - back) % rows, j]
         under_way[j] = sent[j] - arrived
-        velocity[j] = (arrived - past[(step - back - 1) % rows, j]) / dt_s if dt_s > 0.0 else 0.0
+        if back == 0:
+            velocity[j] = command[j]
+        elif dt_s > 0.0:
+            velocity[j] = (arrived - past[(step - back - 1) % rows, j]) / dt_s
         if not told:
             missing[j] *= keep
             missing_late[j] *= keep

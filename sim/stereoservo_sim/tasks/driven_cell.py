@@ -199,11 +199,14 @@ class DrivenCell:
         total, reversals = np.zeros_like(self.pixels()), 0
         last = np.zeros_like(self.links)
         cycles = round(seconds * RATE_HZ)
+        shown, there = self.pixels(), self.links
         for _ in range(cycles):
             self.step()
+            if not np.array_equal(self.links, there):
+                shown, there = self.pixels(), self.links
             reversals += int((self.command * last < 0.0).sum())
             last = np.where(self.command != 0.0, self.command, last)
-            total += self.pixels()
+            total += shown
         return total / cycles, reversals
 
     @staticmethod
@@ -214,6 +217,8 @@ class DrivenCell:
     def _drive(self, velocity: FloatArray, dt_s: float) -> None:
         if self._gears is None:
             self.links = self.links + velocity * dt_s
+            return
+        if not velocity.any() and self._gears.rest(dt_s):
             return
         self._set_positions = self._set_positions + velocity * dt_s
         self._gears.follow(self._set_positions, dt_s)
