@@ -556,35 +556,37 @@ JOINT_CHECKS = (
         "DriverLifecycle.require(); activate() again after deactivate()",
     ),
     JointCheck("refuses calls once closed", refuses_once_closed, "DriverLifecycle.require(); close() twice"),
-    JointCheck("is silent once closed", is_silent_once_closed, "end threads in close(); stop() only while open"),
     JointCheck("leaves nothing behind", leaves_nothing_behind, "join threads, close ports and sockets in close()"),
     JointCheck(
         "numbers and stamps its samples", numbers_its_samples,
         "stamp with context.clock when the device was read; count each sample",
     ),
-    JointCheck("keeps samples apart", keeps_samples_apart, "new arrays in every JointState and CommandReport"),
-    JointCheck(
-        "agrees with its velocities", agrees_with_its_velocities, "units [rad/s, m/s] and sign of the velocities"
-    ),
-    JointCheck("states its resolution", states_its_resolution, "JointSpec(resolution=encoder step at the joint)"),
     JointCheck("stands when activated", stands_when_activated, "activate() at velocity zero or where it stands"),
     JointCheck("moves as told", moves_as_told, "units [rad, m], gear, and the sign of commands against positions"),
-    JointCheck("cuts velocities at the limits", cuts_velocities, "clip to velocity_max and say it in reasons"),
-    JointCheck("refuses bad commands", refuses_bad_commands, "check shape and np.isfinite before anything is sent"),
     JointCheck("stops", stops, "stop() commands velocity zero, in any state, and catches what the device raises"),
     JointCheck(
         "stops when commands cease", stops_when_commands_cease,
         "the device's own watchdog, or positions within a lead of the joint (PositionOutput)",
     ),
-    JointCheck("keeps position limits", keeps_position_limits, "at a limit, send velocities inward only"),
+    JointCheck("refuses bad commands", refuses_bad_commands, "check shape and np.isfinite before anything is sent"),
+    JointCheck("cuts velocities at the limits", cuts_velocities, "clip to velocity_max and say it in reasons"),
+    JointCheck(
+        "agrees with its velocities", agrees_with_its_velocities, "units [rad/s, m/s] and sign of the velocities"
+    ),
+    JointCheck("states its resolution", states_its_resolution, "JointSpec(resolution=encoder step at the joint)"),
+    JointCheck("keeps samples apart", keeps_samples_apart, "new arrays in every JointState and CommandReport"),
+    JointCheck("is silent once closed", is_silent_once_closed, "end threads in close(); stop() only while open"),
+    JointCheck("answers in time", answers_in_time, "read in a thread, or state a call_budget_us that is kept"),
     JointCheck(
         "orders auxiliary joints", orders_auxiliary,
         "kit.auxiliary.verify_order(); stop() holds auxiliary joints, too; require ACTIVE in write_auxiliary()",
     ),
-    JointCheck("answers in time", answers_in_time, "read in a thread, or state a call_budget_us that is kept"),
+    JointCheck("keeps position limits", keeps_position_limits, "at a limit, send velocities inward only"),
     JointCheck(
         "reports a lost device", reports_a_lost_device,
         "raise DriverError('connection_lost') when answers cease; catch everything in stop() and close()",
     ),
 )  # fmt: skip
-"""In the order in which they are run: those first that need no device."""
+"""In the order in which they are run: those first that need no device, and those that may show that an arm must not
+move.
+"""
