@@ -101,7 +101,7 @@ class PositionOutput:
         self._pressed = np.where(sign == 0.0, self._pressed * ~released, sign * presses)
         learnt = np.abs(stands_off - self.offsets) < LEARNT_SHARE * self._lead
         rests = standing & (sign == 0.0) & (self._pressed == 0.0) & learnt
-        self._rested_s = np.where(rests, self._rested_s + self._period_s, 0.0)
+        self._rested_s = np.where(moves, 0.0, self._rested_s + self._period_s * rests)
         moves = moves & ~np.isnan(self._load)
-        known = np.where(self._rested_s >= LEARNS_S, stands_off, self._load)
+        known = np.where(rests & (self._rested_s >= LEARNS_S), stands_off, self._load)
         self._load = np.where(moves, self.offsets, known)

@@ -87,6 +87,18 @@ def test_a_joint_that_was_blocked_is_let_go_when_its_command_ends_or_turns(sag, 
     assert servo.position - start == pytest.approx(-0.2, abs=0.004)
 
 
+def test_a_joint_with_a_coarse_encoder_is_let_go_too():
+    """Its reading flickers by a step, at rest as well."""
+    servo, step, k = output(lead=0.3), 0.0015, 0
+    order = servo.follow(np.zeros(1), np.zeros(1, dtype=bool))
+    for velocity, cycles in ((0.0, 500), (0.4, 500), (-0.05, 2)):
+        for k in range(cycles):
+            order = servo.step(np.array([velocity]), np.array([step * (k % 3 == 0)]), *LIMITS)
+        if velocity > 0.0:
+            assert float(order[0]) > 0.29
+    assert abs(float(order[0])) < 3 * step
+
+
 def test_a_joint_whose_load_is_not_known_yet_is_not_let_go():
     servo = Servo(output(lead=0.03), np.radians(2.5))
     servo.run(0.1)

@@ -8,6 +8,7 @@ import json
 import sys
 import tempfile
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,8 +38,11 @@ class DriverCheckError(Exception):
 class GivenDriver(JointDriverSetup):
     """A driver class with its options, as the command line has them."""
 
-    def __init__(self, driver: type[JointDriver], options: dict[str, Any], pull: bool) -> None:
-        self.driver, self.options, self.pull = driver, options, pull
+    def __init__(self, driver: type[JointDriver], options: dict[str, Any], pull: bool, folder: Path) -> None:
+        self.driver, self.options, self.pull, self.folder = driver, options, pull, folder
+
+    def make_context(self, folder: Path) -> DriverContext:
+        return replace(super().make_context(folder), cell_dir=self.folder)
 
     def make_driver(self, context: DriverContext) -> JointDriver:
         return self.driver(self.options, context)
@@ -87,20 +91,32 @@ def driver_check(
         raise DriverCheckError("argument", "--hardware and --simulated exclude each other")
     if (whole_range or pull) and not hardware:
         raise DriverCheckError("argument", "--whole-range and --pull need --hardware")
-    setup = _setup(driver, _options(options, cell), pull)
+    folder = Path.cwd() if cell is None else cell.absolute().parent
+    setup = _setup(driver, _options(options, cell), pull, folder)
     if hardware:
         setup.real_time = True
         setup.whole_range = whole_range
         far = ", and to its limits" if whole_range else ""
         if not yes and not typer.confirm(WARNING.format(far=far), err=True):
             raise DriverCheckError("refused", "nothing was done")
-    results = [
-        _run(check, setup)
-        if hardware or simulated or not check.connects
-        else CheckResult(check.name, "not run", "needs the device: --hardware (the arm moves) or --simulated")
-        for check in JOINT_CHECKS
-    ]
-    _report(driver, results, as_json)
+    _report(driver, _results(setup, hardware or simulated, hardware), as_json)
+
+
+def _results(setup: JointDriverSetup, connected: bool, hardware: bool) -> list[CheckResult]:
+    """Run the checks; on hardware none after one that has failed, since the arm would move."""
+    results: list[CheckResult] = []
+    failed = ""
+    for check in JOINT_CHECKS:
+        reason = "" if connected else "needs the device: --hardware (the arm moves) or --simulated"
+        if failed and hardware:
+            reason = f"the arm moves no more once a check has failed: mend {failed!r} first"
+        if check.connects and reason:
+            results.append(CheckResult(check.name, "not run", reason))
+            continue
+        results.append(_run(check, setup))
+        if results[-1].verdict == "failed":
+            failed = failed or check.name
+    return results
 
 
 def _options(text: str, cell: Path | None) -> dict[str, Any]:
@@ -119,10 +135,10 @@ def _options(text: str, cell: Path | None) -> dict[str, Any]:
     return found
 
 
-def _setup(name: str, options: dict[str, Any], pull: bool) -> JointDriverSetup:
+def _setup(name: str, options: dict[str, Any], pull: bool, folder: Path) -> JointDriverSetup:
     """What is to be checked. Raises DriverCheckError, plugins.PluginError."""
     if ":" not in name:
-        return GivenDriver(plugins.load(plugins.JOINT_DRIVERS, name), options, pull)
+        return GivenDriver(plugins.load(plugins.JOINT_DRIVERS, name), options, pull, folder)
     module, _, attribute = name.partition(":")
     sys.path.insert(0, str(Path.cwd()))  # as python -m has it
     try:
@@ -134,7 +150,7 @@ def _setup(name: str, options: dict[str, Any], pull: bool) -> JointDriverSetup:
             "import", f"{name} is {found!r}; a driver class, or a JointDriverSetup, is needed"
         )
     if not issubclass(found, JointDriverSetup):
-        return GivenDriver(found, options, pull)
+        return GivenDriver(found, options, pull, folder)
     setup: JointDriverSetup = found()
     return setup
 

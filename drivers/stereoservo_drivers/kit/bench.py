@@ -13,6 +13,8 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import MonotonicClock, VirtualClock
 from stereoservo.ports.devices import CommandReport, DriverContext, JointDriver, JointState
 
+RUNAWAY, RUNAWAY_TIMES = 0.03, 3.0
+"""[rad or m], and times the commanded travel: an arm that goes farther is stopped."""
 FUTURE_NS = 1_000_000
 """Several reads at one time of a virtual clock may carry growing stamps."""
 
@@ -174,11 +176,22 @@ class JointBench:
         return signs * self.setup.speed * np.array([j.velocity_max for j in joints])
 
     def drive(self, driver: JointDriver, velocity: FloatArray, seconds: float) -> list[JointState]:
-        """Command ``velocity`` (n,) at the driver's rate for ``seconds``; returns the samples."""
+        """Command ``velocity`` (n,) at the driver's rate for ``seconds``; returns the samples.
+
+        Raises CheckFailedError, with the arm stopped, where a joint goes much farther than it is commanded.
+        """
         period = 1.0 / driver.describe().rate_hz
-        states = []
+        states: list[JointState] = []
+        start_ns = self.now_ns()
         for _ in range(max(round(seconds / period), 1)):
             states.append(self.read(driver))
+            asked = np.abs(velocity) * (self.now_ns() - start_ns) * 1e-9
+            travel = np.abs(states[-1].positions - states[0].positions)
+            if (travel > RUNAWAY_TIMES * asked + RUNAWAY).any():
+                driver.stop()
+                raise CheckFailedError(
+                    f"the arm runs away, and was stopped: {travel.tolist()} rad or m for {asked.tolist()} commanded"
+                )
             self.write(driver, velocity)
             self.wait(period)
         return states

@@ -94,7 +94,7 @@ def _zero(driver: JointDriver) -> Any:
 # -- without the device ----------------------------------------------------------------------------------------
 
 
-def describes_itself(bench: JointBench) -> str:
+def _describes_itself(bench: JointBench) -> str:
     driver = bench.new()
     require(isinstance(driver, JointDriver), f"{type(driver).__name__} lacks methods of JointDriver")
     description = driver.describe()
@@ -115,7 +115,7 @@ def describes_itself(bench: JointBench) -> str:
     return f"{len(names)} joints at {description.rate_hz:g} Hz, time-out {description.command_timeout_s:g} s"
 
 
-def refuses_before_configure(bench: JointBench) -> str:
+def _refuses_before_configure(bench: JointBench) -> str:
     driver = bench.new()
     codes = [
         refused(call, f"{name}() before configure()")
@@ -128,16 +128,16 @@ def refuses_before_configure(bench: JointBench) -> str:
     return ", ".join(dict.fromkeys(codes))
 
 
-def stops_unconnected(bench: JointBench) -> str:
+def _stops_unconnected(bench: JointBench) -> str:
     driver = bench.new()
     for state in ("before configure()", "after close()"):
         for _ in range(2):
-            _stop(driver, state)
+            _call_stop(driver, state)
         driver.close()
     return "stop() and close(), twice each"
 
 
-def _stop(driver: JointDriver, when: str) -> None:
+def _call_stop(driver: JointDriver, when: str) -> None:
     try:
         driver.stop()
     except Exception as error:
@@ -147,7 +147,7 @@ def _stop(driver: JointDriver, when: str) -> None:
 # -- lifecycle ---------------------------------------------------------------------------------------------------
 
 
-def keeps_its_description(bench: JointBench) -> str:
+def _keeps_its_description(bench: JointBench) -> str:
     driver = bench.new()
     before = driver.describe()
     bench.setup.configure(driver)
@@ -157,7 +157,7 @@ def keeps_its_description(bench: JointBench) -> str:
     return "the same in three states"
 
 
-def refuses_unless_active(bench: JointBench) -> str:
+def _refuses_unless_active(bench: JointBench) -> str:
     driver = bench.configured()
     codes = [refused(lambda: driver.write_velocity(_zero(driver)), "write_velocity() before activate()")]
     driver.activate()
@@ -169,7 +169,7 @@ def refuses_unless_active(bench: JointBench) -> str:
     return f"{codes[0]}, {codes[1]}; activated again"
 
 
-def refuses_once_closed(bench: JointBench) -> str:
+def _refuses_once_closed(bench: JointBench) -> str:
     driver = bench.active()
     driver.close()
     driver.close()
@@ -178,7 +178,7 @@ def refuses_once_closed(bench: JointBench) -> str:
     return ", ".join(dict.fromkeys(codes))
 
 
-def is_silent_once_closed(bench: JointBench) -> str:
+def _is_silent_once_closed(bench: JointBench) -> str:
     driver = bench.active()
     bench.drive(driver, bench.slow(driver), 0.05)
     driver.close()
@@ -194,7 +194,7 @@ def is_silent_once_closed(bench: JointBench) -> str:
     return f"{before} writes before close(), none after"
 
 
-def leaves_nothing_behind(bench: JointBench) -> str:
+def _leaves_nothing_behind(bench: JointBench) -> str:
     for first in (True, False):  # what is loaded once, by the first driver, is no leak
         threads, files = set(threading.enumerate()), _open_files()
         driver = bench.active()
@@ -224,7 +224,7 @@ def _open_files() -> int:
 # -- samples -----------------------------------------------------------------------------------------------------
 
 
-def numbers_its_samples(bench: JointBench) -> str:
+def _numbers_its_samples(bench: JointBench) -> str:
     driver = bench.active()
     period = 1.0 / driver.describe().rate_hz
     states, ages = [], []
@@ -239,7 +239,7 @@ def numbers_its_samples(bench: JointBench) -> str:
     return f"age {age * 1e3:.2f} ms (median)"
 
 
-def keeps_samples_apart(bench: JointBench) -> str:
+def _keeps_samples_apart(bench: JointBench) -> str:
     driver = bench.active()
     velocity = bench.slow(driver)
     state = bench.read(driver)
@@ -255,7 +255,7 @@ def keeps_samples_apart(bench: JointBench) -> str:
     return "samples and reports own their arrays"
 
 
-def agrees_with_its_velocities(bench: JointBench) -> str:
+def _agrees_with_its_velocities(bench: JointBench) -> str:
     driver = bench.active()
     states = bench.drive(driver, bench.slow(driver), 0.6)
     states = states[len(states) // 2 :]
@@ -274,7 +274,7 @@ def agrees_with_its_velocities(bench: JointBench) -> str:
     return f"velocities within {float(error.max()):.2g} rad/s or m/s of the positions' change"
 
 
-def states_its_resolution(bench: JointBench) -> str:
+def _states_its_resolution(bench: JointBench) -> str:
     driver = bench.active()
     description = driver.describe()
     period = 1.0 / description.rate_hz
@@ -301,7 +301,7 @@ def states_its_resolution(bench: JointBench) -> str:
 # -- motion ------------------------------------------------------------------------------------------------------
 
 
-def stands_when_activated(bench: JointBench) -> str:
+def _stands_when_activated(bench: JointBench) -> str:
     driver = bench.configured()
     before = bench.read(driver).positions
     driver.activate()
@@ -314,7 +314,7 @@ def stands_when_activated(bench: JointBench) -> str:
     return f"moved {travel:.2g} rad or m"
 
 
-def moves_as_told(bench: JointBench) -> str:
+def _moves_as_told(bench: JointBench) -> str:
     driver = bench.active()
     velocity = bench.slow(driver)
     start_ns, before = bench.now_ns(), bench.read(driver).positions
@@ -334,7 +334,7 @@ def moves_as_told(bench: JointBench) -> str:
     return f"{shares.min():.0%} to {shares.max():.0%} of the commanded travel"
 
 
-def cuts_velocities(bench: JointBench) -> str:
+def _cuts_velocities(bench: JointBench) -> str:
     driver = bench.active()
     limits = np.array([joint.velocity_max for joint in driver.describe().joints])
     velocity = bench.slow(driver)
@@ -352,7 +352,7 @@ def cuts_velocities(bench: JointBench) -> str:
     return f"cut to the limits: {', '.join(report.reasons)}"
 
 
-def refuses_bad_commands(bench: JointBench) -> str:
+def _refuses_bad_commands(bench: JointBench) -> str:
     driver = bench.active()
     zero = _zero(driver)
     codes = [refused(lambda: driver.write_velocity(np.zeros(len(zero) + 1)), "a command of another shape")]
@@ -364,17 +364,17 @@ def refuses_bad_commands(bench: JointBench) -> str:
     return ", ".join(dict.fromkeys(codes))
 
 
-def stops(bench: JointBench) -> str:
+def _stops(bench: JointBench) -> str:
     driver = bench.active()
     velocity = bench.slow(driver)
     bench.drive(driver, velocity, 0.2)
-    _stop(driver, "while moving")
-    _stop(driver, "while stopping")
+    _call_stop(driver, "while moving")
+    _call_stop(driver, "while stopping")
     state = bench.settle(driver, bench.setup.brake_s)
     bench.require_rest(driver, f"{bench.setup.brake_s:g} s after stop()")
     bench.drive(driver, velocity, 0.2)
     driver.deactivate()
-    _stop(driver, "after deactivate()")
+    _call_stop(driver, "after deactivate()")
     bench.settle(driver, bench.setup.brake_s)
     bench.require_rest(driver, "after deactivate()")
     return (
@@ -382,7 +382,7 @@ def stops(bench: JointBench) -> str:
     )
 
 
-def stops_when_commands_cease(bench: JointBench) -> str:
+def _stops_when_commands_cease(bench: JointBench) -> str:
     if not bench.setup.enforces_timeout:
         raise CheckNotRunError("this device has no command time-out of its own (enforces_timeout)")
     driver = bench.active()
@@ -404,7 +404,7 @@ def stops_when_commands_cease(bench: JointBench) -> str:
     )
 
 
-def keeps_position_limits(bench: JointBench) -> str:
+def _keeps_position_limits(bench: JointBench) -> str:
     allowed_here = bench.setup.whole_range
     if not (not bench.setup.real_time if allowed_here is None else allowed_here):
         raise CheckNotRunError("drives every joint to a limit: whole_range, `--whole-range`")
@@ -440,7 +440,7 @@ def keeps_position_limits(bench: JointBench) -> str:
     return f"{reached} joints driven to a limit, at most {float(beyond.max()):+.2g} rad or m beyond"
 
 
-def orders_auxiliary(bench: JointBench) -> str:
+def _orders_auxiliary(bench: JointBench) -> str:
     driver = bench.active()
     specs = driver.describe().auxiliary
     if not specs:
@@ -459,7 +459,7 @@ def orders_auxiliary(bench: JointBench) -> str:
     driver.write_auxiliary(ends)
     bench.drive(driver, _zero(driver), 0.1)
     driver.stop()
-    _stop(driver, "while an auxiliary joint moves")
+    _call_stop(driver, "while an auxiliary joint moves")
     bench.settle(driver, 0.2)
     stopped = driver.read_auxiliary()
     bench.settle(driver, 0.3)
@@ -479,7 +479,7 @@ def orders_auxiliary(bench: JointBench) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in after.items())
 
 
-def answers_in_time(bench: JointBench) -> str:
+def _answers_in_time(bench: JointBench) -> str:
     driver = bench.active()
     description = driver.describe()
     period, velocity = 1.0 / description.rate_hz, bench.slow(driver)
@@ -507,7 +507,7 @@ def answers_in_time(bench: JointBench) -> str:
     return f"{'; '.join(texts)}; budget {description.call_budget_us:.0f} us"
 
 
-def reports_a_lost_device(bench: JointBench) -> str:
+def _reports_a_lost_device(bench: JointBench) -> str:
     driver = bench.active()
     velocity, period = bench.slow(driver), 1.0 / driver.describe().rate_hz
     bench.drive(driver, velocity, 0.1)
@@ -517,8 +517,8 @@ def reports_a_lost_device(bench: JointBench) -> str:
     try:
         code = _await_fault(bench, driver, velocity, period)
         waited = (bench.now_ns() - start_ns) * 1e-9
-        _stop(driver, "with the device gone")
-        _stop(driver, "with the device gone, a second time")
+        _call_stop(driver, "with the device gone")
+        _call_stop(driver, "with the device gone, a second time")
         driver.close()
     finally:
         bench.setup.plug_in(driver)
@@ -543,48 +543,50 @@ def _await_fault(bench: JointBench, driver: JointDriver, velocity: Any, period: 
 
 JOINT_CHECKS = (
     JointCheck(
-        "describes itself", describes_itself, "fill in JointDriverDescription before anything connects", False
+        "describes itself", _describes_itself, "fill in JointDriverDescription before anything connects", False
     ),
     JointCheck(
-        "refuses calls before configure", refuses_before_configure,
+        "refuses calls before configure", _refuses_before_configure,
         "DriverLifecycle.require() at the beginning of each call", False,
     ),
-    JointCheck("stop raises nothing unconnected", stops_unconnected, "stop() must do nothing there", False),
-    JointCheck("keeps its description", keeps_its_description, "read limits before configure()"),
+    JointCheck("stop raises nothing unconnected", _stops_unconnected, "stop() must do nothing there", False),
+    JointCheck("keeps its description", _keeps_its_description, "read limits before configure()"),
     JointCheck(
-        "refuses commands unless active", refuses_unless_active,
+        "refuses commands unless active", _refuses_unless_active,
         "DriverLifecycle.require(); activate() again after deactivate()",
     ),
-    JointCheck("refuses calls once closed", refuses_once_closed, "DriverLifecycle.require(); close() twice"),
-    JointCheck("is silent once closed", is_silent_once_closed, "end threads in close(); stop() only while open"),
-    JointCheck("leaves nothing behind", leaves_nothing_behind, "join threads, close ports and sockets in close()"),
+    JointCheck("refuses calls once closed", _refuses_once_closed, "DriverLifecycle.require(); close() twice"),
+    JointCheck("leaves nothing behind", _leaves_nothing_behind, "join threads, close ports and sockets in close()"),
     JointCheck(
-        "numbers and stamps its samples", numbers_its_samples,
+        "numbers and stamps its samples", _numbers_its_samples,
         "stamp with context.clock when the device was read; count each sample",
     ),
-    JointCheck("keeps samples apart", keeps_samples_apart, "new arrays in every JointState and CommandReport"),
+    JointCheck("stands when activated", _stands_when_activated, "activate() at velocity zero or where it stands"),
+    JointCheck("moves as told", _moves_as_told, "units [rad, m], gear, and the sign of commands against positions"),
+    JointCheck("stops", _stops, "stop() commands velocity zero, in any state, and catches what the device raises"),
     JointCheck(
-        "agrees with its velocities", agrees_with_its_velocities, "units [rad/s, m/s] and sign of the velocities"
-    ),
-    JointCheck("states its resolution", states_its_resolution, "JointSpec(resolution=encoder step at the joint)"),
-    JointCheck("stands when activated", stands_when_activated, "activate() at velocity zero or where it stands"),
-    JointCheck("moves as told", moves_as_told, "units [rad, m], gear, and the sign of commands against positions"),
-    JointCheck("cuts velocities at the limits", cuts_velocities, "clip to velocity_max and say it in reasons"),
-    JointCheck("refuses bad commands", refuses_bad_commands, "check shape and np.isfinite before anything is sent"),
-    JointCheck("stops", stops, "stop() commands velocity zero, in any state, and catches what the device raises"),
-    JointCheck(
-        "stops when commands cease", stops_when_commands_cease,
+        "stops when commands cease", _stops_when_commands_cease,
         "the device's own watchdog, or positions within a lead of the joint (PositionOutput)",
     ),
-    JointCheck("keeps position limits", keeps_position_limits, "at a limit, send velocities inward only"),
+    JointCheck("refuses bad commands", _refuses_bad_commands, "check shape and np.isfinite before anything is sent"),
+    JointCheck("cuts velocities at the limits", _cuts_velocities, "clip to velocity_max and say it in reasons"),
     JointCheck(
-        "orders auxiliary joints", orders_auxiliary,
+        "agrees with its velocities", _agrees_with_its_velocities, "units [rad/s, m/s] and sign of the velocities"
+    ),
+    JointCheck("states its resolution", _states_its_resolution, "JointSpec(resolution=encoder step at the joint)"),
+    JointCheck("keeps samples apart", _keeps_samples_apart, "new arrays in every JointState and CommandReport"),
+    JointCheck("is silent once closed", _is_silent_once_closed, "end threads in close(); stop() only while open"),
+    JointCheck("answers in time", _answers_in_time, "read in a thread, or state a call_budget_us that is kept"),
+    JointCheck(
+        "orders auxiliary joints", _orders_auxiliary,
         "kit.auxiliary.verify_order(); stop() holds auxiliary joints, too; require ACTIVE in write_auxiliary()",
     ),
-    JointCheck("answers in time", answers_in_time, "read in a thread, or state a call_budget_us that is kept"),
+    JointCheck("keeps position limits", _keeps_position_limits, "at a limit, send velocities inward only"),
     JointCheck(
-        "reports a lost device", reports_a_lost_device,
+        "reports a lost device", _reports_a_lost_device,
         "raise DriverError('connection_lost') when answers cease; catch everything in stop() and close()",
     ),
 )  # fmt: skip
-"""In the order in which they are run: those first that need no device."""
+"""In the order in which they are run: those first that need no device, and those that may show that an arm must not
+move.
+"""

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from stereoservo_drivers.commands.driver_check import driver_check
+from stereoservo_drivers.kit.bench import CheckFailedError, JointBench
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
+from stereoservo_drivers.kit.watchdog import CommandWatchdog
 
-from .faulty_drivers import FAULTY, Driver, SmallSetup
+from .faulty_drivers import FAULTY, Driver, SmallSetup, TimeOutNotKept
 
 
 @pytest.mark.parametrize("check", JOINT_CHECKS, ids=lambda check: check.name)
@@ -91,3 +94,58 @@ def test_hardware_is_moved_only_after_a_yes():
     result = CliRunner().invoke(app, ["faulty_drivers:Driver", "--hardware"], input="n\n")
     assert result.exit_code == 1
     assert "nothing was done" in str(result.exception)
+
+
+@pytest.mark.usefixtures("here")
+def test_hardware_moves_no_more_once_a_check_has_failed():
+    code, report = command("faulty_drivers:Degrees", "--hardware", "--yes")
+    verdicts = {check["name"]: check["verdict"] for check in report["checks"]}
+    names = list(verdicts)
+    assert code == 1
+    assert verdicts["moves as told"] == "failed"
+    assert {verdicts[name] for name in names[names.index("moves as told") + 1 :]} == {"not run"}
+
+
+class Racing(Driver):
+    """A gear that is wrong by a hundred."""
+
+    def limited(self, velocities):
+        return 100.0 * velocities
+
+
+def test_an_arm_that_runs_away_is_stopped_at_once(tmp_path):
+    setup = SmallSetup()
+    setup.driver = Racing
+    bench = JointBench(setup, setup.make_context(tmp_path))
+    driver = bench.active()
+    with pytest.raises(CheckFailedError, match="runs away, and was stopped"):
+        bench.drive(driver, bench.slow(driver), 0.3)
+    assert np.abs(driver.device.positions).max() < 0.06
+    assert not driver.device.velocities.any()
+    bench.close()
+
+
+class Watched(TimeOutNotKept):
+    """A device that goes on for ever, behind a watchdog."""
+
+    def activate(self):
+        super().activate()
+        self.watchdog = CommandWatchdog(0.1, lambda: self.device.exchange(np.zeros(2)))
+
+    def write_velocity(self, qd):
+        report = super().write_velocity(qd)
+        self.watchdog.feed()
+        return report
+
+    def deactivate(self):
+        if self.life.state == "active":
+            self.watchdog.close()
+        super().deactivate()
+
+
+@pytest.mark.parametrize("name", ["stops when commands cease", "leaves nothing behind"])
+def test_a_watchdog_stops_a_device_that_has_none(name, tmp_path):
+    setup = SmallSetup()
+    setup.driver, setup.real_time, setup.brake_s = Watched, True, 0.2
+    (check,) = (check for check in JOINT_CHECKS if check.name == name)
+    assert run_check(check, setup, tmp_path).verdict == "passed"
