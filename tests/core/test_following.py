@@ -295,3 +295,25 @@ def test_trial_motions_are_made_by_late_drives(bench: Any) -> None:
     assert ended.kind == "calibration_finished", ended
     delays = bench.core.state.delays.delay_s
     np.testing.assert_allclose(delays, 0.2, atol=0.02)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_late_drives_stop_before_the_margin_of_a_limit(bench: Any, side: float) -> None:
+    limits = bench.settings.limits
+    bound = bench.q[5] + 0.8 * side
+    low, high = limits.position_min.copy(), limits.position_max.copy()
+    (high if side > 0.0 else low)[5] = bound
+    bench.settings = msgspec.structs.replace(
+        bench.settings, limits=msgspec.structs.replace(limits, position_min=low, position_max=high)
+    )
+    bench.core = ServoCore(bench.settings)
+    bench.ready()
+    bench.delay_s = 0.2
+    farthest = -1.0
+    for _ in range(300):
+        bench.step(Jog({"j6": side}, 0.5))
+        farthest = max(farthest, side * (bench.q[5] - bound))
+    assert abs(farthest + limits.position_margin) < 1e-3
+    for _ in range(150):  # and back
+        bench.step(Jog({"j6": -side}, 0.5))
+    assert side * (bench.q[5] - bound) < -0.5

@@ -181,10 +181,22 @@ def move(context: StepContext) -> SourceOutput:
     context.paused = paused(state)
     if context.paused or state.lifecycle != Lifecycle.ACTIVE:
         state.friction = None
-        return SourceOutput(np.zeros_like(context.q))
+        return _foreseen(SourceOutput(np.zeros_like(context.q)), context)
     kind = MOTION_SOURCES[type(state.source)]
     goal = kind.goal(state.source)
-    return compensate_friction(kind.step(state.source, context), goal, context)
+    return _foreseen(compensate_friction(kind.step(state.source, context), goal, context), context)
+
+
+def _foreseen(output: SourceOutput, context: StepContext) -> SourceOutput:
+    """The output; the safety stage is told where late drives will have their joints before they obey it."""
+    delays = context.state.delays
+    if delays is not None and delays.delay_s.any():
+        towards = np.where(output.velocity != 0.0, output.velocity, context.state.command)
+        ahead = context.q + delays.under_way
+        context.outermost = np.where(
+            towards > 0.0, np.maximum(context.q, ahead), np.minimum(context.q, ahead)
+        )
+    return output
 
 
 # -- friction ---------------------------------------------------------------------------------------------------
