@@ -415,14 +415,18 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
         now_ns, source, cell = 10**12 + int(rng.integers(10**9)), *rng.uniform(0.2, 1.0, 2)
         ages_ns = [int(age * 1e9) for age in rng.uniform(0.0, 0.8, 3)]
         accepted = [SimpleNamespace(accepted_ns=now_ns - age) for age in ages_ns[: rng.integers(3)]]
+        late = bool(
+            rng.integers(2)
+        )  # drives that are late: where they will be counts, and not where they are
         context = SimpleNamespace(
+            outermost=step.positions if late else None,
             state=SimpleNamespace(
                 cameras=accepted,
                 command=step.previous,
                 last_joints_ns=now_ns - ages_ns[2] // 4,
                 lifecycle=lifecycle,
             ),
-            q=step.positions,
+            q=step.positions + (0.7 if late else 0.0),
             dt_s=step.dt_s,
             now_ns=now_ns,
             paused=step.brake,

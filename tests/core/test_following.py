@@ -233,6 +233,17 @@ def test_a_late_joint_that_is_blocked_on_its_way_is_found_as_fast_as_a_prompt_on
     assert (k - blocked) * DT_S <= (0.175 if speed == 1.0 else 0.26)
 
 
+def test_play_before_an_encoder_is_no_delay(bench):
+    """Known from two motions to the same side; what a motion to the other side takes up is not taken for one."""
+    settings = at_the_rate_of_these_tests(bench.settings)
+    state, rest = initial_state(settings), np.zeros(round(0.5 * RATE_HZ))
+    pulse = np.concatenate([setting_out(0.2, 0.5), rest])
+    commands = np.concatenate([pulse, pulse, pulse, -pulse, pulse, -pulse, pulse])
+    assert watched(settings, commands, with_play(travelled(commands), 0.015), state=state)[0] is None
+    assert state.delays is not None
+    assert state.delays.delay_s[0] == 0.0
+
+
 def test_a_drive_that_has_become_faster_is_not_blamed(bench):
     settings = at_the_rate_of_these_tests(bench.settings)
     state = initial_state(settings)
@@ -274,7 +285,7 @@ def test_goals_are_reached_by_late_drives_and_not_overshot(bench: Any, by: str, 
 
 
 def test_trial_motions_are_made_by_late_drives(bench: Any) -> None:
-    trials = msgspec.structs.replace(bench.settings.trials, stops=3, frames=1)
+    trials = msgspec.structs.replace(bench.settings.trials, stops=4, frames=1)
     bench.settings = msgspec.structs.replace(bench.settings, trials=trials)
     bench.core = ServoCore(bench.settings)
     bench.ready()
@@ -284,3 +295,25 @@ def test_trial_motions_are_made_by_late_drives(bench: Any) -> None:
     assert ended.kind == "calibration_finished", ended
     delays = bench.core.state.delays.delay_s
     np.testing.assert_allclose(delays, 0.2, atol=0.02)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_late_drives_stop_before_the_margin_of_a_limit(bench: Any, side: float) -> None:
+    limits = bench.settings.limits
+    bound = bench.q[5] + 0.8 * side
+    low, high = limits.position_min.copy(), limits.position_max.copy()
+    (high if side > 0.0 else low)[5] = bound
+    bench.settings = msgspec.structs.replace(
+        bench.settings, limits=msgspec.structs.replace(limits, position_min=low, position_max=high)
+    )
+    bench.core = ServoCore(bench.settings)
+    bench.ready()
+    bench.delay_s = 0.2
+    farthest = -1.0
+    for _ in range(300):
+        bench.step(Jog({"j6": side}, 0.5))
+        farthest = max(farthest, side * (bench.q[5] - bound))
+    assert abs(farthest + limits.position_margin) < 1e-3
+    for _ in range(150):  # and back
+        bench.step(Jog({"j6": -side}, 0.5))
+    assert side * (bench.q[5] - bound) < -0.5

@@ -71,7 +71,8 @@ class StepContext:
 
     `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
     ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) need a model. `move` sets ``paused``: the active source had
-    to wait. ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
+    to wait, and with late drives ``outermost`` (n,): where joints are, or will be, farthest towards where they go.
+    ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
     """
 
     inputs: StepInputs
@@ -89,6 +90,7 @@ class StepContext:
     weights: FloatArray | None = None
     pixels: FloatArray | None = None
     paused: bool = False
+    outermost: FloatArray | None = None
     goals_read: list[str] = field(default_factory=list)
 
 

@@ -234,7 +234,7 @@ def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> S
     result = safety_stage(
         SafetyInputs(
             raw=motion.velocity,
-            positions=context.q,
+            positions=context.q if context.outermost is None else context.outermost,
             previous=state.command,
             dt_s=context.dt_s,
             joint_age_s=(context.now_ns - state.last_joints_ns) * 1e-9,

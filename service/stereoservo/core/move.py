@@ -181,10 +181,22 @@ def move(context: StepContext) -> SourceOutput:
     context.paused = paused(state)
     if context.paused or state.lifecycle != Lifecycle.ACTIVE:
         state.friction = None
-        return SourceOutput(np.zeros_like(context.q))
+        return _foreseen(SourceOutput(np.zeros_like(context.q)), context)
     kind = MOTION_SOURCES[type(state.source)]
     goal = kind.goal(state.source)
-    return compensate_friction(kind.step(state.source, context), goal, context)
+    return _foreseen(compensate_friction(kind.step(state.source, context), goal, context), context)
+
+
+def _foreseen(output: SourceOutput, context: StepContext) -> SourceOutput:
+    """The output; the safety stage is told where late drives will have their joints before they obey it."""
+    delays = context.state.delays
+    if delays is not None and delays.delay_s.any():
+        towards = np.where(output.velocity != 0.0, output.velocity, context.state.command)
+        ahead = context.q + delays.under_way
+        context.outermost = np.where(
+            towards > 0.0, np.maximum(context.q, ahead), np.minimum(context.q, ahead)
+        )
+    return output
 
 
 # -- friction ---------------------------------------------------------------------------------------------------
@@ -294,7 +306,7 @@ ONSET_TRAVEL = 2.0
 """The travel that is timed, times that by which a reading answers."""
 WAITS, RESTS, SETS_OUT = 0.0, 1.0, 2.0
 """Phases of a measurement."""
-PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S = range(6)
+PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S, TOWARDS = range(7)
 """Rows of `DriveDelays.onset`."""
 
 
@@ -302,7 +314,7 @@ def unknown_delays(settings: CoreSettings) -> DriveDelays:
     """Of joints of which nothing has been sent or seen."""
     n = len(settings.joint_names)
     return DriveDelays(
-        delay_s=np.zeros(n), samples=np.full((SAMPLES, n), np.nan), onset=np.zeros((6, n)), sent=np.zeros(n),
+        delay_s=np.zeros(n), samples=np.full((SAMPLES, n), np.nan), onset=np.zeros((7, n)), sent=np.zeros(n),
         past=np.zeros((math.ceil(LONGEST_S * settings.rate_hz) + 2, n)), velocity=np.zeros(n),
         under_way=np.zeros(n), accounted=np.zeros(n), missing=np.zeros(n),
     )  # fmt: skip
@@ -328,6 +340,8 @@ def measure_delays(
                 onset[STOOD_AT, j], onset[SENT_BEFORE, j] = q[j], sent[j]
                 continue
             onset[PHASE, j], onset[SINCE_S, j], onset[PASSED_S, j] = SETS_OUT, 0.0, -1.0
+            if command[j] * onset[TOWARDS, j] < 0.0 and math.isfinite(samples[-1, j]):
+                onset[PHASE, j], onset[TOWARDS, j] = WAITS, command[j]  # through its play first
         if onset[PHASE, j] != SETS_OUT:
             continue
         onset[SINCE_S, j] += dt_s
@@ -338,7 +352,7 @@ def measure_delays(
             onset[PASSED_S, j] = 0.0
         late = onset[PASSED_S, j] > LONGEST_S or (onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S)
         if abs(made) >= travel or late:
-            onset[PHASE, j] = WAITS
+            onset[PHASE, j], onset[TOWARDS, j] = WAITS, was_sent
             if not late and onset[PASSED_S, j] >= 0.0 and made * was_sent > 0.0:
                 _push(samples[:, j], onset[PASSED_S, j])
                 median_s = _median(samples[:, j])
