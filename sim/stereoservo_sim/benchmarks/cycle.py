@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -25,6 +27,7 @@ from stereoservo_sim.benchmarks.core_loop import (
     CoreLoop,
     largest_cell,
     rx90_with_facets,
+    timed_stages,
 )
 from stereoservo_sim.benchmarks.stereo_reference import stereo_law
 from stereoservo_sim.benchmarks.timing import summary, timed
@@ -37,7 +40,6 @@ WARM_UP = 100
 """Steps of the core that do not count."""
 LARGE_BODIES = ((8, 2, 6), (64, 2, 6), (256, 2, 6), (256, 8, 6), (256, 8, 12))
 """Markers, cameras, joints."""
-"""Markers and cameras."""
 
 
 def stereo_problem() -> dict[str, Any]:
@@ -118,18 +120,17 @@ def with_reference(p: dict[str, Any]) -> FloatArray:
 
 
 def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Microseconds of a control step and of a core step under each Cartesian and image law."""
+    """Microseconds of a control step, and of steps of the core under each law."""
     problem = stereo_problem()
     count = max(200, 100 * repetitions)
     fused = timed(in_one_call(problem), count, warm_up=20)[0]
     kernels = timed(lambda _: with_kernels(problem), count, warm_up=20)[0]
     reference = timed(lambda _: with_reference(problem), count, warm_up=5)[0]
-    progress("control step", 1, 3)
-    laws: tuple[LawName, ...] = ("stereo", "cartesian3")
-    core = {}
-    for k, law in enumerate(laws):
-        core[law] = summary(core_steps(law, count, seed), 1e6)
-        progress("control step", 2 + k, 3)
+    progress("control step", 1, 1)
+    core: dict[str, dict[str, Any]] = {}
+    for law in LAWS:
+        core[law] = core_steps(law, count, seed)
+        progress("core step", len(core), len(LAWS))
     return {
         "stereo_step_us": {
             "one_call": summary(fused, 1e6),
@@ -153,16 +154,42 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     }
 
 
-def core_steps(law: LawName, count: int, seed: int) -> list[float]:
-    """Durations [s] of ``count`` steps of a core that drives the simulated arm to a goal by ``law``."""
+PACED_S = 0.003
+"""Sleep between two steps, as in life: caches are cold then."""
+KINDS = {"moving, between": "between frames", "moving, frames": "with frames"}
+
+
+def core_steps(law: LawName, count: int, seed: int) -> dict[str, Any]:
+    """Microseconds of ``count`` steps between frames, and of those with frames of all cameras, of a core that drives the
+    simulated arm to a goal by ``law``: one after the other (``tight``), with a sleep before each (``paced``), and by
+    stage (``stages``, medians, tight).
+    """
     loop = CoreLoop(rx90(), seed)
     loop.start_goal(law)
+    steps = math.ceil(count * FRAME_EVERY / (FRAME_EVERY - 1))
     for _ in range(WARM_UP):
         loop.step()
-    loop.times.clear()
-    for _ in range(count):
-        loop.step()
-    return [seconds for _, seconds in loop.times]
+    found: dict[str, Any] = {}
+    for name, pause_s in (("tight", 0.0), ("paced", PACED_S)):
+        loop.times.clear()
+        for _ in range(steps):
+            if pause_s:
+                time.sleep(pause_s)
+            loop.step()
+        found[name] = {label: summary(of_kind(loop.times, kind), 1e6) for kind, label in KINDS.items()}
+    with timed_stages(loop) as stages:
+        for _ in range(steps):
+            loop.step()
+    found["stages"] = {
+        label: {stage: summary(of_kind(times, kind), 1e6)["median"] for stage, times in stages.items()}
+        for kind, label in KINDS.items()
+    }
+    return found
+
+
+def of_kind(times: list[tuple[str, float]], kind: str) -> list[float]:
+    """The durations of steps of a kind."""
+    return [seconds for of, seconds in times if of == kind]
 
 
 def _find_groups(model: CellModel, _: int) -> CellModel:
