@@ -99,14 +99,15 @@ class CoreLoop:
             }
         )
 
-    def start_goal(self, law: LawName, number: int = 0) -> None:
-        """Go for a goal that is far enough that the arm is under way for long; the first one takes the model before.
+    def start_goal(self, law: LawName, number: int = 0, share: float = 0.3) -> None:
+        """Go for a goal at a ``share`` of the ranges, far enough that the arm is under way for long; the first one
+        takes the model before.
 
         Others preempt the one before them.
         """
         if number == 0:
             self.take_model()
-        goal = Goal(str(uuid.UUID(int=self.seed + 1 + number)), self.target_at(0.3), law=law, gain=0.2)
+        goal = Goal(str(uuid.UUID(int=self.seed + 1 + number)), self.target_at(share), law=law, gain=0.2)
         outputs = self.step(requests=(Request(2 + number, "bench", RunGoal(goal)),))
         for _ in range(PLANNING):  # it is planned, a slice a step, before it is answered
             replies = [event for event in outputs.events if event.kind == "reply"]

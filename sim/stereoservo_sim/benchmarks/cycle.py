@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +13,7 @@ from stereoservo.control.law import Law, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
+from stereoservo.core.state import ServoGoal
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.composition import Composition
@@ -160,31 +160,38 @@ KINDS = {"moving, between": "between frames", "moving, frames": "with frames"}
 
 
 def core_steps(law: LawName, count: int, seed: int) -> dict[str, Any]:
-    """Microseconds of ``count`` steps between frames, and of those with frames of all cameras, of a core that drives the
-    simulated arm to a goal by ``law``: one after the other (``tight``), with a sleep before each (``paced``), and by
-    stage (``stages``, medians, tight).
+    """Microseconds of ``count`` steps between frames, and of those with frames of all cameras, of a core that drives
+    the simulated arm to a goal by ``law``: one after the other (``tight``), with a sleep before each (``paced``), and
+    by stage (``stages``, medians, tight).
     """
     loop = CoreLoop(rx90(), seed)
-    loop.start_goal(law)
-    steps = math.ceil(count * FRAME_EVERY / (FRAME_EVERY - 1))
-    for _ in range(WARM_UP):
-        loop.step()
+    drive(loop, law, WARM_UP)
     found: dict[str, Any] = {}
     for name, pause_s in (("tight", 0.0), ("paced", PACED_S)):
         loop.times.clear()
-        for _ in range(steps):
-            if pause_s:
-                time.sleep(pause_s)
-            loop.step()
+        drive(loop, law, count, pause_s)
         found[name] = {label: summary(of_kind(loop.times, kind), 1e6) for kind, label in KINDS.items()}
     with timed_stages(loop) as stages:
-        for _ in range(steps):
-            loop.step()
+        drive(loop, law, count)
     found["stages"] = {
         label: {stage: summary(of_kind(times, kind), 1e6)["median"] for stage, times in stages.items()}
         for kind, label in KINDS.items()
     }
     return found
+
+
+def drive(loop: CoreLoop, law: LawName, count: int, pause_s: float = 0.0) -> None:
+    """Run ``count`` steps between frames, and those with frames, while ``law`` drives the arm, to and fro where it gets
+    there; with a pause before each.
+    """
+    between = 0
+    while between < count:
+        if not isinstance(loop.core.state.source, ServoGoal):
+            loop.start_goal(law, loop.seq, 0.3 if loop.seq == 0 or loop.q[0] <= loop.cell.home[0] else 0.0)
+        if pause_s:
+            time.sleep(pause_s)
+        loop.step()
+        between += loop.kind == "moving, between"
 
 
 def of_kind(times: list[tuple[str, float]], kind: str) -> list[float]:
