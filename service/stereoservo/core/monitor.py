@@ -446,8 +446,8 @@ def _likely(
     model_px: float = MODEL_SIGMA_PX,
 ) -> bool:  # fmt: skip
     """Whether innovations (k, 2) look like noise, all together and each of them."""
-    chi2, _, _, largest = camera_chi2(innovation, spread, used, model_px)
-    return chi2 <= improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
+    chi2, _, _, largest, count = camera_chi2(innovation, spread, used, model_px)
+    return chi2 <= improbable(2.0 * count) and largest <= gate_threshold(settings.gate_sigma)
 
 
 def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
