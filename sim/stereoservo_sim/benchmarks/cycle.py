@@ -129,7 +129,7 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     progress("control step", 1, 1)
     core: dict[str, dict[str, Any]] = {}
     for law in LAWS:
-        core[law] = core_steps(law, count, seed)
+        core[law] = core_steps(law, count // 2, seed)
         progress("core step", len(core), len(LAWS))
     return {
         "stereo_step_us": {
