@@ -56,10 +56,9 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
             task = trajectory_task(source, context, scene, task)
     try:
         step = law.step(scene, task, options(source, context, error_px, source.jacobian))
-        _require_velocity(step, len(context.q))
+        velocity = velocity_of(step, len(context.q))
     except Exception as error:  # whatever a third party's law raises ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
-    velocity = step.velocity
     if streamed:
         velocity = velocity + feed_forward(source, context, found.usable * source.wanted)
     if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has kept off the limits itself
@@ -260,10 +259,16 @@ def options(
     return Options(gain=gain, dt_s=context.dt_s, jacobian=jacobian)
 
 
-def _require_velocity(step: LawStep, joints: int) -> None:
-    """Raises ValueError where a law's step is not a velocity of that many joints."""
+def velocity_of(step: LawStep, joints: int) -> FloatArray:
+    """A copy (n,) of the velocity of a law's step, of the type that kernels are compiled for.
+
+    Raises ValueError where it is none of that many joints, TypeError where its numbers are not real.
+    """
     if step.velocity.shape != (joints,):
         raise ValueError(f"a velocity of shape {step.velocity.shape}; ({joints},) is needed")
+    if step.velocity.dtype.kind not in "fiu":
+        raise TypeError(f"a velocity of {step.velocity.dtype}; real numbers are needed")
+    return np.array(step.velocity, dtype=np.float64)
 
 
 def _law_failed(
