@@ -4,6 +4,7 @@ import dataclasses
 import math
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -318,7 +319,7 @@ def test_limits_that_cannot_work_are_refused_by_name(changes, text):
 def test_arrays_of_a_wrong_length_are_refused(name, length):
     whole = SafetyInputs(np.zeros(3), np.zeros(3), np.zeros(3), DT, 0.0, 0.0, False)
     with pytest.raises(SafetyConfigurationError, match=rf"{name} \({length},\)"):
-        safety_stage(dataclasses.replace(whole, **{name: np.zeros(length)}), make_limits())
+        safety_stage(msgspec.structs.replace(whole, **{name: np.zeros(length)}), make_limits())
 
 
 @pytest.mark.parametrize(("beyond", "told"), [(1e-12, False), (1e-6, True)])
@@ -434,7 +435,7 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
         )
         motion = SimpleNamespace(velocity=step.raw, needs_features=step.needs_features, speed_scale=source)
         result = limit.limit(context, motion, limits)
-        same = dataclasses.replace(
+        same = msgspec.structs.replace(
             step,
             joint_age_s=ages_ns[2] // 4 * 1e-9,
             feature_age_s=min(ages_ns[: len(accepted)], default=now_ns) * 1e-9,

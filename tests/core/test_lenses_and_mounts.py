@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import ModelUpdate
+from stereoservo.core.estimate import seen_frame
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.prediction import ideal_observation
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state import JointHistory, decode_state, encode_state
 from stereoservo.messages.goals import FeatureTarget, Goal, Jog, JointTarget, RunGoal, Teach
 from stereoservo.ports.devices import CameraObservation
 
@@ -124,13 +124,19 @@ def sights(pixels: list[tuple[float, float]]) -> CameraObservation:
 def test_sights_beyond_the_fold_are_dropped_and_pinholes_pass_untouched(benches: Any) -> None:
     observation = sights([(320.0, 240.0), (620.0, 240.0), (350.0, 260.0)])
     straight, bent = benches(0), benches(0, k1=-1.8)  # folds 229 px from its centre
-    arrays = model_arrays(straight.truth.model, straight.settings)
-    assert ideal_observation(arrays, 0, observation) is observation
-    arrays = model_arrays(bent.truth.model, bent.settings)
-    found = ideal_observation(arrays, 0, observation)
-    assert found.ids.tolist() == [0, 2]
-    np.testing.assert_allclose(found.pixels[0], (320, 240), atol=1e-12)
-    assert np.linalg.det(found.covariances[1]) > 1e-4  # a barrel compressed it
+    seen, pixels = [], []
+    for bench in (straight, bent):
+        arrays = model_arrays(bench.truth.model, bench.settings)
+        rest = np.zeros_like(arrays.zero)
+        history = JointHistory(np.array([0, 1]), np.array([rest, rest]), 2)
+        frame = seen_frame(arrays, 0, observation, history, 1, rest)
+        assert frame is not None
+        seen.append(frame.sights.seen[:3].tolist())
+        pixels.append((frame.prediction.pixels[0] + frame.sights.innovation[: len(arrays.ids)])[:3])
+    assert seen == [[True, True, True], [True, False, True]]
+    np.testing.assert_allclose(pixels[0], observation.pixels, atol=1e-9)
+    np.testing.assert_allclose(pixels[1][0], (320, 240), atol=1e-9)
+    assert np.linalg.det(frame.sights.spread[2]) > 1e-4  # a barrel compressed it
 
 
 def test_set_point_where_the_lens_images_nothing_is_refused_with_its_value(benches: Any) -> None:

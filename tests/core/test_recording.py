@@ -23,6 +23,7 @@ from stereoservo.core.state import (
     is_recorded,
 )
 from stereoservo.messages.goals import DEFAULT_LAW, Enable, FeatureTarget, Goal, RunGoal
+from stereoservo.numerics.compilation import overloads
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.step_records import Fingerprint, encode_step, fingerprint
@@ -110,6 +111,29 @@ def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
     assert aborted.reasons[0].code == "LAW_FAILED"
     assert "ZeroDivisionError: by zero" in aborted.reasons[0].hint
     assert not np.any(bench.core.state.command)
+
+
+def test_a_law_whose_numbers_are_of_another_type_compiles_nothing_in_the_loop(
+    benches: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law = LAWS[DEFAULT_LAW]
+
+    def step(scene: Scene, task: Task, options: Options) -> LawStep:
+        found = law.step(scene, task, options)
+        velocity = np.repeat(found.velocity.astype(np.float32), 2)[::2]
+        velocity.flags.writeable = False
+        return found._replace(velocity=velocity)
+
+    compiled = []
+    for number, used in enumerate((law, dataclasses.replace(law, step=step))):
+        monkeypatch.setitem(LAWS.usable(), DEFAULT_LAW, used)
+        bench = benches(3, noise_px=0.1).ready()
+        target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
+        bench.step(RunGoal(Goal(str(uuid.UUID(int=1 + number)), FeatureTarget(bench.features(target)))))
+        bench.run(0.3)
+        assert np.any(bench.core.state.command)
+        compiled.append(set(overloads()))
+    assert compiled[0] == compiled[1]
 
 
 def test_replay_is_identical(benches: Any, tmp_path: Path) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereoservo.core.estimate import fold_timing
 from stereoservo.core.ingest import remember_joints
 from stereoservo.core.monitor_state import CameraTiming
-from stereoservo.core.prediction import MODEL_SIGMA_PX, FrameResiduals, fold_timing, joints_at, motion_at
+from stereoservo.core.prediction import MODEL_SIGMA_PX, FrameResiduals, joints_at, velocities_at
 from stereoservo.core.report import advice, offset_s
 from stereoservo.core.state import HISTORY, JointHistory
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import JointState
 
 
 def frame(innovation: FloatArray, velocity: FloatArray, t_ns: int) -> FrameResiduals:
@@ -80,10 +80,14 @@ def test_old_frames_are_forgotten() -> None:
     assert abs(late[-1]) < 0.001
 
 
+def append(history: JointHistory, t_ns: int, q: float) -> None:
+    history.count = remember_joints(history.t_ns, history.positions, history.count, t_ns, np.array([q]))
+
+
 def test_a_third_of_a_second_of_joint_samples_is_kept_at_a_kilohertz() -> None:
     history = JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, 1)))
     for k in range(2000):
-        remember_joints(history, JointState(k, k * 1_000_000, np.array([1e-3 * k]), np.zeros(1)))
+        append(history, k * 1_000_000, 1e-3 * k)
     for back_ms in (0, 1, 2, 7, 150, 300):
         found = joints_at(history, (1999 - back_ms) * 1_000_000)
         assert found is not None
@@ -94,10 +98,10 @@ def test_motion_is_known_between_samples_and_for_one_interval_after_them() -> No
     history = JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, 1)))
     ms = 1_000_000
     for t_ms, q in ((100, 0.0), (104, 0.004), (108, 0.016), (400, 0.3), (404, 0.304)):
-        remember_joints(history, JointState(t_ms, t_ms * ms, np.array([q]), np.zeros(1)))
+        append(history, t_ms * ms, q)
     for t_ms, speed in ((102, 1.0), (106, 3.0), (402, 1.0), (407, 1.0)):
-        found = motion_at(history, t_ms * ms)
-        assert found is not None
+        known, found = velocities_at(history.t_ns, history.positions, history.count, t_ms * ms)
+        assert known
         assert found[0] == pytest.approx(speed)
     for t_ms in (99, 200, 399, 409):
-        assert motion_at(history, t_ms * ms) is None, t_ms
+        assert not velocities_at(history.t_ns, history.positions, history.count, t_ms * ms)[0], t_ms

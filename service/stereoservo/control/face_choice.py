@@ -71,7 +71,20 @@ def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
 
     Their way cannot be the face's front; what they see of the markers stays.
     """
-    return scene._replace(camera_centres=np.ascontiguousarray(scene.camera_centres[choice.kept > 0.0]))
+    operators, composition, matrices, centres, points, pixels, weights = scene
+    return Scene(operators, composition, matrices, _kept_rows(centres, choice.kept), points, pixels, weights)
+
+
+@kernel
+def _kept_rows(rows: FloatArray, kept: FloatArray) -> FloatArray:
+    """Those of ``rows`` (c, 4) where ``kept`` (c,) > 0."""
+    found = np.empty(rows.shape)
+    count = 0
+    for c in range(rows.shape[0]):
+        if kept[c] > 0.0:
+            found[count] = rows[c]
+            count += 1
+    return found[:count]
 
 
 @kernel

@@ -5,20 +5,22 @@ velocity output, refused requests.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import Prediction
+from stereoservo.core.prediction import CameraSights, Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
+from stereoservo.messages.status import Health
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
 
@@ -33,8 +35,10 @@ class Derived:
     ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
     ``frame_timeout_s``: age from which on a frame is refused; ``features_fresh_s``: up to which features are fresh
     enough not to coast. ``prior_every``: steps between priors. ``laws``: those
-    that are installed, by name. ``load_limits``:
-    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
+    that are installed, by name. ``cameras``: indices by name. ``samples`` (4, n): room for the values of a joint
+    sample. ``load_limits``:
+    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored. ``sights``: of
+    the state's cameras, with a model.
     """
 
     nominal_period_ns: int
@@ -43,12 +47,16 @@ class Derived:
     features_fresh_s: float
     prior_every: int
     laws: Mapping[str, Law]
+    cameras: Mapping[str, int]
+    samples: FloatArray
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
+    sights: CameraSights | None = None
+    health: tuple[object, Health] | None = None
+    """What the status last said of the model's health, and of what."""
 
 
-@dataclass(frozen=True)
-class Ingested:
+class Ingested(msgspec.Struct, frozen=True, eq=False):
     """What passed the gate in one step, and why the rest did not.
 
     ``joints``: the sample, if it is new. ``observations``: new ones, each with the index of its camera. ``elapsed_s``:
@@ -65,8 +73,7 @@ class Ingested:
     stops: tuple[Reason, ...]
 
 
-@dataclass(eq=False)
-class StepContext:
+class StepContext(msgspec.Struct, eq=False):
     """One step as its stages and the motion sources see it.
 
     `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
@@ -91,11 +98,10 @@ class StepContext:
     pixels: FloatArray | None = None
     paused: bool = False
     outermost: FloatArray | None = None
-    goals_read: list[str] = field(default_factory=list)
+    goals_read: list[str] = []
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(msgspec.Struct, frozen=True):
     """What a monitor has found, as the stage `monitor` acts on it.
 
     ``stop``: the arm brakes and holds, every goal ends; ``fault``: likewise, and the drives go off until a reset;
@@ -110,8 +116,7 @@ class Finding:
     latched: bool = True
 
 
-@dataclass(frozen=True)
-class SourceOutput:
+class SourceOutput(msgspec.Struct, frozen=True, eq=False):
     """The output of a motion source: joint velocity (n,), whether it may not go on without features, whether it has
     finished, and whether because its goal is ``reached``.
     """
@@ -122,7 +127,7 @@ class SourceOutput:
     finished: bool = False
     reached: bool = False
     error_px: float | None = None
-    task_error: FloatArray = field(default_factory=partial(np.zeros, 0))
+    task_error: FloatArray = msgspec.field(default_factory=partial(np.zeros, 0))
     reasons: tuple[Reason, ...] = ()
 
 

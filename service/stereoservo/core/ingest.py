@@ -14,10 +14,10 @@ import numpy as np
 from stereoservo.core.context import Ingested, StepContext
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.state import HISTORY, LEAST_APART_NS, CoreState, JointHistory, Refused
+from stereoservo.core.state import HISTORY, LEAST_APART_NS, CoreState, Refused
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation, JointState
 
@@ -111,17 +111,10 @@ def _append_joints(sample: JointState | None, context: StepContext) -> FloatArra
     state = context.state
     history = state.history
     if sample is not None:
-        if _jump(sample, context) is not None:
-            history.count = 0
-            state.velocities = np.zeros_like(state.velocities)
-        if history.count > 0:
-            elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
-            previous = history.positions[(history.count - 1) % HISTORY]
-            share = elapsed_s / (elapsed_s + VELOCITY_FILTER_S)
-            state.velocities = state.velocities + share * (
-                (sample.positions - previous) / elapsed_s - state.velocities
-            )
-        remember_joints(history, sample)
+        history.count = _append_sample(
+            history.t_ns, history.positions, history.count, sample.t_ns, _positions(sample, context),
+            state.last_joints_ns, context.settings.limits.velocity_max, state.velocities,
+        )  # fmt: skip
         state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
     if history.count == 0:
         return np.zeros_like(state.command)
@@ -129,16 +122,79 @@ def _append_joints(sample: JointState | None, context: StepContext) -> FloatArra
     return newest
 
 
-def remember_joints(history: JointHistory, sample: JointState) -> None:
-    """Append a joint sample to the ring; it takes the place of the last one where that is close to the one before."""
-    if history.count > 1:
-        before = int(history.t_ns[(history.count - 2) % HISTORY])
-        if 0 <= int(history.t_ns[(history.count - 1) % HISTORY]) - before < LEAST_APART_NS:
-            history.count -= 1
-    slot = history.count % HISTORY
-    history.t_ns[slot] = sample.t_ns
-    history.positions[slot] = sample.positions
-    history.count += 1
+@kernel
+def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, positions: FloatArray) -> int:
+    """Append joint ``positions`` (n,) at ``t_ns`` to a ring of ``stamps`` (k,) and positions ``kept`` (k, n), to which
+    ``count`` were ever written; the new count. They take the place of the last ones where these are close to the ones
+    before.
+    """
+    size = stamps.size
+    if count > 1 and 0 <= stamps[(count - 1) % size] - stamps[(count - 2) % size] < LEAST_APART_NS:
+        count -= 1
+    slot = count % size
+    stamps[slot] = t_ns
+    for j in range(positions.size):
+        kept[slot, j] = positions[j]
+    return count + 1
+
+
+@kernel
+def _append_sample(
+    stamps: IntArray, kept: FloatArray, count: int, t_ns: int, positions: FloatArray, last_ns: int,
+    velocity_max: FloatArray, velocities: FloatArray,
+) -> int:  # fmt: skip
+    """`remember_joints`, and the filtered joint ``velocities`` (n,) since the last sample at ``last_ns``, in place."""
+    if count > 0:
+        elapsed_s = (t_ns - last_ns) * 1e-9
+        previous = kept[(count - 1) % stamps.size]
+        if _jumped(positions, previous, velocity_max, elapsed_s):
+            count = 0
+            velocities[:] = 0.0
+        else:
+            share = elapsed_s / (elapsed_s + VELOCITY_FILTER_S)
+            for j in range(positions.size):
+                velocity = (positions[j] - previous[j]) / elapsed_s
+                velocities[j] = velocities[j] + share * (velocity - velocities[j])
+    return remember_joints(stamps, kept, count, t_ns, positions)
+
+
+@kernel
+def _jumped(positions: FloatArray, previous: FloatArray, velocity_max: FloatArray, elapsed_s: float) -> bool:
+    """Whether a joint cannot have come from its ``previous`` position (n,) to this one within ``elapsed_s``."""
+    for j in range(positions.size):
+        possible = velocity_max[j] * (FASTEST * elapsed_s + STAMP_JITTER_S)
+        if not abs(positions[j] - previous[j]) <= possible:
+            return True
+    return False
+
+
+@kernel
+def _sound(
+    values: FloatArray, kept: FloatArray, count: int, elapsed_s: float, velocity_max: FloatArray, active: bool
+) -> bool:
+    """Whether positions, and velocities, efforts and following errors, the rows of ``values`` (4, n), may be right,
+    and, while the drives are ``active``, the positions are no jump from the newest ones ``kept`` (k, n).
+    """
+    for j in range(values.shape[1]):
+        if not (
+            abs(values[0, j]) <= FARTHEST
+            and math.isfinite(values[1, j])
+            and math.isfinite(values[2, j])
+            and math.isfinite(values[3, j])
+        ):
+            return False
+    return not (
+        active
+        and count > 0
+        and _jumped(values[0], kept[(count - 1) % kept.shape[0]], velocity_max, elapsed_s)
+    )
+
+
+def _positions(sample: JointState, context: StepContext) -> FloatArray:
+    """The positions (n,) of a sample that has passed, in an array of the type that kernels are compiled for."""
+    positions: FloatArray = context.derived.samples[0]
+    positions[:] = sample.positions
+    return positions
 
 
 def _follow_driver(context: StepContext) -> None:
@@ -227,6 +283,8 @@ def _joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
             f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then "
             "resume",
         )  # fmt: skip
+    if _is_sound(sample, context):
+        return sample, None
     wrong = _wrong_values(sample, context.settings.joint_names)
     if wrong:
         return None, Reason(
@@ -236,6 +294,27 @@ def _joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
         )  # fmt: skip
     reason = _jump(sample, context) if state.lifecycle == Lifecycle.ACTIVE else None
     return (sample, None) if reason is None else (None, reason)
+
+
+def _is_sound(sample: JointState, context: StepContext) -> bool:
+    """Whether nothing is wrong with the values of a joint sample, and, while the drives are on, it is no jump."""
+    values, state = context.derived.samples, context.state
+    shape = values.shape[1:]
+    for row, given in enumerate(
+        (sample.positions, sample.velocities, sample.efforts, sample.following_errors)
+    ):
+        if given is None:
+            values[row] = 0.0
+            continue
+        if given.shape != shape:
+            return False
+        values[row] = given
+    return bool(
+        _sound(
+            values, state.history.positions, state.history.count, (sample.t_ns - state.last_joints_ns) * 1e-9,
+            context.settings.limits.velocity_max, state.lifecycle == Lifecycle.ACTIVE,
+        )
+    )  # fmt: skip
 
 
 def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
@@ -285,7 +364,9 @@ def _observations(
     counts its frames anew is known by their stamps, which are checked; numbers alone are not trusted.
     """
     inputs = context.inputs
-    cameras = {camera.name: k for k, camera in enumerate(context.settings.cameras)}
+    if not inputs.observations:
+        return (), ()
+    cameras = context.derived.cameras
     newest = [(estimate.last_seq, estimate.accepted_ns) for estimate in context.state.cameras]
     timeout_s = context.derived.frame_timeout_s
     passed: list[tuple[int, CameraObservation]] = []

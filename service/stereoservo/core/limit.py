@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
@@ -68,6 +70,14 @@ class SafetyLimits:
     coast_s: float
     features_fresh_s: float = 0.15
 
+    @cached_property
+    def arrays(self) -> JointLimits:
+        """The limits as the kernel takes them."""
+        return JointLimits(
+            self.position_min, self.position_max, self.velocity_max, self.acceleration_max, self.position_margin,
+            self.keep_outs,
+        )  # fmt: skip
+
     def __post_init__(self) -> None:
         n = len(self.joint_names)
         for name in ("position_min", "position_max", "velocity_max", "acceleration_max"):
@@ -116,8 +126,7 @@ class SafetyLimits:
                 )
 
 
-@dataclass(frozen=True, eq=False)
-class SafetyInputs:
+class SafetyInputs(msgspec.Struct, frozen=True, eq=False):
     """One step: ``raw`` (n,) what the motion source wants, ``positions`` (n,) as measured, ``previous`` (n,)
     command.
 
@@ -137,8 +146,7 @@ class SafetyInputs:
     brake: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class SafetyResult:
+class SafetyResult(msgspec.Struct, frozen=True, eq=False):
     """``raw`` and ``limited`` joint velocities (n,) and why they differ; ``braking``: the stage overrules the
     source.
     """
@@ -171,35 +179,24 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
             f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
         )
     reasons: list[Reason] = []
-    brake = _stale(inputs, limits, reasons)
-    if not (np.isfinite(raw).all() and np.isfinite(positions).all()):
-        brake = True
-        _tell_non_finite(raw, positions, limits, reasons)
-    if inputs.brake:
-        brake = True
+    brake = _stale(inputs, limits, reasons) or inputs.brake
     age = (
         inputs.joint_age_s if _within(inputs.joint_age_s, limits.joint_timeout_s) else limits.joint_timeout_s
     )
     speed_scale = min(max(inputs.speed_scale, 0.0), 1.0) if math.isfinite(inputs.speed_scale) else 0.0
-    limited, acted, scales = limit_velocity(
-        raw,
-        positions,
-        previous,
-        brake,
-        inputs.dt_s,
-        age,
-        speed_scale,
-        JointLimits(
-            limits.position_min, limits.position_max, limits.velocity_max, limits.acceleration_max,
-            limits.position_margin, limits.keep_outs,
-        ),
-    )  # fmt: skip
+    limited, acted = np.empty(n), np.empty(n, np.int64)
+    by_position, finite, scale, scaled_by, share, shared_by = limit_velocity(
+        raw, positions, previous, brake, inputs.dt_s, age, speed_scale, limits.arrays, limited, acted
+    )
+    if not finite:
+        brake = True
+        _tell_non_finite(raw, positions, limits, reasons)
     if brake:
         reasons.append(_braking(limited, limits, inputs.brake))
-    if acted.any():
+    if by_position:
         _tell_positions(acted, inputs, limits, reasons)
-    if scales[1] >= 0.0 and scales[0] < 1.0 - TOUCHED:
-        j = int(scales[1])
+    if scaled_by >= 0 and scale < 1.0 - TOUCHED:
+        j = scaled_by
         reasons.append(
             Reason(
                 VELOCITY_SCALED,
@@ -211,14 +208,14 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
                 "slower, in the same direction; a lower gain or a higher speed scale avoids it",
             )
         )
-    if not brake and scales[3] >= 0.0 and scales[2] < 1.0 - TOUCHED:
-        j = int(scales[3])
+    if not brake and shared_by >= 0 and share < 1.0 - TOUCHED:
+        j = shared_by
         reasons.append(
             Reason(
                 ACCELERATION_LIMITED,
                 "info",
                 limits.joint_names[j],
-                _number(float(limits.acceleration_max[j]) / max(float(scales[2]), TINY)),
+                _number(float(limits.acceleration_max[j]) / max(share, TINY)),
                 float(limits.acceleration_max[j]),
                 "1/s²",
                 "passes by itself",
@@ -509,18 +506,22 @@ def limit_velocity(
     sample_age: float,
     speed_scale: float,
     limits: JointLimits,
-) -> tuple[FloatArray, IntArray, FloatArray]:
-    """The stages that act on finite numbers: braking, velocity, positions and keep-outs, acceleration.
+    limited: FloatArray,
+    acted: IntArray,
+) -> tuple[bool, bool, float, int, float, int]:
+    """Braking, velocity, positions and keep-outs, acceleration, in this order.
 
-    ``raw`` must be finite unless ``brake``. Returns the limited velocity (n,), ``acted`` (n,): 0 free, 1
-    position limit, 2 + k keep-out k; and ``scales`` (4,): velocity scale, its joint, acceleration share, its
-    joint.
+    Where ``raw`` or ``positions`` are not finite it brakes, too. Into the last two arguments the limited velocity (n,)
+    and who has acted (n,): 0 nobody, 1 position limit, 2 + k keep-out k. Returns whether any has; whether all was
+    finite; velocity scale, its joint, acceleration share, its joint, -1 for none.
     """
     velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
     n = raw.shape[0]
-    limited = np.zeros(n)
-    acted = np.zeros(n, dtype=np.int64)
-    scales = np.empty(4)
+    finite = True
+    for j in range(n):
+        acted[j] = 0
+        finite = finite and math.isfinite(raw[j]) and math.isfinite(positions[j])
+    brake = brake or not finite
     before = _within_speed_limits(previous, velocity_max)
     ahead, behind = np.empty(n), np.empty(n)
     for j in range(n):
@@ -563,8 +564,7 @@ def limit_velocity(
         elif limited[j] < low[j]:
             limited[j] = max(limited[j], min(low[j], before[j] + step))
             acted[j] = low_by[j] + 2
-    scales[0] = scale
-    scales[1] = scaled_by
-    scales[2] = share
-    scales[3] = shared_by
-    return limited, acted, scales
+    by_position = False
+    for j in range(n):
+        by_position = by_position or acted[j] != 0
+    return by_position, finite, scale, scaled_by, share, shared_by

@@ -4,7 +4,7 @@ scaled to unit height above the plane at infinity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
@@ -17,6 +17,9 @@ from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
 from stereoservo.kinematics.model import CellModel, lens_size
 from stereoservo.numerics.arrays import FloatArray, IntArray
+
+FIRST_SIGHT_SIGMA_PX = 6.0
+"""Deviation of a marker whose innovation is not known."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,26 @@ class ModelArrays:
     """Errors of joint readings, where the trials have shown some; none larger than `LARGEST_JOINT_ERROR`."""
     joint_variances: FloatArray
     """The most that these are at any posture (n,) [rad² or m²]; zeros where there are none."""
+    ids: IntArray = field(init=False)
+    """`marker_ids` as an array (m,), and the deviation ``unseen_px`` (m,) [px] of markers before they are seen, where
+    joints are read exactly; not to be written to.
+    """
+    unseen_px: FloatArray = field(init=False)
+    no_rates: FloatArray = field(init=False)
+    """Pixel velocities (c, m, 2) of set-points that stand; not to be written to."""
+    known: FloatArray = field(init=False)
+    """Whether the markers' points are known (2, m): of none, and of all; not to be written to."""
+
+    def __post_init__(self) -> None:
+        count = len(self.marker_ids)
+        constants = {
+            "ids": np.array(self.marker_ids, dtype=np.int64),
+            "unseen_px": np.full(count, FIRST_SIGHT_SIGMA_PX),
+            "no_rates": np.zeros((len(self.matrices), count, 2)),
+            "known": np.array([[0.0], [1.0]]) * np.ones(count),
+        }
+        for name, value in constants.items():
+            object.__setattr__(self, name, value)
 
 
 def _require_numbers(model: CellModel) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -68,7 +69,7 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
-from stereoservo.core.state import CalibrationMotion, Contact, CoreState
+from stereoservo.core.state import CalibrationMotion, CoreState
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray
@@ -168,91 +169,104 @@ def detect_collision(
     contact.seen_ns = sample.t_ns
     contact.efforts = None if sample.efforts is None else sample.efforts.copy()
     contact.following_errors = None if sample.following_errors is None else sample.following_errors.copy()
-    speed = np.abs(state.command)
-    if elapsed_s > GAP_S or state.lifecycle != Lifecycle.ACTIVE:
-        _forget(contact, sample)
-        return None
-    efforts, following = _readings(contact, sample)
-    if state.stopped or not bool((speed > MOVING).any()):
-        if contact.leave_s > 0.0:
-            _absorb(contact, efforts, following)
-        _clear(contact)
-        contact.mean_efforts = _nearer(contact.mean_efforts, efforts, elapsed_s / (elapsed_s + REST_S))
-        return None
-    contact.leave_s = max(0.0, contact.leave_s - elapsed_s)
-    excess, lag = _excess(contact, efforts, following)
+    efforts = np.array(contact.mean_efforts if sample.efforts is None else sample.efforts, np.float64)
+    following = np.zeros(efforts.shape)
+    if sample.following_errors is not None:
+        following[:] = sample.following_errors
+    forgets = elapsed_s > GAP_S or state.lifecycle != Lifecycle.ACTIVE
+    if forgets:
+        contact.leave_s = 0.0
+    moving = not (forgets or state.stopped) and bool(_moves(state.command))
+    if moving:
+        contact.leave_s = max(0.0, contact.leave_s - elapsed_s)
     learning = isinstance(state.source, CalibrationMotion)
-    unlimited = np.full(speed.size, np.inf)
-    effort_limits, following_limits = (
-        stated_thresholds(settings) if learning else limits or (unlimited, unlimited)
-    )
-    beyond = np.abs(excess) > effort_limits
-    share = np.where(beyond, 0.0, elapsed_s / (elapsed_s + MEAN_S))  # a contact is no new mean
-    contact.mean_efforts = _nearer(contact.mean_efforts, efforts, share)
-    contact.effort_excess = _pushed(contact.effort_excess, excess)
-    contact.following_excess = _pushed(contact.following_excess, lag)
-    if isinstance(state.source, CalibrationMotion):
-        learn_loads(state.source.id, contact, speed, efforts, following)
-    if limits is None:
+    thresholds = (stated_thresholds(settings) if moving else None) if learning else limits
+    if thresholds is None:
+        unlimited = _unlimited(efforts.size)
+        thresholds = unlimited, unlimited
+    beyond = _account_loads(
+        efforts, following, contact.mean_efforts, contact.effort_excess, contact.following_excess, contact.low,
+        contact.high, elapsed_s, forgets, moving, contact.leave_s > 0.0, *thresholds,
+    )  # fmt: skip
+    if not moving:
         return None
-    reason = worst_contact(contact, settings, effort_limits, following_limits, learning)
+    if learning:
+        learn_loads(state.source.id, contact, np.abs(state.command), efforts, following)  # type: ignore[union-attr]
+    if limits is None or not beyond:
+        return None
+    reason = worst_contact(contact, settings, *thresholds, learning)
     if reason is not None:
         contact.low = np.array([np.minimum(contact.mean_efforts, efforts), np.minimum(following, 0.0)])
         contact.high = np.array([np.maximum(contact.mean_efforts, efforts), np.maximum(following, 0.0)])
         contact.leave_s = LEAVE_S
-        _clear(contact)
+        contact.effort_excess[:], contact.following_excess[:] = 0.0, 0.0
     return reason
 
 
-def _readings(contact: Contact, sample: JointState) -> tuple[FloatArray, FloatArray]:
-    """Efforts and following errors; as expected where the driver has none, or one that is not a number."""
-    efforts = contact.mean_efforts if sample.efforts is None else sample.efforts
-    following = np.zeros_like(efforts) if sample.following_errors is None else sample.following_errors
-    return (
-        np.where(np.isfinite(efforts), efforts, contact.mean_efforts),
-        np.where(np.isfinite(following), following, 0.0),
-    )
+@lru_cache(maxsize=8)
+def _unlimited(n: int) -> FloatArray:
+    """Thresholds (n,) that nothing reaches; not to be written to."""
+    return np.full(n, np.inf)
 
 
-def _excess(contact: Contact, efforts: FloatArray, following: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Signed distances from what is expected: the mean and zero, or anything that a contact brought of late."""
-    mean = contact.mean_efforts
-    if contact.leave_s <= 0.0:
-        return efforts - mean, following
-    low, high = np.minimum(mean, contact.low[0]), np.maximum(mean, contact.high[0])
-    behind, ahead = np.minimum(contact.low[1], 0.0), np.maximum(contact.high[1], 0.0)
-    return (
-        efforts - np.minimum(np.maximum(efforts, low), high),
-        following - np.minimum(np.maximum(following, behind), ahead),
-    )
+@kernel
+def _moves(command: FloatArray) -> bool:
+    moving = False
+    for j in range(command.size):
+        moving = moving or abs(command[j]) > MOVING
+    return moving
 
 
-def _nearer(mean: FloatArray, value: FloatArray, share: float | FloatArray) -> FloatArray:
-    nearer: FloatArray = mean + share * (value - mean)
-    return nearer
+@kernel
+def _account_loads(
+    efforts: FloatArray, following: FloatArray, mean: FloatArray, effort_excess: FloatArray,
+    following_excess: FloatArray, low: FloatArray, high: FloatArray, elapsed_s: float, forgets: bool, moving: bool,
+    leaving: bool, effort_limits: FloatArray, following_limits: FloatArray,
+) -> bool:  # fmt: skip
+    """Take a sample's ``efforts`` and ``following`` errors (n,) into the arrays of a `Contact`; whether all samples of
+    a window are beyond a limit on one side, or a limit is none.
+
+    Readings that are no numbers become what is expected. The mean begins anew where it ``forgets`` (the drives were
+    off, or nothing was heard for long); at rest what comes while the arm is ``leaving`` a contact belongs to it. In
+    motion a reading is compared with the mean and zero, or with anything that a contact brought of late.
+    """
+    beyond = False
+    for j in range(efforts.size):
+        if not math.isfinite(efforts[j]):
+            efforts[j] = mean[j]
+        if not math.isfinite(following[j]):
+            following[j] = 0.0
+        if moving:
+            excess, lag = efforts[j] - mean[j], following[j]
+            if leaving:
+                excess = efforts[j] - min(max(efforts[j], min(mean[j], low[0, j])), max(mean[j], high[0, j]))
+                lag -= min(max(lag, min(low[1, j], 0.0)), max(high[1, j], 0.0))
+            if not abs(excess) > effort_limits[j]:  # a contact is no new mean
+                mean[j] += elapsed_s / (elapsed_s + MEAN_S) * (efforts[j] - mean[j])
+            lasting = _push(effort_excess[:, j], excess) / effort_limits[j]
+            lasting_lag = _push(following_excess[:, j], lag) / following_limits[j]
+            beyond = beyond or not (lasting <= 1.0 and lasting_lag <= 1.0)
+            continue
+        if not forgets and leaving:
+            low[0, j], low[1, j] = min(low[0, j], efforts[j]), min(low[1, j], following[j])
+            high[0, j], high[1, j] = max(high[0, j], efforts[j]), max(high[1, j], following[j])
+        effort_excess[:, j] = 0.0
+        following_excess[:, j] = 0.0
+        mean[j] = (
+            efforts[j] if forgets else mean[j] + elapsed_s / (elapsed_s + REST_S) * (efforts[j] - mean[j])
+        )
+    return beyond
 
 
-def _pushed(window: FloatArray, newest: FloatArray) -> FloatArray:
-    return np.concatenate([window[1:], newest[None]])
-
-
-def _clear(contact: Contact) -> None:
-    contact.effort_excess = np.zeros_like(contact.effort_excess)
-    contact.following_excess = np.zeros_like(contact.following_excess)
-
-
-def _absorb(contact: Contact, efforts: FloatArray, following: FloatArray) -> None:
-    """What comes while the arm brakes and stands after a contact belongs to it."""
-    contact.low = np.minimum(contact.low, np.array([efforts, following]))
-    contact.high = np.maximum(contact.high, np.array([efforts, following]))
-
-
-def _forget(contact: Contact, sample: JointState) -> None:
-    """The mean begins anew: the drives were off, or nothing was heard for long."""
-    efforts, _ = _readings(contact, sample)
-    contact.mean_efforts = efforts.copy()
-    contact.leave_s = 0.0
-    _clear(contact)
+@kernel
+def _push(window: FloatArray, newest: float) -> float:
+    """Append to a window (samples,), the oldest one going; how far all of it is beyond zero on one side."""
+    least, most = newest, newest
+    for k in range(window.size - 1):
+        window[k] = window[k + 1]
+        least, most = min(least, window[k]), max(most, window[k])
+    window[window.size - 1] = newest
+    return max(least, -most, 0.0)
 
 
 def detect_following_error(
@@ -450,8 +464,8 @@ def _likely(
     model_px: float = MODEL_SIGMA_PX,
 ) -> bool:  # fmt: skip
     """Whether innovations (k, 2) look like noise, all together and each of them."""
-    chi2, _, _, largest = camera_chi2(innovation, spread, used, model_px)
-    return chi2 <= improbable(2.0 * float(used.sum())) and largest <= gate_threshold(settings.gate_sigma)
+    chi2, _, _, largest, count = camera_chi2(innovation, spread, used, model_px)
+    return chi2 <= improbable(2.0 * count) and largest <= gate_threshold(settings.gate_sigma)
 
 
 def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:

@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
@@ -219,7 +220,8 @@ LEAST_STEPS = 5.0
 def _bounds(
     kinds: tuple[str, ...], resolution: tuple[float, ...], inexact: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared.
+    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared; not to be
+    written to.
 
     Nothing is added to joints with coarse encoders where the model states errors of joint readings (``inexact``): play
     before the encoder looks like friction, and steps show too late that it is taken up; the joint would hunt.
@@ -229,8 +231,6 @@ def _bounds(
         least = LEAST_STEPS * np.array(resolution)
         most = np.where((least > travel) & inexact, 0.0, most)
         travel = np.maximum(travel, least)
-    most.setflags(write=False)
-    travel.setflags(write=False)
     return most, travel
 
 
@@ -250,41 +250,51 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
         known = state.friction = FrictionCompensation(
             subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
         )
+    inexact = state.model is not None and state.model.joint_accuracy is not None
+    most, travel = _bounds(settings.joint_kinds, settings.resolution, inexact)
+    looks = context.ingested.joints is not None and _fresh(output, context)
     arrives = state.command if state.delays is None else state.delays.velocity
-    known.sent = known.sent + arrives * context.dt_s
-    known.sent_s = known.sent_s + context.dt_s
-    wanted = output.velocity
-    if context.ingested.joints is not None and _fresh(output, context):
-        inexact = state.model is not None and state.model.joint_accuracy is not None
-        bounds = _bounds(settings.joint_kinds, settings.resolution, inexact)
-        _estimate(known, wanted, context.q, bounds, context.dt_s)
-    if not known.velocity.any():
-        return output
-    return replace(output, velocity=np.where(wanted == 0.0, 0.0, wanted + known.velocity))
+    velocity = np.empty(context.q.size)
+    changed = _compensated(
+        output.velocity, arrives, context.q, known.velocity, known.stood_at, known.sent, known.sent_s, most,
+        travel, context.dt_s, looks, velocity,
+    )  # fmt: skip
+    return msgspec.structs.replace(output, velocity=velocity) if changed else output
 
 
-def _estimate(
-    known: FrictionCompensation,
-    wanted: FloatArray,
-    q: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-    dt_s: float,
-) -> None:
-    """Compare the travel that was sent, once it is enough, with what came of it; begin again where it reverses."""
-    most, travel = bounds
-    sent, seconds = known.sent, known.sent_s
-    valid = (np.abs(wanted) < SMALL * most) & (wanted * sent >= 0.0)
-    enough = valid & (np.abs(sent) > travel + LAG_S * np.abs(sent) / seconds)
-    share = np.where(enough, (q - known.stood_at) / np.where(enough, sent, 1.0), 1.0)
-    lost = np.clip(1.0 - share, 0.0, 1.0) * sent / seconds
-    velocity = known.velocity + np.where(
-        enough, np.minimum(seconds / RISE_S, 1.0) * (lost - known.velocity), 0.0
-    )
-    velocity = np.where(wanted * velocity < 0.0, velocity * (1.0 - min(dt_s / RISE_S, 1.0)), velocity)
-    known.velocity = np.clip(velocity, -most, most)
-    again = enough | ~valid
-    known.sent, known.sent_s = np.where(again, 0.0, sent), np.where(again, 0.0, seconds)
-    known.stood_at = np.where(again, q, known.stood_at)
+@kernel
+def _compensated(
+    wanted: FloatArray, arrives: FloatArray, q: FloatArray, friction: FloatArray, stood_at: FloatArray,
+    sent: FloatArray, sent_s: FloatArray, most: FloatArray, travel: FloatArray, dt_s: float, looks: bool,
+    velocity: FloatArray,
+) -> bool:  # fmt: skip
+    """The ``velocity`` (n,) ``wanted`` with the ``friction`` (n,) on top, and whether there is any.
+
+    ``arrives`` (n,): the command that the drives obey now. ``friction``, ``stood_at``, ``sent`` and ``sent_s`` are
+    brought up to date in place: where it ``looks``, the travel that was sent, once it is enough, is compared with what
+    came of it, and begins again where it reverses. ``most``, ``travel``: of `_bounds`.
+    """
+    changed = False
+    for j in range(wanted.size):
+        velocity[j] = 0.0
+        sent[j] += arrives[j] * dt_s
+        sent_s[j] += dt_s
+        if looks:
+            valid = abs(wanted[j]) < SMALL * most[j] and wanted[j] * sent[j] >= 0.0
+            enough = valid and abs(sent[j]) > travel[j] + LAG_S * abs(sent[j]) / sent_s[j]
+            if enough:
+                share = (q[j] - stood_at[j]) / sent[j]
+                lost = max(0.0, min(1.0 - share, 1.0)) * sent[j] / sent_s[j]
+                friction[j] += min(sent_s[j] / RISE_S, 1.0) * (lost - friction[j])
+            if wanted[j] * friction[j] < 0.0:
+                friction[j] *= 1.0 - min(dt_s / RISE_S, 1.0)
+            friction[j] = max(-most[j], min(friction[j], most[j]))
+            if enough or not valid:
+                sent[j], sent_s[j], stood_at[j] = 0.0, 0.0, q[j]
+        changed = changed or friction[j] != 0.0
+        if wanted[j] != 0.0:
+            velocity[j] = wanted[j] + friction[j]
+    return changed
 
 
 def _fresh(output: SourceOutput, context: StepContext) -> bool:

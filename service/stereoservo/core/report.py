@@ -5,9 +5,7 @@ model health and the estimated time offset of each camera.
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import msgspec
 import numpy as np
 
 from stereoservo.core.context import COMPILING, SourceOutput, StepContext
@@ -16,14 +14,14 @@ from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
 from stereoservo.core.limit import SafetyResult
-from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays
 from stereoservo.core.monitor_state import CameraTiming, ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
-from stereoservo.core.prediction import FIRST_SIGHT_SIGMA_PX, TIMING_SIGMA_S, Prediction, propagate_covariance
+from stereoservo.core.prediction import TIMING_SIGMA_S, Prediction, propagate_covariance
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, Contact, CoreState
+from stereoservo.core.state import CameraEstimate, CoreState
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
 from stereoservo.messages.reasons import Level, Reason
 from stereoservo.messages.status import CameraHealth, Health, Lifecycle, ModelReadiness
@@ -53,7 +51,10 @@ def report(
 
 def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
     state, settings = context.state, context.settings
-    reasons = _reasons(context, motion, limited)
+    masked = masked_ids(state)
+    diagnosis = shown_diagnosis(state.watching.verdict, masked)
+    reasons = _reasons(context, motion, limited, diagnosis)
+    effort_limits, following_limits = context.derived.load_limits or (None, None)
     source = MOTION_SOURCES[type(state.source)]
     done, left_s = (None, None) if source.progress is None else source.progress(state.source, context)
     innovation_px, visible = {}, {}
@@ -81,12 +82,17 @@ def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -
         visible=visible,
         progress=done,
         seconds_left=left_s,
-        health=health_status(state, settings, "" if state.reanchoring is None else state.reanchoring.phase),
-        **_load_status(state.contact, context.derived.load_limits),
+        efforts=state.contact.efforts,
+        following_errors=state.contact.following_errors,
+        effort_limits=effort_limits,
+        following_limits=following_limits,
+        health=_health(context, diagnosis, masked),
     )
 
 
-def _reasons(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> tuple[Reason, ...]:
+def _reasons(
+    context: StepContext, motion: SourceOutput, limited: SafetyResult, diagnosis: ModelDiagnosis
+) -> tuple[Reason, ...]:
     """Why the arm does not do what its source wants, or may not soon."""
     state = context.state
     found = [*state.fault, *limited.reasons, *motion.reasons, *_refused_inputs(state)]
@@ -94,9 +100,8 @@ def _reasons(context: StepContext, motion: SourceOutput, limited: SafetyResult) 
         found.extend(camera_relocalization.reasons(state))
     if any(state.mobile):
         found.extend(moving_camera.reasons(state, context.settings))
-    if state.reanchoring is None:
-        diagnosis = shown_diagnosis(state)
-        reason = None if diagnosis.kind == "ok" else diagnosis_reason(diagnosis)
+    if state.reanchoring is None and diagnosis.kind != "ok":
+        reason = diagnosis_reason(diagnosis)
         if reason is not None:
             found.append(reason)
     explain = MOTION_SOURCES[type(state.source)].progress_reasons
@@ -143,26 +148,16 @@ def _priors(context: StepContext) -> tuple[Prior, ...]:
     return priors(arrays, context.settings, prediction, cameras, state.velocities, context.now_ns, unknown)
 
 
-def _load_status(contact: Contact, limits: tuple[FloatArray, FloatArray] | None) -> dict[str, Any]:
-    """Fields of the status."""
-    effort_limits, following_limits = (None, None) if limits is None else limits
-    return {
-        "efforts": contact.efforts,
-        "following_errors": contact.following_errors,
-        "effort_limits": effort_limits,
-        "following_limits": following_limits,
-    }
-
-
 def _level(reasons: tuple[Reason, ...]) -> str:
     """The worst level of the reasons; information is none."""
-    worst = max([LEVELS.index(reason.level) for reason in reasons], default=0)
+    if not reasons:
+        return "ok"
+    worst = max([LEVELS.index(reason.level) for reason in reasons])
     return "ok" if worst == 0 else LEVELS[worst]
 
 
-def shown_diagnosis(state: CoreState) -> ModelDiagnosis:
+def shown_diagnosis(verdict: ModelDiagnosis, masked: tuple[int, ...]) -> ModelDiagnosis:
     """The verdict as it is shown: a marker that is left out remains one that has slipped."""
-    verdict, masked = state.watching.verdict, masked_ids(state)
     if verdict.kind != "ok" or not masked:
         return verdict
     listed = tuple(str(marker) for marker in masked)
@@ -170,11 +165,32 @@ def shown_diagnosis(state: CoreState) -> ModelDiagnosis:
     return ModelDiagnosis("marker_slipped", listed, text=text)
 
 
-def health_status(state: CoreState, settings: CoreSettings, reanchoring: str) -> Health:
-    """What the status says of the model's health."""
-    if state.model is None or state.readiness == ModelReadiness.NONE:
-        return Health()
-    watching, verdict = state.watching, shown_diagnosis(state)
+NO_HEALTH = Health()
+
+
+def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, ...]) -> Health:
+    """What the status says of the model's health: what it said before, where nothing of it has changed."""
+    state, derived = context.state, context.derived
+    model = state.model
+    if model is None or state.readiness == ModelReadiness.NONE:
+        return NO_HEALTH
+    reanchoring = "" if state.reanchoring is None else state.reanchoring.phase
+    facts = [
+        (s.chi2, s.rms_px, s.worst, s.worst_px, s.timing.product, s.timing.square)
+        for s in state.watching.sightings
+    ]
+    places = None if not any(state.mobile) else ["" if m is None else m.place for m in state.mobile]
+    told = (model.epoch, diagnosis, masked, reanchoring, facts, places)
+    if derived.health is None or derived.health[0] != told:
+        derived.health = told, _health_now(context, diagnosis, masked, reanchoring)
+    return derived.health[1]
+
+
+def _health_now(
+    context: StepContext, verdict: ModelDiagnosis, masked: tuple[int, ...], reanchoring: str
+) -> Health:
+    state = context.state
+    assert state.model is not None
     ids = (*state.model.marker_ids, *state.model.scene_ids)
     return Health(
         verdict=verdict.kind,
@@ -193,10 +209,10 @@ def health_status(state: CoreState, settings: CoreSettings, reanchoring: str) ->
                 advice(sighting.timing),
             )
             for camera, sighting, moves in zip(
-                settings.cameras, watching.sightings, state.mobile, strict=True
+                context.settings.cameras, state.watching.sightings, state.mobile, strict=True
             )
         },
-        masked=masked_ids(state),
+        masked=masked,
         reanchoring=reanchoring,
     )
 
@@ -237,21 +253,45 @@ def priors(
 
     None for cameras of whose place nothing is known: their detectors look in the whole image.
     """
-    ids: IntArray = np.array(arrays.marker_ids, dtype=np.int64)
     found = []
     for camera, estimate in enumerate(cameras):
         if settings.cameras[camera].name in unknown:
             continue
         jacobian = prediction.jacobian[camera]
-        pixels, speed, covariance = expected_sights(
-            prediction.pixels[camera], jacobian, velocities, estimate.innovation, now_ns - estimate.seen_ns,
-            estimate.seen_ns, _unseen_sigma(jacobian, arrays),
+        ids, markers = arrays.ids, arrays.ids.size
+        pixels, speed, covariance, seen = (
+            np.empty((markers, 2)),
+            np.empty((markers, 2)),
+            np.empty((markers, 2, 2)),
+            np.empty(markers, np.bool_),
+        )
+        all_seen = _expected(
+            prediction.pixels[camera], jacobian, velocities, estimate.innovation, now_ns, estimate.seen_ns,
+            _unseen_sigma(jacobian, arrays), arrays.lenses[camera], pixels, speed, covariance, seen,
         )  # fmt: skip
+        if not all_seen:  # markers beyond the fold of the camera's lens are left out
+            ids, pixels, speed, covariance = ids[seen], pixels[seen], speed[seen], covariance[seen]
         # The vision process asks for the stamps that the camera tells.
         stamp_ns = now_ns - estimate.offset_ns
-        prior = Prior(settings.cameras[camera].name, stamp_ns, ids, pixels, speed, covariance)
-        found.append(_raw_prior(prior, arrays.lenses[camera]))
+        found.append(Prior(settings.cameras[camera].name, stamp_ns, ids, pixels, speed, covariance))
     return tuple(found)
+
+
+@kernel
+def _expected(
+    predicted: FloatArray, jacobian: FloatArray, velocities: FloatArray, innovation: FloatArray, now_ns: int,
+    seen_ns: IntArray, unseen_px: FloatArray, lens: FloatArray, pixels: FloatArray, speed: FloatArray,
+    covariance: FloatArray, seen: BoolArray,
+) -> bool:  # fmt: skip
+    """Into the last four: `expected_sights` as the camera's lens shows them, and which of them (m,) lie within its
+    fold; whether all do.
+    """
+    found = expected_sights(predicted, jacobian, velocities, innovation, now_ns - seen_ns, seen_ns, unseen_px)
+    if lens.size == 4 and lens[0] == 0.0:
+        pixels[:], speed[:], covariance[:] = found
+        return True
+    pixels[:], speed[:], covariance[:], seen[:] = distort_expected(lens, *found)
+    return bool(seen.all())
 
 
 @kernel
@@ -289,25 +329,9 @@ LARGEST_WINDOW_PX = 20.0
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
     """Deviations (m,) [px] of markers that were not seen of late, by their ``jacobian`` (m, 2, n)."""
     if arrays.joint_accuracy is None:
-        return np.full(len(jacobian), FIRST_SIGHT_SIGMA_PX)
+        return arrays.unseen_px
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
     return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
-
-
-def _raw_prior(prior: Prior, lens: FloatArray) -> Prior:
-    """A prior as the camera's lens shows it; markers beyond its fold are left out."""
-    if len(lens) == 4 and lens[0] == 0.0:
-        return prior
-    pixels, velocities, covariances, seen = distort_expected(
-        lens, prior.pixels, prior.velocities, prior.covariances
-    )
-    return msgspec.structs.replace(
-        prior,
-        ids=prior.ids[seen],
-        pixels=pixels[seen],
-        velocities=velocities[seen],
-        covariances=covariances[seen],
-    )
 
 
 @kernel

@@ -19,6 +19,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import Derived, Ingested, StepContext
 from stereoservo.core.cycle import Event, StepInputs, StepOutputs
@@ -35,6 +37,7 @@ from stereoservo.core.limit import limit, safety_limits
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitor import monitor
 from stereoservo.core.move import move
+from stereoservo.core.prediction import shared_sights
 from stereoservo.core.report import report
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, initial_state
@@ -56,9 +59,12 @@ class ServoCore:
             frame_timeout_s=frame_timeout_s(settings),
             features_fresh_s=features_fresh_s(settings),
             laws=LAWS.usable(),
+            cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
+            samples=np.zeros((4, len(settings.joint_names))),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
             arrays=None if model is None else model_arrays(model, settings),
             load_limits=load_limits(settings, model),
+            sights=None if model is None else shared_sights(self.state.cameras),
         )
         self._limits = safety_limits(settings, self._derived.features_fresh_s)
 

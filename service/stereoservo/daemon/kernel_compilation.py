@@ -39,7 +39,7 @@ from stereoservo.control.marker_groups import FLAT_PX, find_groups
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.monitors.moving_camera import rehearse as rehearse_mobile
-from stereoservo.core.prediction import rows_of
+from stereoservo.core.prediction import joints_at, rows_of
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.daemon.process_control import die_with_parent
@@ -53,6 +53,7 @@ from stereoservo.messages.goals import (
     FeatureTarget,
     Goal,
     Jog,
+    JointTarget,
     PointSource,
     PointTarget,
     Request,
@@ -89,14 +90,16 @@ def warm_up_first() -> None:
     pixels = _example_pixels(model)
     core = ServoCore(example_settings())
     jog = Request(1, "warmup", Jog({JOINTS[0]: 0.1}))
-    for step in range(1, 4):
+    move = Request(1, "warmup", RunGoal(Goal("00000000-0000", JointTarget({JOINTS[0]: 0.1}))))
+    for step, request in enumerate((jog, jog, jog, move, move), 1):
         inputs = _inputs(step, pixels, model)
         core.step(
             msgspec.structs.replace(
-                inputs, model_update=None, requests=(jog,), driver_active=True, compiling=True
+                inputs, model_update=None, requests=(request,), driver_active=True, compiling=True
             )
         )
-    rows_of(*(np.zeros(0, np.int64),) * 3)  # at the stops of trials
+    rows_of(*(np.zeros(0, np.int64),) * 3)  # at the stops of trials, with the joints there
+    joints_at(core.state.history, 0)
     warm_up_laws(own=False)
 
 

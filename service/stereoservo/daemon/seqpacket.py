@@ -50,6 +50,10 @@ class PacketChannel:
             ) from error
         return cls(connection, str(path))
 
+    def fileno(self) -> int:
+        """Descriptor of the socket; -1 once it is closed."""
+        return self._socket.fileno()
+
     @property
     def is_open(self) -> bool:
         """False once either side has closed."""
@@ -120,6 +124,10 @@ class ChannelServer:
         path.chmod(0o600)
         self._socket.listen(8)
         self.peers: list[PacketChannel] = []
+
+    def fileno(self) -> int:
+        """Descriptor of the listening socket, readable while a peer waits to be accepted."""
+        return self._socket.fileno()
 
     def accept(self) -> list[PacketChannel]:
         """Accept waiting peers, drop those that have gone; returns the new ones."""

@@ -4,6 +4,7 @@ outbox of recent events.
 
 from __future__ import annotations
 
+import select
 from collections import deque
 
 import msgspec
@@ -33,6 +34,7 @@ from stereoservo.ports.devices import CameraObservation, Prior
 from stereoservo.recording.step_records import StepMessage
 
 RETAINED_EVENTS = 2048
+NOTHING_WAITS = GatewayMessages(False, (), None)
 
 
 class EventOutbox:
@@ -94,13 +96,27 @@ class ProcessLinks:
         self._gateway: PacketChannel | None = None
         self._recorder: _RecorderPeer | None = None
         self._outbox = EventOutbox()
+        self._waiting = self._watched()
+
+    def _watched(self) -> select.poll:
+        """What tells in one call whether a peer or a message waits: calls that fail cost more, in every cycle."""
+        waiting = select.poll()
+        for server in (self._control, self._steps):
+            waiting.register(server.fileno(), select.POLLIN)
+        if self._gateway is not None and self._gateway.is_open:
+            waiting.register(self._gateway.fileno(), select.POLLIN)
+        return waiting
 
     def receive(self) -> GatewayMessages:
         """Requests and model of the newest gateway connection; a message that does not decode is left out."""
+        if not self._waiting.poll(0):
+            return NOTHING_WAITS
         heard = False
         for peer in self._control.accept():
             self._gateway = peer
             heard = True
+        for peer in self._steps.accept():
+            self._recorder = _RecorderPeer(peer)
         requests: list[Request] = []
         update: ModelUpdate | None = None
         for data in [] if self._gateway is None else self._gateway.receive():
@@ -114,6 +130,7 @@ class ProcessLinks:
                 update = ModelUpdate(message.model, message.reanchored)
             elif isinstance(message, Hello):
                 self._outbox.rewind(message.last_event)
+        self._waiting = self._watched()
         return GatewayMessages(heard, tuple(requests), update)
 
     def observations(self) -> tuple[CameraObservation, ...]:
@@ -131,9 +148,7 @@ class ProcessLinks:
         return self._stop.poll()
 
     def step_recorder(self) -> _RecorderPeer | None:
-        """The newest connection to the step socket while it is open."""
-        for peer in self._steps.accept():
-            self._recorder = _RecorderPeer(peer)
+        """The newest connection to the step socket that `receive` has found, while it is open."""
         if self._recorder is not None and not self._recorder.channel.is_open:
             self._recorder = None
         return self._recorder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,6 +13,7 @@ from stereoservo.control.law import Law, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
+from stereoservo.core.state import ServoGoal
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.composition import Composition
@@ -25,6 +27,7 @@ from stereoservo_sim.benchmarks.core_loop import (
     CoreLoop,
     largest_cell,
     rx90_with_facets,
+    timed_stages,
 )
 from stereoservo_sim.benchmarks.stereo_reference import stereo_law
 from stereoservo_sim.benchmarks.timing import summary, timed
@@ -37,7 +40,6 @@ WARM_UP = 100
 """Steps of the core that do not count."""
 LARGE_BODIES = ((8, 2, 6), (64, 2, 6), (256, 2, 6), (256, 8, 6), (256, 8, 12))
 """Markers, cameras, joints."""
-"""Markers and cameras."""
 
 
 def stereo_problem() -> dict[str, Any]:
@@ -118,18 +120,17 @@ def with_reference(p: dict[str, Any]) -> FloatArray:
 
 
 def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Microseconds of a control step and of a core step under each Cartesian and image law."""
+    """Microseconds of a control step, and of steps of the core under each law."""
     problem = stereo_problem()
     count = max(200, 100 * repetitions)
     fused = timed(in_one_call(problem), count, warm_up=20)[0]
     kernels = timed(lambda _: with_kernels(problem), count, warm_up=20)[0]
     reference = timed(lambda _: with_reference(problem), count, warm_up=5)[0]
-    progress("control step", 1, 3)
-    laws: tuple[LawName, ...] = ("stereo", "cartesian3")
-    core = {}
-    for k, law in enumerate(laws):
-        core[law] = summary(core_steps(law, count, seed), 1e6)
-        progress("control step", 2 + k, 3)
+    progress("control step", 1, 1)
+    core: dict[str, dict[str, Any]] = {}
+    for law in LAWS:
+        core[law] = core_steps(law, count // 2, seed)
+        progress("core step", len(core), len(LAWS))
     return {
         "stereo_step_us": {
             "one_call": summary(fused, 1e6),
@@ -153,16 +154,49 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     }
 
 
-def core_steps(law: LawName, count: int, seed: int) -> list[float]:
-    """Durations [s] of ``count`` steps of a core that drives the simulated arm to a goal by ``law``."""
+PACED_S = 0.003
+"""Sleep between two steps, as in life: caches are cold then."""
+KINDS = {"moving, between": "between frames", "moving, frames": "with frames"}
+
+
+def core_steps(law: LawName, count: int, seed: int) -> dict[str, Any]:
+    """Microseconds of ``count`` steps between frames, and of those with frames of all cameras, of a core that drives
+    the simulated arm to a goal by ``law``: one after the other (``tight``), with a sleep before each (``paced``), and
+    by stage (``stages``, medians, tight).
+    """
     loop = CoreLoop(rx90(), seed)
-    loop.start_goal(law)
-    for _ in range(WARM_UP):
+    drive(loop, law, WARM_UP)
+    found: dict[str, Any] = {}
+    for name, pause_s in (("tight", 0.0), ("paced", PACED_S)):
+        loop.times.clear()
+        drive(loop, law, count, pause_s)
+        found[name] = {label: summary(of_kind(loop.times, kind), 1e6) for kind, label in KINDS.items()}
+    with timed_stages(loop) as stages:
+        drive(loop, law, count)
+    found["stages"] = {
+        label: {stage: summary(of_kind(times, kind), 1e6)["median"] for stage, times in stages.items()}
+        for kind, label in KINDS.items()
+    }
+    return found
+
+
+def drive(loop: CoreLoop, law: LawName, count: int, pause_s: float = 0.0) -> None:
+    """Run ``count`` steps between frames, and those with frames, while ``law`` drives the arm, to and fro where it gets
+    there; with a pause before each.
+    """
+    between = 0
+    while between < count:
+        if not isinstance(loop.core.state.source, ServoGoal):
+            loop.start_goal(law, loop.seq, 0.3 if loop.seq == 0 or loop.q[0] <= loop.cell.home[0] else 0.0)
+        if pause_s:
+            time.sleep(pause_s)
         loop.step()
-    loop.times.clear()
-    for _ in range(count):
-        loop.step()
-    return [seconds for _, seconds in loop.times]
+        between += loop.kind == "moving, between"
+
+
+def of_kind(times: list[tuple[str, float]], kind: str) -> list[float]:
+    """The durations of steps of a kind."""
+    return [seconds for of, seconds in times if of == kind]
 
 
 def _find_groups(model: CellModel, _: int) -> CellModel:

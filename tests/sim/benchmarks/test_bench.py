@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from stereoservo.cli import main as cli
+from stereoservo.control.law_registry import LAWS
 from stereoservo_sim.benchmarks import calibration
 from stereoservo_sim.benchmarks.calibration import run_calibration, thesis_sized
-from stereoservo_sim.benchmarks.cycle import core_steps, run_cycle
+from stereoservo_sim.benchmarks.cycle import run_cycle
 from stereoservo_sim.benchmarks.features import run_features
 from stereoservo_sim.benchmarks.timing import machine, stolen_share, summary, timed
 
@@ -76,8 +77,13 @@ def test_calibration_is_thesis_sized_and_reaches_one_minimum(monkeypatch):
 def test_cycle_times_kernels_and_core():
     result = run_cycle(1, 0, quiet)
     assert result["stereo_step_us"]["kernels"]["repetitions"] == 200
-    assert set(result["core_step_us"]) == {"stereo", "cartesian3"}
-    assert len(core_steps("stereo", 30, seed=4)) == 30
+    assert set(result["core_step_us"]) == set(LAWS)
+    for found in result["core_step_us"].values():
+        for pace in ("tight", "paced"):
+            assert found[pace]["between frames"]["repetitions"] >= 100
+            assert found[pace]["with frames"]["repetitions"] >= 10
+        for kind, stages in found["stages"].items():
+            assert 0.0 < sum(stages.values()) < 2.0 * found["tight"][kind]["max"]
 
 
 def test_features_find_the_dots():

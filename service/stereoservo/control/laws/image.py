@@ -6,15 +6,13 @@ a camera drops out.
 
 from __future__ import annotations
 
-import numpy as np
-
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
-from stereoservo.control.laws.stereo import image_reasons, image_velocity_step
+from stereoservo.control.laws.stereo import image_reasons, image_velocity_step, standing
 
 
 def image(scene: Scene, task: Task, options: Options) -> LawStep:
     """``q̇ = gain·J⁺(s* − s)`` over the markers that are seen and wanted, in any number of cameras (8.26)."""
-    return image_velocity_step(scene, task, options, options.jacobian, np.zeros_like(task.rates))
+    return image_velocity_step(scene, task, options, options.jacobian, standing(task.rates.shape))
 
 
 LAW = Law(

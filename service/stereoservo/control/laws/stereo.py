@@ -7,6 +7,7 @@ The damped least-squares step in the images is here, which `image`, `points` and
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from math import expm1, inf
 from typing import NamedTuple
 
@@ -161,6 +162,22 @@ def image_step(
 
 
 @kernel
+def _image_step_into(
+    operators: FloatArray,
+    view: View,
+    body: Body,
+    gain: float,
+    choice: int,
+    damping: float,
+    velocity: FloatArray,
+) -> float:
+    """`image_step` into ``velocity`` (n,); the conditioning."""
+    x, conditioning = image_step(operators, view, body, gain, choice, damping)
+    velocity[:] = x
+    return conditioning
+
+
+@kernel
 def limit_into(
     operators: FloatArray, centre: FloatArray, rotation_rate: float, translation_rate: float, x: FloatArray
 ) -> None:
@@ -204,8 +221,9 @@ def image_velocity_step(
         scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted
     )
     body = Body(scene.points, task.target_points, task.target_known)
-    velocity, conditioning = image_step(
-        scene.operators, view, body, held_gain(options), int(jacobian), options.damping
+    velocity = np.empty(len(scene.operators))
+    conditioning = _image_step_into(
+        scene.operators, view, body, held_gain(options), int(jacobian), options.damping, velocity
     )
     return limited(scene, task, options, velocity, conditioning)
 
@@ -230,7 +248,13 @@ def image_reasons(step: LawStep) -> tuple[Reason, ...]:
 
 def stereo(scene: Scene, task: Task, options: Options) -> LawStep:
     """``q̇ = gain·J⁺(s* − s)``, all cameras stacked (8.36): with one camera left it is the law of one camera."""
-    return image_velocity_step(scene, task, options, options.jacobian, np.zeros_like(task.rates))
+    return image_velocity_step(scene, task, options, options.jacobian, standing(task.rates.shape))
+
+
+@lru_cache(maxsize=8)
+def standing(shape: tuple[int, ...]) -> FloatArray:
+    """Rates of set-points that stand; not to be written to."""
+    return np.zeros(shape)
 
 
 LAW = Law(

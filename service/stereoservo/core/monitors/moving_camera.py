@@ -120,7 +120,7 @@ def see(
     mobile = state.mobile[camera]
     if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
         return sights
-    hidden = dataclasses.replace(sights, seen=np.zeros_like(sights.seen))
+    hidden = msgspec.structs.replace(sights, seen=np.zeros_like(sights.seen))
     if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
         return (
             hidden if mobile.moving else sights
@@ -327,7 +327,7 @@ def _stand(c: int, mobile: MobileCamera, context: StepContext) -> StepContext:
     prediction = predict(new, context.q)
     weights = context.weights.copy()
     weights[c] = 0.0
-    return dataclasses.replace(
+    return msgspec.structs.replace(
         context, arrays=new, prediction=prediction, weights=weights, pixels=pixels_now(prediction, state.cameras)
     )  # fmt: skip
 
@@ -386,7 +386,12 @@ def to_look_from(
     corrected = predict(here, context.q + state.correction)
     pixels, jacobian = context.prediction.pixels.copy(), context.prediction.jacobian.copy()
     pixels[moving], jacobian[moving] = corrected.pixels[moving], corrected.jacobian[moving]
-    return here, dataclasses.replace(context.prediction, pixels=pixels, jacobian=jacobian), cameras, unknown
+    return (
+        here,
+        msgspec.structs.replace(context.prediction, pixels=pixels, jacobian=jacobian),
+        cameras,
+        unknown,
+    )
 
 
 def moving_cameras(state: CoreState, settings: CoreSettings) -> tuple[str, ...]:

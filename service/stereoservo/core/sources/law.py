@@ -17,12 +17,12 @@ from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import centre_of, points_now, scene_of
+from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, KindArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
@@ -39,17 +39,14 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     arrays, prediction, pixels = context.arrays, context.prediction, context.pixels
     if arrays is None or prediction is None or context.weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")
-    usable = context.weights * source.used[:, None]
     streamed = follow(source, context, arrays) if source.stream is not None else False
-    active = usable * source.wanted
-    distance = np.sqrt(((pixels - source.set_points) ** 2).sum(axis=-1))
-    error_px = float(np.where(active > 0.0, distance, 0.0).max()) if bool((active > 0.0).any()) else None
-    seen = int((active.max(axis=0) > 0.0).sum())
-    ended = run_ended(source, context, error_px, seen, may_end=not streamed)
+    found = goal_error(source, context, arrays, context.weights, pixels)
+    error_px = found.error_px
+    ended = run_ended(source, context, error_px, found.seen, may_end=not streamed)
     if ended is not None:
         return ended
     law = context.derived.laws[source.law]
-    scene, task = choose(source, context, *scene_and_task(source, context, arrays, usable))
+    scene, task = choose(source, context, *scene_and_task(source, context, arrays, found))
     if law.planned:
         if source.plan is None and source.pose_known:
             hint = "the way is planned from where the arm comes to rest"
@@ -59,18 +56,72 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
             task = trajectory_task(source, context, scene, task)
     try:
         step = law.step(scene, task, options(source, context, error_px, source.jacobian))
-        _require_velocity(step, len(context.q))
+        velocity = velocity_of(step, len(context.q))
     except Exception as error:  # whatever a third party's law raises ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
-    velocity = step.velocity
     if streamed:
-        velocity = velocity + feed_forward(source, context, active)
+        velocity = velocity + feed_forward(source, context, found.usable * source.wanted)
     if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has kept off the limits itself
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
         velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
         reasons=law.reasons(step),
     )  # fmt: skip
+
+
+class GoalError(NamedTuple):
+    """A goal and its body now: ``usable`` (c, m) weights of the cameras that it may use; the largest distance
+    ``error_px`` over markers and cameras, None where none is seen; how many of its markers are ``seen``. Of the joints
+    with their correction, the body's ``points`` (m, 4) and the ``centre`` (4,) of the goal.
+    """
+
+    usable: FloatArray
+    error_px: float | None
+    seen: int
+    points: FloatArray
+    centre: FloatArray
+
+
+def goal_error(
+    source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray, pixels: FloatArray
+) -> GoalError:
+    """Error and body of ``source`` with the present ``weights`` (c, m) and ``pixels`` (c, m, 2)."""
+    usable, points, centre = np.empty(weights.shape), np.empty(arrays.marker_points.shape), np.empty(4)
+    measured, error_px, seen = _goal_error(
+        weights, source.used, source.wanted, pixels, source.set_points, arrays.generators, arrays.kinds,
+        arrays.zero, context.q, context.state.correction, arrays.tip_first, arrays.marker_points, source.centre_weights,
+        source.centre_body, usable, points, centre,
+    )  # fmt: skip
+    return GoalError(usable, error_px if measured else None, seen, points, centre)
+
+
+@kernel
+def _goal_error(
+    weights: FloatArray, used: FloatArray, wanted: FloatArray, pixels: FloatArray, set_points: FloatArray,
+    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, correction: FloatArray, tip_first: bool,
+    marker_points: FloatArray, centre_weights: FloatArray, centre_body: FloatArray, usable: FloatArray,
+    points: FloatArray, centre: FloatArray,
+) -> tuple[bool, float, int]:  # fmt: skip
+    """The arrays of `GoalError` into the last three; whether an error was measured, it, and the markers seen."""
+    cameras, markers = weights.shape
+    largest, measured, seen = 0.0, False, 0
+    for i in range(markers):
+        visible = False
+        for c in range(cameras):
+            usable[c, i] = weights[c, i] * used[c]
+            if not usable[c, i] * wanted[c, i] > 0.0:
+                continue
+            visible = True
+            u, v = pixels[c, i, 0] - set_points[c, i, 0], pixels[c, i, 1] - set_points[c, i, 1]
+            distance = math.sqrt(u * u + v * v)
+            if distance > largest or math.isnan(distance):
+                largest = distance
+        measured = measured or visible
+        seen += visible
+    joints = q + correction
+    points[:] = body_points(generators, kinds, zero, joints, tip_first, marker_points)
+    centre_into(generators, kinds, zero, joints, tip_first, points, centre_weights, centre_body, centre)
+    return measured, largest, seen
 
 
 def activate_run(source: LawRun, context: StepContext) -> None:
@@ -104,7 +155,6 @@ def run_ended(
     """
     source.moved_s += context.dt_s
     source.error_px = error_px
-    zero = np.zeros_like(context.q)
     if source.moved_s > source.time_limit_s:
         return _out_of_time(source, context, error_px)
     if seen < MIN_MARKERS:
@@ -112,31 +162,34 @@ def run_ended(
             "TOO_FEW_MARKERS", "hold", "", float(seen), float(MIN_MARKERS), "markers",
             "bring the goal's markers back into view",
         )  # fmt: skip
-        return SourceOutput(zero, needs_features=True, error_px=error_px, reasons=(reason,))
+        return SourceOutput(
+            np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,)
+        )
     if _settled(source, context, error_px) and may_end:
         context.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
-        return SourceOutput(zero, finished=True, reached=True, error_px=error_px)
+        return SourceOutput(np.zeros_like(context.q), finished=True, reached=True, error_px=error_px)
     return None
 
 
 def scene_and_task(
-    source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray
+    source: ServoGoal, context: StepContext, arrays: ModelArrays, found: GoalError
 ) -> tuple[Scene, Task]:
     """The present and the goal as laws take them."""
     prediction, pixels = context.prediction, context.pixels
     assert prediction is not None
     assert pixels is not None
-    points = points_now(
-        arrays, context.q, prediction, pixels, weights, context.state.correction, source.points
-    )
-    scene = scene_of(prediction, pixels, arrays, points, weights)
+    points, centre = found.points, found.centre
+    if source.points == "triangulated":
+        points = triangulated(arrays, pixels, found.usable, points)
+        centre = centre_of(source, context.q + context.state.correction, arrays, points)
+    scene = scene_of(prediction, pixels, arrays, points, found.usable)
     task = Task(
         source.set_points,
         source.wanted,
-        np.zeros_like(source.rates),
+        arrays.no_rates,
         source.target_points,
-        np.full(len(points), 1.0 if source.pose_known else 0.0),
-        centre_of(source, context.q + context.state.correction, arrays, points),
+        arrays.known[1 if source.pose_known else 0],
+        centre,
         source.centre_target,
         source.choice.triple,
     )
@@ -206,10 +259,16 @@ def options(
     return Options(gain=gain, dt_s=context.dt_s, jacobian=jacobian)
 
 
-def _require_velocity(step: LawStep, joints: int) -> None:
-    """Raises ValueError where a law's step is not a velocity of that many joints."""
+def velocity_of(step: LawStep, joints: int) -> FloatArray:
+    """A copy (n,) of the velocity of a law's step, of the type that kernels are compiled for.
+
+    Raises ValueError where it is none of that many joints, TypeError where its numbers are not real.
+    """
     if step.velocity.shape != (joints,):
         raise ValueError(f"a velocity of shape {step.velocity.shape}; ({joints},) is needed")
+    if step.velocity.dtype.kind not in "fiu":
+        raise TypeError(f"a velocity of {step.velocity.dtype}; real numbers are needed")
+    return np.array(step.velocity, dtype=np.float64)
 
 
 def _law_failed(
