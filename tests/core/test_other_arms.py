@@ -153,6 +153,25 @@ def test_arm_with_prismatic_joints_reaches() -> None:
     assert loop.error_px(goal_q) < 0.15
 
 
+@pytest.mark.parametrize(("law", "able"), [("cartesian3", False), ("cartesian2", False), ("stereo", True)])
+def test_a_law_of_components_that_the_arm_makes_only_together_is_refused_before_anything_moves(
+    law: str, able: bool
+) -> None:
+    """A face that is not square to a SCARA's axes: turned about them it revolves about its hinge and in its plane."""
+    level = scara()
+    c, s = np.cos(0.9), np.sin(0.9)
+    cell = level.with_body(level.body @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T)
+    loop = Loop(cell)
+    goal_q = cell.home + np.array([0.15, -0.2, 0.04, 0.4])
+    event = loop.run(loop.features(goal_q), law=law)
+    if able:
+        assert event.kind == "goal_reached", event
+        return
+    assert (event.kind, event.accepted, event.reasons[0].code) == ("reply", False, "NOT_REACHABLE"), event
+    assert "'stereo', 'image', 'points', 'trajectory'" in event.reasons[0].hint
+    assert np.array_equal(loop.q, cell.home)
+
+
 def of_markers(target: FeatureTarget, ids: tuple[int, ...]) -> FeatureTarget:
     """The same goal, shown by these markers only."""
     return FeatureTarget(

@@ -241,6 +241,19 @@ def _displacement_by_law(
     return D, False
 
 
+def left_by_components(
+    arrays: ModelArrays, operators: FloatArray, points: FloatArray, targets: FloatArray, face: IntArray
+) -> float:
+    """Largest distance [px] from the goal at which a law in components comes to rest with the freedoms ``operators``
+    (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
+    """
+    known = np.ones(len(points), dtype=bool)
+    D, _ = _displacement_by_law(operators, points, targets, known, face, np.eye(4), LAW_STEPS)
+    there, _ = project_points(arrays.matrices, transform_points(D, points))
+    wanted, _ = project_points(arrays.matrices, targets)
+    return float(np.sqrt(((there - wanted) ** 2).sum(axis=-1)).max())
+
+
 @kernel
 def _middle(points: FloatArray, known: BoolArray) -> FloatArray:
     """Mean (4,) of the ``known`` of ``points`` (m, 4)."""
