@@ -88,7 +88,16 @@ class PybulletCameraDriver(SimulatedCamera):
         settings = RenderSettings(
             blur_px=options.blur, noise_grey=options.noise, background=options.background
         )
-        return Renderer(self.cell, self.camera, settings)
+        try:
+            return Renderer(self.cell, self.camera, settings)
+        except Exception as error:
+            from stereoservo_sim.world.physics import (
+                PhysicsError,
+            )  # loaded where the background is pybullet's
+
+            if isinstance(error, PhysicsError):
+                raise DriverError("physics", str(error)) from error
+            raise
 
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.world.mechanics import GRAVITY
-from stereoservo_sim.world.robots import Robot, urdf
+from stereoservo_sim.world.robots import Robot, roll_pitch_yaw, urdf
 from stereoservo_sim.world.velocity_drives import RigidPlant
 
 MAX_TORQUE = 1000.0
@@ -80,8 +79,9 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
         try:
             body = int(
                 bullet.loadURDF(
-                    str(path), robot.mounted[:3, 3].tolist(), _quaternion(robot.mounted), useFixedBase=True,
-                    physicsClientId=client,
+                    str(path), robot.mounted[:3, 3].tolist(),
+                    bullet.getQuaternionFromEuler(roll_pitch_yaw(robot.mounted).tolist()),
+                    useFixedBase=True, physicsClientId=client,
                 )
             )  # fmt: skip
         except bullet.error as error:
@@ -104,11 +104,6 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
             beside[k] = min(max(0.0, low), high) if low < high else 0.0
             bullet.resetJointState(body, k, beside[k], physicsClientId=client)
     return LoadedRobot(body, joints, links[robot.flange], beside, moving)
-
-
-def _quaternion(pose: FloatArray) -> list[float]:
-    """Unit quaternion (x, y, z, w) of the rotation of a pose (4, 4)."""
-    return [float(value) for value in Rotation.from_matrix(pose[:3, :3]).as_quat()]
 
 
 class PybulletPlant(RigidPlant):

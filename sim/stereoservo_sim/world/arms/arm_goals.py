@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.world.arms.arm_cell import LEVER, WIDEST, body_jacobian, seen_by_all
 from stereoservo_sim.world.camera_rig import inverse_pose
-from stereoservo_sim.world.robots import Robot, flange_pose, joint_frames
-from stereoservo_sim.world.simulated_cell import DEMO_GOALS, HAND_GOALS, SimulatedCell, demo_cell, hand_cell
+from stereoservo_sim.world.robots import RX90, Robot, flange_pose, joint_frames
+from stereoservo_sim.world.simulated_cell import DEMO_GOALS, HAND_GOALS, SimulatedCell
 
 DRAWN, ENOUGH = 600, 16
 """Configurations that are drawn at most, and good ones that are enough."""
@@ -36,8 +36,7 @@ def goals_of(cell: SimulatedCell) -> dict[str, FloatArray]:
     At them and on the ways there from the base, straight in the joints and, where the arm can, straight in space,
     every camera sees every marker, and no joint comes to its limit. Raises ValueError where there are fewer than three.
     """
-    embedded = {demo_cell().robot.name: (demo_cell(), hand_cell())}
-    if cell.robot.file is None and cell.robot.name in embedded:
+    if cell.robot is RX90:
         return DEMO_GOALS if cell.stand is None else HAND_GOALS
     straight = goes_straight(cell.robot, cell.base)
     good: list[tuple[float, float, FloatArray]] = []
