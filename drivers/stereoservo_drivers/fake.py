@@ -20,10 +20,9 @@ from stereoservo.ports.devices import (
     JointState,
 )
 from stereoservo_drivers.options import decode_options
-from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
+from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm, cell_of_context
 from stereoservo_drivers.simulated_camera import ArmByRow, CameraOptions, SimulatedCamera
 from stereoservo_sim.world.camera_rig import PinholeCamera
-from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.velocity_drives import DriveBank, IdealPlant, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -83,7 +82,11 @@ class FakeJointDriver(SimulatedArm):
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         decoded = decode_options(FakeJointOptions, options, self.driver)
-        cell = demo_cell()
+        if decoded.joints and decoded.urdf:
+            raise DriverError(
+                "option", "driver 'fake': joints and urdf both say which arm it is; one is valid"
+            )
+        cell = cell_of_context(options, context, self.driver)
         joints, base, robot = cell.robot.joints, cell.base, cell.robot if not decoded.joints else None
         if decoded.joints:
             joints = tuple(

@@ -15,9 +15,8 @@ from msgspec import Meta
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, DriverContext, DriverError, Frame
 from stereoservo_drivers.options import decode_options
-from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm
+from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm, cell_of_context
 from stereoservo_drivers.simulated_camera import ArmByRow, CameraOptions, SimulatedCamera
-from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.velocity_drives import Plant
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ class PybulletJointDriver(SimulatedArm):
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         decoded = decode_options(PybulletJointOptions, options, self.driver)
-        cell = demo_cell()
+        cell = cell_of_context(options, context, self.driver)
         super().__init__(decoded, context, cell.robot.joints, cell.base, cell.robot)
         self._arm = cell.robot
 
@@ -89,7 +88,16 @@ class PybulletCameraDriver(SimulatedCamera):
         settings = RenderSettings(
             blur_px=options.blur, noise_grey=options.noise, background=options.background
         )
-        return Renderer(self.cell, self.camera, settings)
+        try:
+            return Renderer(self.cell, self.camera, settings)
+        except Exception as error:
+            from stereoservo_sim.world.physics import (
+                PhysicsError,
+            )  # loaded where the background is pybullet's
+
+            if isinstance(error, PhysicsError):
+                raise DriverError("physics", str(error)) from error
+            raise
 
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator

@@ -21,18 +21,20 @@ from stereoservo.ports.devices import (
 )
 from stereoservo_drivers.kit.auxiliary import AuxiliaryMotion
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
+from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, place_of
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
 from stereoservo_sim.world.mechanical_plant import MechanicalPlant
 from stereoservo_sim.world.mechanics import MechanicsOption, chosen_mechanics, column, quantised
 from stereoservo_sim.world.robots import Robot
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.velocity_drives import DriveBank, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 
 
-class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of every simulated arm.
+class ArmOptions(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of every simulated arm, beside those on which arm it is and where (`ArmPlace`).
 
     ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the
     simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
@@ -42,7 +44,7 @@ class ArmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
-    start: dict[str, float] = {}
+    start: dict[str, float] = msgspec.field(default_factory=dict)
     resume: bool = True
     command_timeout_s: Positive = 0.1
     encoder: NonNegative = 1e-6
@@ -76,7 +78,11 @@ class SimulatedArm:
         self._context = context
         self._robot = robot
         try:
-            self._mechanics = chosen_mechanics(options.mechanics, [joint.name for joint in joints])
+            self._mechanics = chosen_mechanics(
+                options.mechanics,
+                [joint.name for joint in joints],
+                [joint.kind == "prismatic" for joint in joints],
+            )
         except ValueError as error:
             raise DriverError("option", f"driver {self.driver!r}: {error}") from error
         self._steps = np.full(len(joints), options.encoder)
@@ -111,6 +117,7 @@ class SimulatedArm:
             call_budget_us=self.call_budget_us,
             home=tuple(self._start.tolist()),
             auxiliary=self._options.auxiliary,
+            simulated=True,
         )
 
     def configure(self) -> None:
@@ -244,6 +251,14 @@ class SimulatedArm:
             )
         except HistoryError as error:
             raise DriverError("history", str(error), path=str(path)) from error
+
+
+def cell_of_context(arm: Mapping[str, Any], context: DriverContext, driver: str) -> SimulatedCell:
+    """The simulated cell of the options ``arm`` for a driver. Raises DriverError."""
+    try:
+        return cell_of(place_of(arm), context.mount, context.cell_dir)
+    except ValueError as error:
+        raise DriverError("option", f"driver {driver!r}: {error}") from error
 
 
 def _start(

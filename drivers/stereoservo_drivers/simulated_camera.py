@@ -12,8 +12,9 @@ from msgspec import Meta
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
+from stereoservo_drivers.simulated_arm import cell_of_context
 from stereoservo_sim.world.history import FILE_NAME, HistoryError, TrueJointHistory
-from stereoservo_sim.world.simulated_cell import SimulatedCell, simulated_cell, workpiece_cell
+from stereoservo_sim.world.simulated_cell import SimulatedCell, workpiece_cell
 from stereoservo_sim.world.workpiece import Moved, MovedFile, MovedFileError
 
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -319,11 +320,12 @@ class SimulatedCamera:
 
 def _cell_of(options: CameraOptions, context: DriverContext, driver: str) -> SimulatedCell:
     if not options.workpiece:
-        return simulated_cell(context.mount)
-    if context.mount != "eye_to_hand":
+        return cell_of_context(context.arm, context, driver)
+    if context.mount != "eye_to_hand" or context.arm.get("urdf"):
         raise DriverError(
             "option",
-            f"driver {driver!r}: workpiece: one is simulated before standing cameras only (mount 'eye_to_hand')",
+            f"driver {driver!r}: workpiece: one is simulated before standing cameras only (mount 'eye_to_hand'), and "
+            "the embedded arm",
             mount=context.mount,
         )
     return workpiece_cell()

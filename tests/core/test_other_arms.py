@@ -13,7 +13,7 @@ from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSetting
 from stereoservo.messages.goals import Enable, FeatureTarget, Goal, Request, RunGoal
 from stereoservo.ports.devices import CameraObservation, JointState
 from stereoservo_sim.world.exact_model import exact_model
-from stereoservo_sim.world.synthetic import SyntheticCell, gantry_with_wrist, scara, seven
+from stereoservo_sim.world.synthetic import SyntheticCell, gantry, gantry_with_wrist, pan_tilt, scara, seven
 
 PERIOD_NS = 10_000_000
 
@@ -31,7 +31,7 @@ class Loop:
         )  # fmt: skip
         self.model = exact_model(cell)
         cameras = tuple(
-            CameraSettings(c.name, c.width, c.height, 25.0, "eye_to_hand", cell.marker_ids)
+            CameraSettings(c.name, c.width, c.height, 25.0, cell.mount, cell.marker_ids)
             for c in self.model.cameras
         )
         self.core = ServoCore(
@@ -151,3 +151,81 @@ def test_arm_with_prismatic_joints_reaches() -> None:
     event = loop.run(loop.features(goal_q), law="cartesian2")
     assert event.kind == "goal_reached", event
     assert loop.error_px(goal_q) < 0.15
+
+
+@pytest.mark.parametrize(("law", "able"), [("cartesian3", False), ("cartesian2", False), ("stereo", True)])
+def test_a_law_of_components_that_the_arm_makes_only_together_is_refused_before_anything_moves(
+    law: str, able: bool
+) -> None:
+    """A face that is not square to a SCARA's axes: turned about them it revolves about its hinge and in its plane."""
+    level = scara()
+    c, s = np.cos(0.9), np.sin(0.9)
+    cell = level.with_body(level.body @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T)
+    loop = Loop(cell)
+    goal_q = cell.home + np.array([0.15, -0.2, 0.04, 0.4])
+    event = loop.run(loop.features(goal_q), law=law)
+    if able:
+        assert event.kind == "goal_reached", event
+        return
+    assert (event.kind, event.accepted, event.reasons[0].code) == ("reply", False, "NOT_REACHABLE"), event
+    assert "'stereo', 'image', 'points', 'trajectory'" in event.reasons[0].hint
+    assert np.array_equal(loop.q, cell.home)
+
+
+def of_markers(target: FeatureTarget, ids: tuple[int, ...]) -> FeatureTarget:
+    """The same goal, shown by these markers only."""
+    return FeatureTarget(
+        {camera: {i: pixels[i] for i in ids} for camera, pixels in target.set_points.items()}
+    )
+
+
+@pytest.mark.parametrize("law", ["stereo", "image", "cartesian3"])
+@pytest.mark.parametrize("shown", [1, 2])
+@pytest.mark.parametrize("arm", [scara, gantry])
+def test_one_point_and_two_are_goals_of_an_arm_of_few_freedoms(arm: Any, shown: int, law: str) -> None:
+    cell = arm()
+    loop = Loop(cell)
+    goal_q = cell.home + np.resize([0.15, -0.1, 0.04, 0.4], len(cell.home))
+    ids = cell.marker_ids[2 : 2 + shown]
+    event = loop.run(of_markers(loop.features(goal_q), ids), law=law)
+    assert event.kind == "goal_reached", event
+    apart = loop.cell.pixels(np.array([loop.q, goal_q]))[:, :, 2 : 2 + shown]
+    assert np.abs(apart[:, 0] - apart[:, 1]).max() < 0.15
+    moved = np.abs(loop.q - cell.home)
+    assert (
+        moved.max() < 2.0 * np.abs(goal_q - cell.home).max()
+    )  # and what a point leaves open is not driven about
+
+
+@pytest.mark.parametrize("law", ["stereo", "image"])
+def test_a_pan_tilt_head_turns_to_one_point(law: str) -> None:
+    cell = pan_tilt()
+    loop = Loop(cell)
+    goal_q = cell.home + np.array([0.12, -0.08])
+    event = loop.run(of_markers(loop.features(goal_q), cell.marker_ids[:1]), law=law)
+    assert event.kind == "goal_reached", event
+    assert np.abs(loop.q - goal_q).max() < 1e-3  # two angles, which one point in two cameras fixes
+
+
+def test_a_point_beyond_an_arms_freedoms_is_refused_with_the_nearest_that_it_reaches() -> None:
+    cell = pan_tilt()
+    loop = Loop(cell)
+    marker = cell.marker_ids[0]
+    shown = of_markers(loop.features(cell.home), (marker,))
+    apart = {
+        camera: {marker: (u + (20.0 if k else -20.0), v)}  # nearer than any turn of the head brings it
+        for k, (camera, pixels) in enumerate(shown.set_points.items())
+        for u, v in pixels.values()
+    }
+    event = loop.run(FeatureTarget(apart), law="stereo")
+    assert (event.kind, event.accepted) == ("reply", False)
+    assert event.reasons[0].code == "NOT_REACHABLE", event
+    assert event.reasons[0].value == pytest.approx(20.0, rel=0.2)
+    assert "nearest that they reach" in event.reasons[0].hint
+    assert np.array_equal(loop.q, cell.home)
+
+
+def test_an_arm_of_six_joints_needs_three_markers_still() -> None:
+    loop = Loop(gantry_with_wrist())
+    event = loop.run(of_markers(loop.features(loop.cell.home), loop.cell.marker_ids[:2]), law="stereo")
+    assert event.reasons[0].code == "TOO_FEW_MARKERS", event

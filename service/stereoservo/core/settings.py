@@ -10,7 +10,15 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS, UnknownLawError
-from stereoservo.messages.cell_file import MAX_MARKERS, CellFile, CellFileError, Mount, check_joints
+from stereoservo.messages.cell_file import (
+    MAX_MARKERS,
+    CellFile,
+    CellFileError,
+    JointLimit,
+    Mount,
+    check_joints,
+    check_limits,
+)
 from stereoservo.messages.goals import LawName, PointSource
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointKindName
@@ -166,6 +174,7 @@ def core_settings(
     ``cameras`` in the cell file's order, each with its detector's marker ids. ``speed_cap`` (0, 1] lowers the cell's
     speed scale (commissioning). Raises CellFileError where they do not fit.
     """
+    cell = completed(cell, joints)
     names = tuple(joint.name for joint in joints.joints)
     check_joints(cell, names)
     try:
@@ -230,6 +239,32 @@ def core_settings(
         reanchor=cell.servo.reanchor == "auto",
         resolution=tuple(joint.resolution for joint in joints.joints),
     )
+
+
+def completed(cell: CellFile, joints: JointDriverDescription) -> CellFile:
+    """The cell file with what it may leave out of a simulated arm: limits, and the base of the trial motions.
+
+    Raises CellFileError where what it does state does not fit.
+    """
+    if not joints.simulated:
+        return cell
+    safety, calibration = cell.safety, cell.calibration
+    if not safety.limit:
+        safety = msgspec.structs.replace(
+            safety,
+            limit=tuple(
+                JointLimit(j.name, j.position_min, j.position_max, j.velocity_max, j.acceleration_max)
+                for j in joints.joints
+            ),
+        )
+    if calibration is not None and joints.home:
+        home = {joint.name: value for joint, value in zip(joints.joints, joints.home, strict=True)}
+        calibration = msgspec.structs.replace(calibration, base={**home, **calibration.base})
+    if safety is cell.safety and calibration is cell.calibration:
+        return cell
+    found = msgspec.structs.replace(cell, safety=safety, calibration=calibration)
+    check_limits(found, cell.cell.name)
+    return found
 
 
 def _limit_settings(cell: CellFile, joints: JointDriverDescription, speed_cap: float) -> LimitSettings:

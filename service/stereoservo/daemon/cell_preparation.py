@@ -66,8 +66,9 @@ def describe_cell(
         "runtime_dir": runtime,
         "cell_dir": cell_path.parent,
         "seed": seed,
+        "arm": cell.arm_options,
     }
-    joint_context = DriverContext(**common)  # type: ignore[arg-type]
+    joint_context = DriverContext(**common, mount=cell.camera[0].mount)  # type: ignore[arg-type]
     with _named(cell_path, "joints.options"):
         joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
             cell.joints.options, joint_context

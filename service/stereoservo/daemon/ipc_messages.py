@@ -66,7 +66,8 @@ class RunPlan(msgspec.Struct, frozen=True):
             cell_dir=Path(self.cell_path).parent,
             camera="" if camera is None else camera.name,
             seed=self.seed,
-            mount="eye_to_hand" if camera is None else camera.mount,
+            mount=(camera or self.cell.camera[0]).mount,
+            arm=self.cell.arm_options,
         )
 
     def settings(self) -> CoreSettings:

@@ -278,7 +278,7 @@ class LockstepCell:
 
     def _make_drivers(self) -> None:
         self.joints: JointDriver = plugins.load(plugins.JOINT_DRIVERS, self.cell.joints.driver)(
-            self.cell.joints.options, self._driver_context("")
+            self.cell.joints.options, self._driver_context("", self.cell.camera[0].mount)
         )
         self.cameras: list[CameraDriver] = []
         self.detectors: list[Detector | None] = []
@@ -290,9 +290,11 @@ class LockstepCell:
             descriptions.append(describe_camera(section, camera, detector))
         self.descriptions = tuple(descriptions)
 
-    def _driver_context(self, camera: str, mount: Mount = "eye_to_hand") -> DriverContext:
+    def _driver_context(self, camera: str, mount: Mount) -> DriverContext:
         name, runtime_dir, cell_dir, seed = self._context
-        return DriverContext(self.clock, name, runtime_dir, cell_dir, camera, seed, self.services, mount)
+        return DriverContext(
+            self.clock, name, runtime_dir, cell_dir, camera, seed, self.services, mount, self.cell.arm_options
+        )
 
     def _open_camera(self, c: int) -> _ScheduledCamera:
         description = self.descriptions[c]

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS, OPTIONS, UnknownLawError
+from stereoservo.core.goals.marker_body import fewest_markers
 from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.messages.goals import (
     AdaptiveGain,
@@ -293,10 +294,11 @@ def check_features(target: FeatureTarget, context: GoalContext, where: str = "ta
             problems += _marker_of_camera(f"{place}.{marker}", marker, camera, context)
             problems += _inside(f"{place}.{marker}", pixel, camera)
             markers.add(marker)
-    if not problems and len(markers) < MIN_MARKERS:
+    needed = fewest_markers(len(context.settings.joint_names))
+    if not problems and len(markers) < needed:
         problems.append(
             f"{where}.set_points: {len(markers)} marker(s) ({listed(sorted(markers))}); at least "
-            f"{MIN_MARKERS} fix a pose"
+            f"{needed} fix a pose"
         )
     return problems
 
@@ -371,8 +373,11 @@ def check_points(target: PointTarget, context: GoalContext) -> list[str]:
     if problems:
         return problems
     ids = listed(sorted(target.points))
+    needed = fewest_markers(len(context.settings.joint_names))
+    if len(target.points) < needed:
+        return [f"target.points: {len(target.points)} marker(s) ({ids}); at least {needed} fix a pose"]
     if len(target.points) < MIN_MARKERS:
-        return [f"target.points: {len(target.points)} marker(s) ({ids}); at least {MIN_MARKERS} fix a pose"]
+        return []
     M = np.array(list(target.points.values()))
     singular = np.linalg.svd(M / np.linalg.norm(M, axis=1, keepdims=True), compute_uv=False)
     if not singular[2] > STRAIGHT * singular[0]:

@@ -127,9 +127,9 @@ class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[safety]``"""
+    """``[safety]``. A cell whose arm is simulated may leave ``limit`` out: then the machine's limits are the cell's."""
 
-    limit: tuple[JointLimit, ...]
+    limit: tuple[JointLimit, ...] = ()
     keep_out: tuple[KeepOut, ...] = ()
     coast_s: NonNegative = 0.5
     """How long a law may run on prediction alone when no camera delivers."""
@@ -158,10 +158,11 @@ class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``, then all at once.
 
-    A joint without a range goes outwards as far as the markers stay in every view, up to 0.6 rad or 0.2 m.
+    A joint without a range goes outwards as far as the markers stay in every view, up to 0.6 rad or 0.2 m. Of a
+    simulated arm the base may be left out.
     """
 
-    base: dict[str, float]
+    base: dict[str, float] = {}
     range: dict[str, Positive] = {}
     stops: Annotated[int, Meta(ge=4, le=200)] = 9
     frames: Annotated[int, Meta(ge=1, le=200)] = 5
@@ -227,9 +228,15 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scene: SceneSection = SceneSection()
     recording: RecordingSection = RecordingSection()
     emulate: dict[str, Any] = {}
-    """``[emulate.drives]``, ``[emulate.cameras]``: what `stereoservo emulate` puts in the place of the hardware; the
-    daemon does not read it.
+    """``[emulate.drives]``, ``[emulate.cameras]``: what `stereoservo emulate` puts in the place of the hardware; of
+    the daemon's processes only a simulated camera reads it (``arm_options``).
     """
+
+    @property
+    def arm_options(self) -> dict[str, Any]:
+        """Options that say which arm is simulated, if one is: of the emulated drives, else of the joint driver."""
+        drives = self.emulate.get("drives")
+        return drives if isinstance(drives, dict) else self.joints.options
 
 
 def load_cell_file(path: Path) -> CellFile:
@@ -282,7 +289,7 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
             f"{', '.join(f'{camera.name!r} is {camera.mount}' for camera in cell.camera)}; all cameras of a cell are "
             "mounted alike: mount them so, or take those that stand and those on the arm as cells of their own",
         )
-    _check_limits(cell, path)
+    check_limits(cell, path)
     return cell
 
 
@@ -302,7 +309,8 @@ def _check_numbers(value: Any, key: str, path: Path | str) -> None:
         raise CellFileError(path, key, "is an integer of more than 63 bits")
 
 
-def _check_limits(cell: CellFile, path: Path | str) -> None:
+def check_limits(cell: CellFile, path: Path | str) -> None:
+    """Check the joints' limits, and what is stated by joint against them. Raises CellFileError."""
     seen: list[str] = []
     for limit in cell.safety.limit:
         if limit.joint in seen:
@@ -335,6 +343,8 @@ def _check_limits(cell: CellFile, path: Path | str) -> None:
         sections.append((f"safety.keep_out {box.name!r}", dict(box.ranges)))
     for key, values in sections:
         for joint, value in values.items():
+            if not seen and not cell.safety.limit:
+                continue  # checked once the driver has told its joints' limits
             if joint not in seen:
                 raise CellFileError(
                     path,
@@ -453,4 +463,4 @@ _SECTIONS: dict[str, type[msgspec.Struct]] = {
 }  # fmt: skip
 
 
-__all__ = ["CellFile", "CellFileError", "check_cell", "check_joints", "load_cell_file"]
+__all__ = ["CellFile", "CellFileError", "check_cell", "check_joints", "check_limits", "load_cell_file"]

@@ -71,6 +71,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
 
     ``home``: a configuration in which the arm may well be (in joint order; empty: none is known).
     ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
+    ``simulated``: nothing real moves; then a cell file may leave limits and base out, and has these and ``home``.
     ``lacks``: which of ``efforts`` and ``following_errors`` its samples do not carry, as far as it is known beforehand.
     ``auxiliary``: joints and outputs beside them, of an :class:`AuxiliaryDriver`.
     """
@@ -85,6 +86,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     effort_units: tuple[str, ...] = ()
     lacks: tuple[Literal["efforts", "following_errors"], ...] = ()
     auxiliary: tuple[AuxiliarySpec, ...] = ()
+    simulated: bool = False
 
 
 class CameraDescription(msgspec.Struct, frozen=True):
@@ -187,7 +189,8 @@ class Clock(Protocol):
 class DriverContext:
     """Context of a driver, given to its constructor beside its own options.
 
-    ``camera``, ``mount``: of a camera driver or detector, as the cell file has them.
+    ``camera``: of a camera driver or detector, as the cell file has it. ``mount``: of the cell's cameras. ``arm``: what
+    the cell file says of a simulated arm (`messages.cell_file.CellFile.arm_options`), for the cameras that see it.
     """
 
     clock: Clock
@@ -199,6 +202,7 @@ class DriverContext:
     services: dict[str, Any] = field(default_factory=dict)
     """In-process objects shared between drivers of one process (lockstep: the simulated world)."""
     mount: Mount = "eye_to_hand"
+    arm: Mapping[str, Any] = field(default_factory=dict)
 
 
 @runtime_checkable

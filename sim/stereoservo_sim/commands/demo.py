@@ -32,9 +32,10 @@ from stereoservo_sim.demonstration.runner import (
     conduct_live,
     conduct_lockstep,
 )
-from stereoservo_sim.demonstration.scenario import GOALS
+from stereoservo_sim.demonstration.scenario import shown_goals
 from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.world.mechanics import PRESETS
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in PRESETS})  # type: ignore[misc]
 
@@ -73,7 +74,7 @@ def demo(
     """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
     try:
         path = Path(cell) if cell.endswith(".toml") else shipped_cell_path(cell)
-        _check(load_cell_file(path), lockstep)
+        truth = _checked(load_cell_file(path), path.parent, lockstep)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--cell") from error
     if law is not None and law not in LAWS:
@@ -84,7 +85,8 @@ def demo(
             path = with_mechanics(path, out, mechanics.value)
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint="--mechanics") from error
-    goals = GOALS if law is None else (replace(GOALS[0], law=law), *GOALS[1:])
+    first, *others = shown_goals(truth)
+    goals = (first if law is None else replace(first, law=law), *others)
     conduct = conduct_lockstep if lockstep else conduct_live
     started = time.monotonic()
     with _telling() as stage:
@@ -101,9 +103,9 @@ def demo(
         raise DemoFailedError(f"{'; '.join(result['problems'])}; report: {result['report']}")
 
 
-def _check(cell: CellFile, lockstep: bool) -> None:
-    """Check that a cell can be demonstrated, with a simulation that can be judged. Raises ValueError."""
-    true_cell(cell)
+def _checked(cell: CellFile, folder: Path, lockstep: bool) -> SimulatedCell:
+    """The simulation behind a cell that can be demonstrated, and judged by it. Raises ValueError."""
+    truth = true_cell(cell, folder)
     emulated = has_emulated_drives(cell)
     streams = [camera.name for camera in cell.camera if camera.driver == "video"]
     if streams and not has_emulated_cameras(cell):
@@ -125,6 +127,7 @@ def _check(cell: CellFile, lockstep: bool) -> None:
         raise ValueError(
             f"cell {cell.cell.name!r} drives real hardware; the demonstration needs emulated drives: [emulate.drives]"
         )
+    return truth
 
 
 @contextmanager

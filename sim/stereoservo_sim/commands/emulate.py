@@ -132,8 +132,9 @@ def _serve(
     try:
         with _named(path, "joints.options"):
             emulator = make_bus_emulator(
-                options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent
-            )
+                options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent,
+                mount=cell.camera[0].mount,
+            )  # fmt: skip
     except BaseException:
         endpoint.close()
         raise
@@ -171,8 +172,8 @@ def _cameras(settings: _Settings, termination: Termination) -> None:
     with _named(path, "emulate.cameras"):
         try:
             serve_cameras(
-                load_cell_file(path), channel=settings.channel, orders=settings.orders, as_json=settings.as_json,
-                ended=lambda: termination.asked,
+                load_cell_file(path), path.parent, channel=settings.channel, orders=settings.orders,
+                as_json=settings.as_json, ended=lambda: termination.asked,
             )  # fmt: skip
         except FaultCommandError as error:
             raise typer.BadParameter(str(error), param_hint="--order") from error

@@ -9,7 +9,6 @@ from pathlib import Path
 from stereoservo.messages.cell_file import CellFile
 from stereoservo_sim.world.mechanics import MechanicsPreset
 
-SECTION = re.compile(r"^\[joints\.options\]\s*(?:#.*)?$", re.MULTILINE)
 HEADING = re.compile(r"^\[", re.MULTILINE)
 SOURCE = re.compile(r"^(\s*source\s*=\s*)\"http://127\.0\.0\.1:\d+/", re.MULTILINE)
 ANY_SERVER = "http://127.0.0.1:0"
@@ -48,12 +47,8 @@ def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
     Raises ValueError where the file has no ``[joints.options]`` with a ``channel``.
     """
     text = cell_path.read_text(encoding="utf-8")
-    options = tomllib.loads(text).get("joints", {}).get("options", {})
     text = _replaced(text, "channel", channel, cell_path)
-    eds = options.get("eds", "")
-    if eds:
-        text = _replaced(text, "eds", str(cell_path.parent.absolute() / eds), cell_path)
-    return _written(text, cell_path, folder)
+    return _written(_with_its_files(text, cell_path), cell_path, folder)
 
 
 def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Path:
@@ -85,10 +80,20 @@ def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Pa
         raise ValueError(
             f"{cell_path}: mechanics cannot be put into [{section}] ({error}): state them as one line there"
         ) from error
+    return _written(_with_its_files(text, cell_path), cell_path, folder)
+
+
+def _with_its_files(text: str, cell_path: Path) -> str:
+    """``text`` of a cell file with what it names relative to itself named from everywhere."""
+    tree = tomllib.loads(text)
     eds = tree["joints"].get("options", {}).get("eds", "")
     if eds:
         text = _replaced(text, "eds", str(cell_path.parent.absolute() / eds), cell_path)
-    return _written(text, cell_path, folder)
+    drives = tree.get("emulate", {}).get("drives")
+    section = "joints.options" if drives is None else "emulate.drives"
+    urdf = (tree["joints"].get("options", {}) if drives is None else drives).get("urdf", "")
+    own = cell_path.parent.absolute() / urdf
+    return _replaced(text, "urdf", str(own), cell_path, section) if urdf and own.is_file() else text
 
 
 def _written(text: str, cell_path: Path, folder: Path) -> Path:
@@ -99,9 +104,9 @@ def _written(text: str, cell_path: Path, folder: Path) -> Path:
     return copy
 
 
-def _replaced(text: str, key: str, value: str, path: Path) -> str:
-    """``text`` with ``key`` of ``[joints.options]`` set to the string ``value``."""
-    section = SECTION.search(text)
+def _replaced(text: str, key: str, value: str, path: Path, name: str = "joints.options") -> str:
+    """``text`` with ``key`` of the section ``name`` set to the string ``value``."""
+    section = re.search(rf"^\[{re.escape(name)}\]\s*(?:#.*)?$", text, re.MULTILINE)
     if section is not None:
         end = HEADING.search(text, section.end())
         body = text[section.end() : end.start() if end else len(text)]
@@ -113,6 +118,4 @@ def _replaced(text: str, key: str, value: str, path: Path) -> str:
         )
         if count == 1:
             return text[: section.end()] + changed + (text[end.start() :] if end else "")
-    raise ValueError(
-        f"{path}: needs a line `{key} = …` under [joints.options], to be run with emulated drives"
-    )
+    raise ValueError(f"{path}: needs a line `{key} = …` under [{name}], to be run from a copy")

@@ -16,7 +16,6 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.demonstration.judge import Judgement, RecordedDemonstration
 from stereoservo_sim.demonstration.report import CalibrationPlots, GoalPlots, ReportData, write_report
 from stereoservo_sim.demonstration.runner import Demonstration
-from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 TRACK_POINTS = 200
@@ -27,8 +26,9 @@ def write_pages(
 ) -> None:
     """Write the report. Raises OSError."""
     cell = demonstration.cell
-    truth = true_cell(cell)
-    limits = {limit.joint: limit.velocity for limit in cell.safety.limit}
+    truth = demonstration.truth
+    limits = {joint.name: joint.velocity_max for joint in truth.robot.joints}
+    limits.update({limit.joint: limit.velocity for limit in cell.safety.limit})
     mode = "lockstep, virtual time" if demonstration.lockstep else "real processes over zenoh"
     facts = {
         "mode": mode,

@@ -12,7 +12,6 @@ from stereoservo_sim.demonstration.judge import Judgement, judge_goal, read_flig
 from stereoservo_sim.demonstration.overview import write_overview
 from stereoservo_sim.demonstration.report_pages import write_pages
 from stereoservo_sim.demonstration.runner import Demonstration
-from stereoservo_sim.demonstration.truth import true_cell
 
 MAX_ERROR_PX = 0.3
 MAX_ERROR_MM = 0.5
@@ -24,7 +23,7 @@ def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     ``seconds``: how long the demonstration took. Raises RecordingError, LookupError where a goal was never flown.
     """
     flight = read_flight(demonstration.recording)
-    truth = true_cell(demonstration.cell)
+    truth = demonstration.truth
     goals = [
         judge_goal(
             goal.name, goal.law, demonstration.outcomes[goal.name], flight, demonstration.truth_t,

@@ -27,11 +27,12 @@ from stereoservo_sim.demonstration.emulated import (
 )
 from stereoservo_sim.demonstration.live_demonstrator import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep_demonstrator import LockstepDemonstrator
-from stereoservo_sim.demonstration.scenario import GOALS, Calibrated, ShownGoal, perform
-from stereoservo_sim.demonstration.truth import TruthLog
+from stereoservo_sim.demonstration.scenario import Calibrated, ShownGoal, perform, shown_goals
+from stereoservo_sim.demonstration.truth import TruthLog, true_cell
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
+from stereoservo_sim.world.arms.arm_goals import goals_of
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.simulated_cell import goals_of
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 
 class DemoFailedError(Exception):
@@ -61,18 +62,25 @@ class Demonstration:
     loop: LoopInfo | None
     seed: int
     lockstep: bool
-    goals: Sequence[ShownGoal] = GOALS
+    truth: SimulatedCell
+    goals: Sequence[ShownGoal]
 
 
 def conduct_lockstep(
-    cell_path: Path, out: Path, seed: int, stage: DemonstrationProgress, goals: Sequence[ShownGoal] = GOALS
+    cell_path: Path,
+    out: Path,
+    seed: int,
+    stage: DemonstrationProgress,
+    goals: Sequence[ShownGoal] | None = None,
 ) -> Demonstration:
-    """Run in one process in virtual time; deterministic given the seed."""
+    """Run in one process in virtual time; deterministic given the seed. ``goals``: by default those of the arm."""
     cell = load_cell_file(cell_path)
+    truth = true_cell(cell, cell_path.parent)
+    goals = shown_goals(truth) if goals is None else goals
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
     with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
-        history = TrueJointHistory.in_memory(len(cell.safety.limit), capacity=1 << 16)
+        history = TrueJointHistory.in_memory(len(truth.base), capacity=1 << 16)
         with LockstepCell(
             cell, cell_dir=cell_path.parent, runtime_dir=Path(scratch), seed=seed, recording=recording,
             services={"world": history},
@@ -83,19 +91,15 @@ def conduct_lockstep(
             calibrated, outcomes = perform(
                 LockstepDemonstrator(lockstep, seed, stage.progress),
                 names,
-                _configurations(cell),
+                goals_of(truth),
                 stage.tell,
                 goals,
             )
             times, positions = log.end()
     save_model(calibrated.model, out / "model.json")
     return Demonstration(
-        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True, goals
+        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True, truth, goals
     )
-
-
-def _configurations(cell: CellFile) -> dict[str, FloatArray]:
-    return goals_of(cell.camera[0].mount)
 
 
 def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], None]:
@@ -111,10 +115,19 @@ def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], No
 
 
 def conduct_live(
-    cell_path: Path, out: Path, seed: int, stage: DemonstrationProgress, goals: Sequence[ShownGoal] = GOALS
+    cell_path: Path,
+    out: Path,
+    seed: int,
+    stage: DemonstrationProgress,
+    goals: Sequence[ShownGoal] | None = None,
 ) -> Demonstration:
-    """Run with real processes: a daemon in directories of its own, and a client over zenoh."""
+    """Run with real processes: a daemon in directories of its own, and a client over zenoh. ``goals``: by default those
+    of the arm.
+    """
     cell = load_cell_file(cell_path)
+    truth = true_cell(cell, cell_path.parent)
+    goals = shown_goals(truth) if goals is None else goals
+    configurations = goals_of(truth)
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
     with ExitStack() as ends:
@@ -134,7 +147,7 @@ def conduct_live(
             with Client(cell.cell.name) as client:
                 names = tuple(joint.name for joint in client.info().joints)
                 calibrated, outcomes = perform(
-                    LiveDemonstrator(client, stage.progress), names, _configurations(cell), stage.tell, goals
+                    LiveDemonstrator(client, stage.progress), names, configurations, stage.tell, goals
                 )
                 loop = client.status().loop
             times, positions = log.end()
@@ -143,7 +156,7 @@ def conduct_live(
                 raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
     save_model(calibrated.model, out / "model.json")
     return Demonstration(
-        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False, goals
+        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False, truth, goals
     )
 
 

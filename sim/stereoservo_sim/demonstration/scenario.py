@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -13,6 +13,8 @@ from stereoservo.kinematics.joint_reprojection import joint_problem, seen_chain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import DisplacementTarget, LawName, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.arms.arm_goals import goes_straight
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 TEACH_FRAMES = 20
 SEEN_FRAMES = 20
@@ -27,7 +29,7 @@ JUDGE_S = 1.2  # rest after a goal, of which one second is judged
 
 @dataclass(frozen=True)
 class ShownGoal:
-    """A goal of the demonstration, one of ``world.goals_of``: the law that reaches it, and the kind of its target.
+    """A goal of the demonstration, one of ``arm_goals.goals_of``: the law that reaches it, and the kind of its target.
 
     ``taught``: by its name, the pixels that were shown. ``displacement``: by what the body has to do from where it is,
     a projective 4x4 in the model's frame, without a pixel of the goal.
@@ -44,6 +46,20 @@ GOALS = (
     ShownGoal("far", "trajectory", "displacement"),
 )
 """From home: 29, 180 and 94 degrees of rotation, 0.12, 0.14 and 0.37 m; see ``world``."""
+
+
+def shown_goals(cell: SimulatedCell) -> tuple[ShownGoal, ...]:
+    """The goals of a cell's demonstration, with laws that its arm can follow.
+
+    An arm of few freedoms cannot turn a face about its hinge and in its plane, each for itself, as the Cartesian laws
+    do; one that does not reach on a straight way what it reaches takes a law in the images there, too.
+    """
+    robot = cell.robot
+    if len(robot.joints) >= 6 or robot.prismatic.all():
+        return GOALS
+    near, roll, far = GOALS
+    bent = far if goes_straight(robot, cell.base) else replace(far, law="stereo")
+    return near, replace(roll, law="image"), bent
 
 
 @dataclass(frozen=True)

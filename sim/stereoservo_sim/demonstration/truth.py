@@ -16,22 +16,26 @@ from stereoservo.messages.cell_file import CameraSection, CellFile
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.emulators.cameras.stream_settings import cameras_of_cell
 from stereoservo_sim.emulators.fault_engine import EmulationError
+from stereoservo_sim.world.arms.arm_cell import cell_of, place_of
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
-from stereoservo_sim.world.simulated_cell import SimulatedCell, simulated_cell, workpiece_cell
+from stereoservo_sim.world.simulated_cell import SimulatedCell, workpiece_cell
 from stereoservo_sim.world.workpiece import Moved
 
 POLL_S = 1.0
 
 
-def true_cell(cell: CellFile) -> SimulatedCell:
-    """Simulated cell behind a cell file's cameras: their mount, lenses, workpiece, by the cell file's names.
+def true_cell(cell: CellFile, folder: Path = Path()) -> SimulatedCell:
+    """Simulated cell behind a cell file's cameras: its arm, their mount, lenses, workpiece, by the cell file's names.
+    ``folder``: of the cell file.
 
     Cameras of driver ``video`` show what ``[emulate.cameras]`` puts at their address. Raises ValueError where a camera
-    is none of the simulated rig.
+    is none of the simulated rig, and where the arm cannot be simulated.
     """
     options = [_simulated_options(section, cell) for section in cell.camera]
     shown = any(option.get("workpiece", False) for option in options)
-    simulated = workpiece_cell() if shown else simulated_cell(cell.camera[0].mount)
+    simulated = (
+        workpiece_cell() if shown else cell_of(place_of(cell.arm_options), cell.camera[0].mount, folder)
+    )
     cameras = []
     for section, option in zip(cell.camera, options, strict=True):
         view = option.get("view") or section.name

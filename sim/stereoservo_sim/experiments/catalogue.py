@@ -78,6 +78,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(12),),
         ),
         Experiment(
+            "shipped-arms",
+            "self-calibration of the shipped arms (panda, iiwa, xarm, scara, gantry, pan_tilt, rx90), near their bases",
+            "arms.shipped_arms",
+            (repetitions(5), Option("cell", str, "one of these arms alone")),
+        ),
+        Experiment(
             "random-lenses",
             "the random rigs behind lenses with k1, k2 and tangential terms: usable, wrong, refused by cause",
             "arms.random_lenses",

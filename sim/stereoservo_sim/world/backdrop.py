@@ -94,7 +94,7 @@ class PybulletBackdrop(Backdrop):
         if self._client < 0:
             raise PhysicsError("pybullet refuses another simulation in this process")
         self._cell = cell
-        self._arm = load_robot(self._bullet, self._client, cell.robot)
+        self._loaded = load_robot(self._bullet, self._client, cell.robot)
         floor = self._bullet.createVisualShape(
             self._bullet.GEOM_BOX,
             halfExtents=[3, 3, 0.01],
@@ -109,8 +109,8 @@ class PybulletBackdrop(Backdrop):
 
     def draw(self, q: FloatArray) -> ImageArray:
         """Image of the arm at ``q`` (n,) [rad]."""
-        for joint, position in enumerate(q.tolist()):
-            self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
+        for joint, position in zip(self._loaded.joints, q.tolist(), strict=True):
+            self._bullet.resetJointState(self._loaded.body, joint, position, physicsClientId=self._client)
         camera = self._cell.in_world(self._camera, q)
         view = (np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.world_to_camera).T.ravel().tolist()
         _, _, rgba, _, _ = self._bullet.getCameraImage(

@@ -74,7 +74,10 @@ def exact_simulated_model(cell: SimulatedCell, seed: int) -> CellModel:
     """Model of the simulated cell with its base as zero, in a projective frame that ``seed`` draws."""
     frames, flange = joint_frames(cell.robot, cell.base)
     generators = np.zeros((len(cell.base), 4, 4))
-    for twist, frame in zip(generators, frames, strict=True):
+    for twist, frame, joint in zip(generators, frames, cell.robot.joints, strict=True):
+        if joint.kind == "prismatic":
+            twist[:3, 3] = frame[:3, 2]
+            continue
         x, y, z = frame[:3, 2]
         twist[:3, :3] = [(0, -z, y), (z, 0, -x), (-y, x, 0)]
         twist[:3, 3] = -twist[:3, :3] @ frame[:3, 3]
@@ -89,7 +92,7 @@ def exact_simulated_model(cell: SimulatedCell, seed: int) -> CellModel:
     points = points @ inverse.T
     return CellModel(
         schema=MODEL_SCHEMA, epoch=3, joint_names=cell.robot.joint_names,
-        joint_kinds=("revolute",) * len(cell.base),
+        joint_kinds=tuple(joint.kind for joint in cell.robot.joints),
         zero=cell.base, generators=inverse @ generators @ H,
         cameras=tuple(CameraModel(c.name, c.P @ H, c.width, c.height, c.lens) for c in cell.rig.cameras),
         marker_ids=tuple(int(i) for i in cell.body.ids), marker_points=points / (points @ plane)[:, None],

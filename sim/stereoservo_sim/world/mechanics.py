@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo_sim.world.robots import Robot, joint_frames
 
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -98,6 +98,10 @@ MechanicsOption = Literal["none", "strain_wave", "planetary_qdd", "serial_servo"
 """As in a cell file: a preset for all joints, or a table by joint; a joint that is left out is perfect."""
 
 
+PINION = 0.02
+"""Travel of a prismatic joint of a preset to a turn of its gear by one radian [m]: a pinion of this radius."""
+
+
 def preset(name: MechanicsPreset, joints: int) -> tuple[Mechanics, ...]:
     """Mechanics of all joints after a preset; ripple phases a golden angle apart, since gears are not aligned.
 
@@ -111,15 +115,27 @@ def preset(name: MechanicsPreset, joints: int) -> tuple[Mechanics, ...]:
     )
 
 
-def chosen_mechanics(option: MechanicsOption, joint_names: Sequence[str]) -> tuple[Mechanics, ...] | None:
+def behind_pinion(joint: Mechanics) -> Mechanics:
+    """Mechanics [m] of a prismatic joint that a gear of mechanics ``joint`` [rad] drives by a pinion."""
+    lengths = ("encoder_step", "ripple", "play", "sag", "dead_band", "dead_speed", "zero_drift")
+    scaled = {name: getattr(joint, name) * PINION for name in lengths}
+    return msgspec.structs.replace(joint, ripple_order=joint.ripple_order / PINION, **scaled)
+
+
+def chosen_mechanics(
+    option: MechanicsOption, joint_names: Sequence[str], prismatic: Sequence[bool] = ()
+) -> tuple[Mechanics, ...] | None:
     """Mechanics of a cell file's joints, or None where there are none.
 
-    Raises ValueError for unknown joints, and for a first joint that is coupled to a previous one.
+    ``prismatic``: of which joints a preset's gear drives a pinion; empty: of none. Raises ValueError for unknown
+    joints, and for a first joint that is coupled to a previous one.
     """
     if option == "none" or option == {}:
         return None
     if isinstance(option, str):
-        return preset(option, len(joint_names))
+        gears = preset(option, len(joint_names))
+        straight = prismatic or (False,) * len(gears)
+        return tuple(behind_pinion(gear) if one else gear for gear, one in zip(gears, straight, strict=True))
     for name in option:
         if name not in joint_names:
             raise ValueError(f"mechanics: no joint {name!r}; joints: {', '.join(joint_names)}")
@@ -198,48 +214,51 @@ def gear_offset(mechanics: Sequence[Mechanics], motor: FloatArray) -> FloatArray
 
 def gravity_torques(
     points: FloatArray, axes: FloatArray, centres: FloatArray, masses: FloatArray,
-    gravity: FloatArray = GRAVITY,
+    gravity: FloatArray = GRAVITY, prismatic: BoolArray | None = None,
 ) -> FloatArray:  # fmt: skip
-    """Torques (n,) [N m] of gravity about revolute joints, positive about their axes.
+    """Torques (n,) [N m] of gravity about revolute joints, positive about their axes; forces [N] along prismatic ones.
 
     ``points``, ``axes`` (n, 3): on and along each joint's axis. ``centres`` (n, 3) [m], ``masses`` (n,) [kg]: of the
-    link after each joint; joint i carries the links i, …, n - 1. ``gravity`` (3,) [m/s²].
+    link after each joint; joint i carries the links i, …, n - 1. ``gravity`` (3,) [m/s²]. ``prismatic`` (n,): which
+    joints are; None: none.
     """
     weights = masses[::-1].cumsum()[::-1]
     moments = (masses[:, None] * centres)[::-1].cumsum(axis=0)[::-1]
     levers = moments - weights[:, None] * points
     torques: FloatArray = np.einsum("ij,ij->i", axes, np.cross(levers, gravity))
+    if prismatic is not None and prismatic.any():
+        torques = np.where(prismatic, weights * (axes @ gravity), torques)
     return torques
 
 
 def gravity_load(robot: Robot, q: FloatArray) -> FloatArray:
     """Loads (n,) of a robot at ``q`` (n,): gravity torques over a bound of what each joint can have to bear."""
     frames, _ = joint_frames(robot, q)
-    local, masses, bounds = _masses(robot)
-    centres = np.einsum("nij,nj->ni", frames[:, :3, :3], local) + frames[:, :3, 3]
-    return gravity_torques(frames[:, :3, 3], frames[:, :3, 2], centres, masses) / bounds
+    centres = np.einsum("nij,nj->ni", frames[:, :3, :3], robot.centres) + frames[:, :3, 3]
+    torques = gravity_torques(
+        frames[:, :3, 3], frames[:, :3, 2], centres, robot.masses, prismatic=robot.prismatic
+    )
+    return torques / largest_torques(robot)
 
 
 @lru_cache(maxsize=8)
-def _masses(robot: Robot) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Centres of the links in their frames (n, 3), masses (n,), and torques (n,) with the arm stretched out."""
-    count = len(robot.dh)
-    centres = np.zeros((count, 3))
-    for link in range(count):
-        ends = [end for s in robot.shapes if s.link == link + 1 for end in (s.start, s.end)]
-        if ends:
-            corners = np.array(ends)
-            centres[link] = 0.5 * (corners.max(axis=0) + corners.min(axis=0))
-    masses = np.array(robot.masses)
-    steps = [float(np.hypot(a, d)) for a, _, d in robot.dh]
-    reach = np.linalg.norm(centres, axis=1)
+def largest_torques(robot: Robot) -> FloatArray:
+    """Bounds (n,) of gravity torques [N m] with the arm stretched out; of forces [N] on prismatic joints."""
+    count = len(robot.joints)
+    steps = np.linalg.norm(robot.links[:, :3, 3], axis=1)
+    steps = steps + [
+        max(abs(j.position_min), abs(j.position_max)) if j.kind == "prismatic" else 0.0 for j in robot.joints
+    ]
+    reach = np.linalg.norm(robot.centres, axis=1)
     bounds = np.array(
         [
-            sum(masses[k] * (sum(steps[j:k]) + reach[k]) for k in range(j, count)) * float(np.abs(GRAVITY[2]))
+            robot.masses[j:].sum()
+            if robot.prismatic[j]
+            else sum(robot.masses[k] * (steps[j:k].sum() + reach[k]) for k in range(j, count))
             for j in range(count)
         ]
     )
-    return centres, masses, np.maximum(bounds, 1e-9)
+    return np.maximum(bounds * float(np.abs(GRAVITY[2])), 1e-9)
 
 
 def horizontal_load(q: FloatArray) -> FloatArray:

@@ -6,13 +6,17 @@ import ctypes
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.world.robots import Robot, urdf
+from stereoservo_sim.world.mechanics import GRAVITY
+from stereoservo_sim.world.robots import Robot, roll_pitch_yaw, urdf
 from stereoservo_sim.world.velocity_drives import RigidPlant
 
 MAX_TORQUE = 1000.0
@@ -23,10 +27,9 @@ class PhysicsError(Exception):
     """pybullet cannot be used; the message holds the cause."""
 
 
-def import_pybullet() -> Any:
-    """Import pybullet without the message that its C code prints. Raises PhysicsError."""
-    if "pybullet" in sys.modules:
-        return sys.modules["pybullet"]
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what C code prints."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(descriptor) for descriptor in (1, 2)]
@@ -34,24 +37,73 @@ def import_pybullet() -> Any:
         with open(os.devnull, "wb") as sink:
             os.dup2(sink.fileno(), 1)
             os.dup2(sink.fileno(), 2)
-            import pybullet
-
+            yield
             ctypes.CDLL(None).fflush(None)  # what sits in C's own buffers
-    except ImportError as error:
-        raise PhysicsError(f"pybullet cannot be imported: {error}") from error
     finally:
         for descriptor, copy in zip((1, 2), kept, strict=True):
             os.dup2(copy, descriptor)
             os.close(copy)
+
+
+def import_pybullet() -> Any:
+    """Import pybullet without the message that its C code prints. Raises PhysicsError."""
+    if "pybullet" in sys.modules:
+        return sys.modules["pybullet"]
+    try:
+        with _quiet():
+            import pybullet
+    except ImportError as error:
+        raise PhysicsError(f"pybullet cannot be imported: {error}") from error
     return pybullet
 
 
-def load_robot(bullet: Any, client: int, robot: Robot) -> int:
-    """Load an arm into a simulation; returns its body number."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{robot.name}.urdf"
-        path.write_text(urdf(robot))
-        return int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+@dataclass(frozen=True)
+class LoadedRobot:
+    """An arm in a simulation: its body's number there, the indices of its joints, and of the link of the flange;
+    ``beside``: joints that are not the arm's, with the positions where they rest; ``moving``: all joints that move.
+    """
+
+    body: int
+    joints: list[int]
+    flange: int
+    beside: dict[int, float]
+    moving: list[int]
+
+
+def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
+    """Load an arm into a simulation, the joints beside it at rest. Raises PhysicsError where the engine cannot."""
+    with tempfile.TemporaryDirectory() as folder, _quiet():
+        path = robot.file or Path(folder) / f"{robot.name}.urdf"
+        if robot.file is None:
+            path.write_text(urdf(robot))
+        try:
+            body = int(
+                bullet.loadURDF(
+                    str(path), robot.mounted[:3, 3].tolist(),
+                    bullet.getQuaternionFromEuler(roll_pitch_yaw(robot.mounted).tolist()),
+                    useFixedBase=True, physicsClientId=client,
+                )
+            )  # fmt: skip
+        except bullet.error as error:
+            raise PhysicsError(
+                f"pybullet cannot load {path}: {error} (are its meshes where it says? driver 'fake' and "
+                "background = 'arm' need none)"
+            ) from error
+    infos = [
+        bullet.getJointInfo(body, k, physicsClientId=client)
+        for k in range(bullet.getNumJoints(body, physicsClientId=client))
+    ]
+    index = {info[1].decode(): k for k, info in enumerate(infos)}
+    links = {info[12].decode(): k for k, info in enumerate(infos)}
+    moving = [k for k, info in enumerate(infos) if info[2] != bullet.JOINT_FIXED]
+    joints = [index[joint.name] for joint in robot.joints]
+    beside = {}
+    for k in moving:
+        low, high = infos[k][8:10]
+        if k not in joints:
+            beside[k] = min(max(0.0, low), high) if low < high else 0.0
+            bullet.resetJointState(body, k, beside[k], physicsClientId=client)
+    return LoadedRobot(body, joints, links[robot.flange], beside, moving)
 
 
 class PybulletPlant(RigidPlant):
@@ -70,10 +122,11 @@ class PybulletPlant(RigidPlant):
         self._gains = [POSITION_GAIN] * self._count
         self._velocity_gains = [1.0] * self._count
         self._bullet.setTimeStep(step_s, physicsClientId=self._client)
-        self._bullet.setGravity(0, 0, -9.81, physicsClientId=self._client)
-        self._arm = load_robot(self._bullet, self._client, robot)
-        self._joints = list(range(self._count))
-        for joint in self._joints:
+        self._mounted = robot.mounted[:3, :3]
+        self._pull(GRAVITY)
+        loaded = load_robot(self._bullet, self._client, robot)
+        self._loaded, self._arm, self._joints = loaded, loaded.body, loaded.joints
+        for joint in loaded.moving:
             self._bullet.changeDynamics(
                 self._arm,
                 joint,
@@ -82,7 +135,16 @@ class PybulletPlant(RigidPlant):
                 jointDamping=0,
                 physicsClientId=self._client,
             )
+        self._places = [loaded.moving.index(joint) for joint in loaded.joints]
+        for joint, rest in loaded.beside.items():
+            self._bullet.setJointMotorControl2(
+                self._arm, joint, self._bullet.POSITION_CONTROL, targetPosition=rest, force=MAX_TORQUE,
+                physicsClientId=self._client,
+            )  # fmt: skip
         self.place(positions)
+
+    def _pull(self, gravity: FloatArray) -> None:
+        self._bullet.setGravity(*gravity.tolist(), physicsClientId=self._client)
 
     def place(self, positions: FloatArray) -> None:
         """Set the joints to ``positions`` (n,), at rest, without moving there."""
@@ -90,12 +152,16 @@ class PybulletPlant(RigidPlant):
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         self.positions = positions.copy()
         self.velocities = np.zeros(self._count)
-        still = [0.0] * self._count
-        self.efforts = np.array(
-            self._bullet.calculateInverseDynamics(
-                self._arm, positions.tolist(), still, still, physicsClientId=self._client
-            )
+        rests = [self._loaded.beside.get(joint, 0.0) for joint in self._loaded.moving]
+        for place, position in zip(self._places, positions.tolist(), strict=True):
+            rests[place] = position
+        still = [0.0] * len(rests)
+        self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's axes for the world's
+        balanced = self._bullet.calculateInverseDynamics(
+            self._arm, rests, still, still, physicsClientId=self._client
         )
+        self._pull(GRAVITY)
+        self.efforts = np.array(balanced)[self._places]
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Advance by ``h`` [s], one step of the engine, towards set-points (n,), (n,)."""
@@ -119,7 +185,7 @@ class PybulletPlant(RigidPlant):
     def flange(self) -> FloatArray:
         """Pose (4, 4) of the flange as the engine sees it, for checks against the closed form."""
         state = self._bullet.getLinkState(
-            self._arm, self._count, computeForwardKinematics=True, physicsClientId=self._client
+            self._arm, self._loaded.flange, computeForwardKinematics=True, physicsClientId=self._client
         )
         pose = np.eye(4)
         pose[:3, :3] = np.array(self._bullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)

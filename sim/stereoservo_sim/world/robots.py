@@ -1,17 +1,20 @@
-"""Serial arms from classic Denavit-Hartenberg rows: forward kinematics, shapes, and URDF.
+"""Serial arms: forward kinematics, shapes, and URDF text; one of Denavit-Hartenberg rows.
 
 This is the simulation's truth. Nothing of it reaches the service, which learns the arm from images.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import JointSpec
+
+NO_EXTENT = 0.02
+"""Radius [m] of what a link without shapes is taken for where its inertia is asked for."""
 
 
 @dataclass(frozen=True)
@@ -24,58 +27,69 @@ class Capsule:
     radius: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Robot:
-    """A revolute arm: ``dh`` rows (a [m], alpha [rad], d [m]), one a joint; ``joints`` the machine's
-    limits.
+    """A serial arm of ``n`` joints, each about or along the z axis of its frame; ``joints`` the machine's limits.
+
+    ``base`` (4, 4): the first joint's frame in the world at its zero. ``links`` (n, 4, 4): from each joint's frame,
+    moved, to the next one's at its zero, the last to the flange. ``masses`` (n,) [kg] and ``centres`` (n, 3) [m] of the
+    links in their joints' frames. Shapes of link 0 are in the world. ``file``: the URDF that it was read from, mounted
+    at ``mounted`` (4, 4) in the world, with the flange at its link ``flange``.
     """
 
     name: str
-    dh: tuple[tuple[float, float, float], ...]
+    base: FloatArray
+    links: FloatArray
     joints: tuple[JointSpec, ...]
-    masses: tuple[float, ...]
+    masses: FloatArray
+    centres: FloatArray
     shapes: tuple[Capsule, ...]
+    file: Path | None = None
+    mounted: FloatArray = field(default_factory=lambda: np.eye(4))
+    flange: str = "flange"
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints, base first."""
         return tuple(joint.name for joint in self.joints)
 
+    @property
+    def prismatic(self) -> BoolArray:
+        """Which joints move along their axes, (n,)."""
+        return np.array([joint.kind == "prismatic" for joint in self.joints])
 
-def _tail(a: float, alpha: float, d: float) -> FloatArray:
-    """Transform (4, 4) after the joint's rotation in a classic row: Tz(d) Tx(a) Rx(alpha)."""
+
+def link_of_row(a: float, alpha: float, d: float) -> FloatArray:
+    """Transform (4, 4) after the joint's rotation in a classic row, a, d [m], alpha [rad]: Tz(d) Tx(a) Rx(alpha)."""
     c, s = np.cos(alpha), np.sin(alpha)
     return np.array([[1, 0, 0, a], [0, c, -s, 0], [0, s, c, d], [0, 0, 0, 1.0]])
 
 
-@lru_cache(maxsize=8)
-def _tails(robot: Robot) -> FloatArray:
-    return np.stack([_tail(*row) for row in robot.dh])
-
-
 def joint_frames(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Link poses in the world, (n, 4, 4), z along each joint's axis and turned by ``q``; and the flange,
+    """Link poses in the world, (n, 4, 4), z along each joint's axis and moved by ``q``; and the flange,
     (4, 4).
 
     Args:
         robot: the arm.
-        q: (n,) joint positions [rad].
+        q: (n,) joint positions [rad or m].
     """
-    tails = _tails(robot)
-    frames = np.empty((len(robot.dh), 4, 4))
-    pose = np.eye(4)
-    for i, tail in enumerate(tails):
-        c, s = np.cos(q[i]), np.sin(q[i])
-        turned = pose.copy()
-        turned[:, 0] = c * pose[:, 0] + s * pose[:, 1]
-        turned[:, 1] = c * pose[:, 1] - s * pose[:, 0]
-        frames[i] = turned
-        pose = turned @ tail
+    frames = np.empty((len(robot.joints), 4, 4))
+    pose = robot.base
+    for i, (joint, link) in enumerate(zip(robot.joints, robot.links, strict=True)):
+        moved = pose.copy()
+        if joint.kind == "prismatic":
+            moved[:3, 3] += q[i] * pose[:3, 2]
+        else:
+            c, s = np.cos(q[i]), np.sin(q[i])
+            moved[:, 0] = c * pose[:, 0] + s * pose[:, 1]
+            moved[:, 1] = c * pose[:, 1] - s * pose[:, 0]
+        frames[i] = moved
+        pose = moved @ link
     return frames, pose
 
 
 def flange_pose(robot: Robot, q: FloatArray) -> FloatArray:
-    """Pose of the flange in the world, (4, 4), z along the last joint's axis, for ``q`` (n,) [rad]."""
+    """Pose of the flange in the world, (4, 4), z along the last joint's axis, for ``q`` (n,)."""
     return joint_frames(robot, q)[1]
 
 
@@ -95,17 +109,17 @@ def urdf(robot: Robot) -> str:
     names.
     """
     lines = [f'<robot name="{robot.name}">']
-    for i, mass in enumerate((10.0, *robot.masses)):
+    for i, mass in enumerate((10.0, *robot.masses.tolist())):
         lines.append(f'  <link name="link_{i}">')
         lines += _inertial(mass, [shape for shape in robot.shapes if shape.link == i])
         for shape in robot.shapes:
             if shape.link == i:
                 lines += _cylinder(shape)
         lines.append("  </link>")
-    previous = np.eye(4)
+    previous = robot.base
     for i, joint in enumerate(robot.joints):
         lines += [
-            f'  <joint name="{joint.name}" type="revolute">',
+            f'  <joint name="{joint.name}" type="{joint.kind}">',
             f'    <parent link="link_{i}"/><child link="link_{i + 1}"/>',
             f"    {_origin(previous)}",
             '    <axis xyz="0 0 1"/>',
@@ -114,7 +128,7 @@ def urdf(robot: Robot) -> str:
             '    <dynamics damping="0" friction="0"/>',
             "  </joint>",
         ]
-        previous = _tail(*robot.dh[i])
+        previous = robot.links[i]
     lines += [
         '  <link name="flange">',
         *_inertial(0.1, []),
@@ -132,14 +146,20 @@ def _numbers(values: FloatArray) -> str:
     return " ".join(f"{float(value):.17g}" for value in values)
 
 
-def _origin(pose: FloatArray) -> str:
+def roll_pitch_yaw(pose: FloatArray) -> FloatArray:
+    """Angles (3,) [rad] about the fixed axes x, y, z, in this order, of the rotation of a pose (4, 4)."""
     R = pose[:3, :3]
-    roll, pitch, yaw = (
-        np.arctan2(R[2, 1], R[2, 2]),
-        -np.arcsin(np.clip(R[2, 0], -1, 1)),
-        np.arctan2(R[1, 0], R[0, 0]),
+    return np.array(
+        [
+            np.arctan2(R[2, 1], R[2, 2]),
+            -np.arcsin(np.clip(R[2, 0], -1, 1)),
+            np.arctan2(R[1, 0], R[0, 0]),
+        ]
     )
-    return f'<origin xyz="{_numbers(pose[:3, 3])}" rpy="{_numbers(np.array([roll, pitch, yaw]))}"/>'
+
+
+def _origin(pose: FloatArray) -> str:
+    return f'<origin xyz="{_numbers(pose[:3, 3])}" rpy="{_numbers(roll_pitch_yaw(pose))}"/>'
 
 
 def _inertial(mass: float, shapes: list[Capsule]) -> list[str]:
@@ -147,7 +167,7 @@ def _inertial(mass: float, shapes: list[Capsule]) -> list[str]:
     identified.
     """
     points = np.array([p for s in shapes for p in (s.start, s.end)]) if shapes else np.zeros((1, 3))
-    radius = max((s.radius for s in shapes), default=0.02)
+    radius = max((s.radius for s in shapes), default=NO_EXTENT)
     size = points.max(axis=0) - points.min(axis=0) + 2 * radius
     inertia = mass / 12 * (size @ size - size**2)
     return [
@@ -174,6 +194,12 @@ def _cylinder(shape: Capsule) -> list[str]:
     ]
 
 
+def _middle(shapes: list[Capsule]) -> FloatArray:
+    """Middle (3,) of the box around the ends of ``shapes``."""
+    ends = np.array([end for shape in shapes for end in (shape.start, shape.end)])
+    return np.asarray(0.5 * (ends.max(axis=0) + ends.min(axis=0)))
+
+
 def _revolute(name: str, low_deg: float, high_deg: float) -> JointSpec:
     return JointSpec(
         name=name,
@@ -185,19 +211,33 @@ def _revolute(name: str, low_deg: float, high_deg: float) -> JointSpec:
     )
 
 
+RX90_ROWS = tuple(
+    (a, float(np.deg2rad(alpha)), d)
+    for a, alpha, d in (
+        (0.0, -90, 0.42),
+        (0.40, 0, 0.0),
+        (0.0, 90, 0.0),
+        (0.0, -90, 0.80),
+        (0.0, 90, 0.0),
+        (0.0, 0, 0.085),
+    )
+)
+"""Rows (a [m], alpha [rad], d [m]) after the Stäubli RX 90 of the thesis (its section 5.5)."""
+
+_RX90_SHAPES = (
+    Capsule(0, (0, 0, 0.0), (0, 0, 0.10), 0.13),
+    Capsule(1, (0, 0, 0.10), (0, 0, 0.42), 0.09),
+    Capsule(2, (0, 0, 0), (0.40, 0, 0), 0.07),
+    Capsule(3, (0, 0, -0.07), (0, 0, 0.07), 0.07),
+    Capsule(4, (0, 0, 0), (0, 0, 0.76), 0.055),
+    Capsule(5, (0, 0, -0.045), (0, 0, 0.045), 0.05),
+    Capsule(6, (0, 0, 0), (0, 0, 0.12), 0.03),
+)
+
 RX90 = Robot(
     name="rx90",
-    dh=tuple(
-        (a, float(np.deg2rad(alpha)), d)
-        for a, alpha, d in (
-            (0.0, -90, 0.42),
-            (0.40, 0, 0.0),
-            (0.0, 90, 0.0),
-            (0.0, -90, 0.80),
-            (0.0, 90, 0.0),
-            (0.0, 0, 0.085),
-        )
-    ),
+    base=np.eye(4),
+    links=np.stack([link_of_row(*row) for row in RX90_ROWS]),
     joints=(
         _revolute("j1", -160, 160),
         _revolute("j2", -137, 137),
@@ -206,15 +246,8 @@ RX90 = Robot(
         _revolute("j5", -105, 120),
         _revolute("j6", -270, 270),
     ),
-    masses=(20.0, 15.0, 8.0, 6.0, 2.0, 1.5),
-    shapes=(
-        Capsule(0, (0, 0, 0.0), (0, 0, 0.10), 0.13),
-        Capsule(1, (0, 0, 0.10), (0, 0, 0.42), 0.09),
-        Capsule(2, (0, 0, 0), (0.40, 0, 0), 0.07),
-        Capsule(3, (0, 0, -0.07), (0, 0, 0.07), 0.07),
-        Capsule(4, (0, 0, 0), (0, 0, 0.76), 0.055),
-        Capsule(5, (0, 0, -0.045), (0, 0, 0.045), 0.05),
-        Capsule(6, (0, 0, 0), (0, 0, 0.12), 0.03),
-    ),
+    masses=np.array((20.0, 15.0, 8.0, 6.0, 2.0, 1.5)),
+    centres=np.stack([_middle([s for s in _RX90_SHAPES if s.link == k]) for k in range(1, 7)]),
+    shapes=_RX90_SHAPES,
 )
-"""Six revolute joints after the Stäubli RX 90 of the thesis (its section 5.5)."""
+"""Six revolute joints after these rows."""

@@ -214,8 +214,3 @@ HAND_GOALS: dict[str, FloatArray] = {
 def simulated_cell(mount: Mount) -> SimulatedCell:
     """The embedded cell with cameras on the given mount."""
     return hand_cell() if mount == "eye_in_hand" else demo_cell()
-
-
-def goals_of(mount: Mount) -> dict[str, FloatArray]:
-    """Goal configurations (n,) [rad] of :func:`simulated_cell`, by name."""
-    return HAND_GOALS if mount == "eye_in_hand" else DEMO_GOALS

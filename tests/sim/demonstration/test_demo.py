@@ -1,5 +1,6 @@
 """The demonstration as the command line gives it, of every shipped cell: in lockstep, and as real processes where a
-cell has no lockstep (a bus or streams in real time). The plain cell in the suite, all with three seeds in ``-m slow``.
+cell has no lockstep (a bus or streams in real time). The plain cell in the suite, all with three seeds in ``-m slow``,
+and there those of other arms.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from stereoservo_sim import cells
 
 CELL_FILES = {path.stem: path for path in sorted(Path(cells.__file__).parent.glob("*.toml"))}
 REAL_TIME = [name for name, path in CELL_FILES.items() if load_cell_file(path).emulate]
-LOCKSTEP = [name for name in CELL_FILES if name not in REAL_TIME]
+LOCKSTEP = [name for name in CELL_FILES if name not in (*REAL_TIME, *cells.ARMS)]
 SEEDS = (0, 1, 2)
 MORE_SEEDS = range(3, 10)
 TIMEOUT_S = 900
@@ -113,6 +114,17 @@ def test_lockstep_is_deterministic_given_the_seed(demos: Demos, tmp_path: Path) 
 @pytest.mark.parametrize("cell", LOCKSTEP)
 def test_every_cell_with_a_lockstep_does_likewise(every_demo: Demos, cell: str, seed: int) -> None:
     check(every_demo[f"{cell}-{seed}"].result())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.parametrize("arm", cells.ARMS)
+def test_every_other_arm_reaches_its_goals(tmp_path: Path, arm: str) -> None:
+    result = run_demo(tmp_path, "--lockstep", "--cell", arm)
+    assert [goal["outcome"] for goal in result["goals"]] == ["reached"] * 3
+    assert max(goal["final_error_px"] for goal in result["goals"]) <= 0.1
+    assert result["converged"] is True
+    assert result["replay"]["identical"] is True
 
 
 @pytest.mark.slow

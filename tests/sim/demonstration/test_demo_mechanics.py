@@ -9,6 +9,7 @@ import pytest
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.demonstration.emulated import with_mechanics
+from stereoservo_sim.world.arms.urdf_file import urdf_path
 
 
 @pytest.mark.parametrize("name", CELLS)
@@ -54,3 +55,16 @@ def test_what_cannot_be_changed_is_refused(tmp_path: Path, old: str, new: str, m
     (tmp_path / "copy").mkdir()
     with pytest.raises(ValueError, match=message):
         with_mechanics(path, tmp_path / "copy", "strain_wave")
+
+
+def test_an_arm_beside_the_cell_file_is_found_from_the_copy(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(shipped_cell_path("scara").read_text().replace("scara.urdf", "mine.urdf"))
+    (tmp_path / "mine.urdf").write_bytes(urdf_path("scara.urdf", tmp_path).read_bytes())
+    (tmp_path / "copy").mkdir()
+    copy = load_cell_file(with_mechanics(path, tmp_path / "copy", "strain_wave"))
+    assert copy.joints.options["urdf"] == str(tmp_path / "mine.urdf")
+    # one that is shipped is found from everywhere, and stays as it is named
+    (tmp_path / "other").mkdir()
+    shipped = load_cell_file(with_mechanics(shipped_cell_path("scara"), tmp_path / "other", "strain_wave"))
+    assert shipped.joints.options["urdf"] == "scara.urdf"

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from stereoservo.messages.cell_file import check_cell, load_cell_file
-from stereoservo_sim.cells import CELLS, demo_cell_path, shipped_cell_path
+from stereoservo_sim.cells import ARMS, CELLS, demo_cell_path, shipped_cell_path
 from stereoservo_sim.demonstration.truth import true_cell
 
 DEPLOYED = Path(__file__).parents[3] / "deploy" / "cells"
 SIXTY = np.deg2rad(60.0)
+LAID_OUT = [name for name in CELLS if name not in ARMS]
+"""Cells that state their limits and ranges."""
 
 
 @pytest.mark.parametrize("name", CELLS)
@@ -37,10 +39,11 @@ def test_the_cell_file_names_what_the_simulation_has(name: str) -> None:
     cell = load_cell_file(shipped_cell_path(name))
     truth = true_cell(cell)
     assert [camera.name for camera in cell.camera] == [camera.name for camera in truth.rig.cameras]
-    assert [limit.joint for limit in cell.safety.limit] == list(truth.robot.joint_names)
+    if name in LAID_OUT:
+        assert [limit.joint for limit in cell.safety.limit] == list(truth.robot.joint_names)
 
 
-@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("name", LAID_OUT)
 @pytest.mark.parametrize("index", range(6))
 def test_every_calibration_stop_shows_every_marker_to_both_cameras(name: str, index: int) -> None:
     file = load_cell_file(shipped_cell_path(name))

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from oracles.lenses import with_lenses
 from stereoservo.messages.cell_file import check_joints, load_cell_file
 from stereoservo_sim.cells import shipped_cell_path
+from stereoservo_sim.world.arms.arm_goals import goals_of
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
 from stereoservo_sim.world.robots import flange_pose
-from stereoservo_sim.world.simulated_cell import HAND_GOALS, demo_cell, goals_of, hand_cell, simulated_cell
+from stereoservo_sim.world.simulated_cell import HAND_GOALS, demo_cell, hand_cell, simulated_cell
 
 CELL = hand_cell()
 FILE = load_cell_file(shipped_cell_path("eye_in_hand"))
@@ -58,7 +59,7 @@ def test_the_body_stands_and_the_cameras_move() -> None:
 def test_mount_chooses_the_cell() -> None:
     assert simulated_cell("eye_in_hand") is CELL
     assert simulated_cell("eye_to_hand") is demo_cell()
-    assert goals_of("eye_in_hand").keys() == goals_of("eye_to_hand").keys()
+    assert goals_of(hand_cell()).keys() == goals_of(demo_cell()).keys()
 
 
 def test_cell_file_fits_the_arm() -> None:

@@ -204,14 +204,14 @@ def test_an_arm_sags_downwards_in_every_posture():
 
 
 def test_gravity_torques_are_those_of_the_physics_engine():
-    from stereoservo_sim.world.mechanics import _masses
+    from stereoservo_sim.world.mechanics import largest_torques
     from stereoservo_sim.world.physics import PybulletPlant
 
     plant = PybulletPlant(RX90, demo_cell().base, 1e-3)
     try:
         for q in (demo_cell().base, *DEMO_GOALS.values()):
             plant.place(q)
-            torques = gravity_load(RX90, q) * _masses(RX90)[2]
+            torques = gravity_load(RX90, q) * largest_torques(RX90)
             # The engine's flange weighs 0.1 kg more, at most 1.4 m away.
             assert np.allclose(torques, -plant.efforts, atol=0.1 * 9.81 * 1.4)
     finally:

@@ -8,8 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stereoservo_sim.world.mechanics import Mechanics, Transmission, at_rest, gravity_torques
-from stereoservo_sim.world.mechanics import _masses as masses_of
-from stereoservo_sim.world.robots import RX90, _tail, joint_frames
+from stereoservo_sim.world.robots import RX90, joint_frames
 
 MASS, ARM = 2.0, 0.3
 """Of the link [kg], and from its axis [m]."""
@@ -154,7 +153,7 @@ def test_friction_holds_a_motor_within_its_dead_band() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_gravity_loads_of_an_arm(seed: int) -> None:
-    centres, masses, _ = masses_of(RX90)
+    centres, masses = RX90.centres, RX90.masses
     model = mujoco.MjModel.from_xml_string(_arm(centres, masses))
     data = mujoco.MjData(model)
     rng = np.random.default_rng(seed)
@@ -171,14 +170,14 @@ def test_gravity_loads_of_an_arm(seed: int) -> None:
 def _arm(centres: np.ndarray, masses: np.ndarray) -> str:
     """The arm as nested bodies of MuJoCo; a body stands at its joint, turned as the row before it leaves it."""
     opening, closing, tail = "", "", np.eye(4)
-    for row, centre, mass in zip(RX90.dh, centres, masses, strict=True):
+    for link, centre, mass in zip(RX90.links, centres, masses, strict=True):
         x, y, z, w = Rotation.from_matrix(tail[:3, :3]).as_quat()
         opening += (
             f'<body pos="{_text(tail[:3, 3])}" quat="{_text(w, x, y, z)}"><joint type="hinge" axis="0 0 1"/>'
             f'<inertial pos="{_text(centre)}" mass="{_text(mass)}" diaginertia="0.01 0.01 0.01"/>'
         )
         closing += "</body>"
-        tail = _tail(*row)
+        tail = link
     world = f"<worldbody>{opening}{closing}</worldbody>"
     return f'<mujoco><compiler autolimits="false"/><option gravity="0 0 -9.81"/>{world}</mujoco>'
 

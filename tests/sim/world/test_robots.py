@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from stereoservo_sim.world.physics import PybulletPlant
-from stereoservo_sim.world.robots import RX90, flange_pose, joint_frames, shape_segments, urdf
+from stereoservo_sim.world.robots import RX90, RX90_ROWS, flange_pose, joint_frames, shape_segments, urdf
 
 
 def product_of_dh_matrices(q):
     """Textbook: Rz(q) Tz(d) Tx(a) Rx(alpha), multiplied out by hand (Spong)."""
     pose = np.eye(4)
-    for (a, alpha, d), angle in zip(RX90.dh, q, strict=True):
+    for (a, alpha, d), angle in zip(RX90_ROWS, q, strict=True):
         c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
         pose = pose @ np.array(
             [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]

@@ -142,7 +142,9 @@ def _must_not_run(name: str) -> None:
 
 def _must_fit(file: CellFile, data: Any, path: Path) -> None:
     cameras = [camera.name for camera in file.camera]
-    joints = {limit.joint for limit in file.safety.limit}
+    joints = {limit.joint for limit in file.safety.limit} or set(
+        data.joint_names
+    )  # not stated of a simulated arm
     if [camera.name for camera in data.cameras] != cameras or set(data.joint_names) != joints:
         raise CommandError(
             "other_cell",

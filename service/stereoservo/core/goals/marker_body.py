@@ -22,7 +22,7 @@ from stereoservo.control.laws.cartesian3 import cartesian3_step
 from stereoservo.control.marker_groups import FLAT_PX
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import markers_at
+from stereoservo.core.prediction import chain_at, markers_at
 from stereoservo.core.settings import CoreSettings
 from stereoservo.kinematics.kernels import (
     distort_pixel,
@@ -37,6 +37,7 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 MIN_MARKERS = 3
+"""That fix the pose of a body that may stand anywhere."""
 RIGID_SHARE = 0.1
 """Of the body's extent that goals in points or matrices may differ by from a rigid displacement, for their noise."""
 BODY_DEPTH = 0.02
@@ -51,6 +52,31 @@ REFINEMENTS = 12
 REFINE_DAMPING = 1e-12
 CONVERGED = 1e-13
 """Of a refinement's step in the basis."""
+
+
+ARM_ROUNDS = 60
+"""Of least squares in an arm's joints."""
+ARM_STEP = 0.3
+"""Largest step of a joint in such a round [rad or m]: what is linear there."""
+ARM_DAMPING = 1e-9
+"""Of these rounds: what the markers do not ask for, the joints do not do."""
+ARM_CONVERGED = 1e-10
+"""Of a round's step [rad or m]."""
+
+
+def fewest_markers(joints: int) -> int:
+    """How many markers a goal has to show: those of an arm of fewer than six joints that it can reach fix more."""
+    return MIN_MARKERS if joints >= RIGID_FREEDOMS else 1
+
+
+RIGID_FREEDOMS = 6
+
+
+def markers_needed(wanted: FloatArray) -> int:
+    """How many markers of an accepted goal have to be seen, which shows those that are ``wanted`` (c, m): all of them
+    where they are fewer than would fix a pose.
+    """
+    return min(MIN_MARKERS, int((wanted.max(axis=0) > 0.0).sum()))
 
 
 @dataclass(frozen=True)
@@ -215,6 +241,19 @@ def _displacement_by_law(
     return D, False
 
 
+def left_by_components(
+    arrays: ModelArrays, operators: FloatArray, points: FloatArray, targets: FloatArray, face: IntArray
+) -> float:
+    """Largest distance [px] from the goal at which a law in components comes to rest with the freedoms ``operators``
+    (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
+    """
+    known = np.ones(len(points), dtype=bool)
+    D, _ = _displacement_by_law(operators, points, targets, known, face, np.eye(4), LAW_STEPS)
+    there, _ = project_points(arrays.matrices, transform_points(D, points))
+    wanted, _ = project_points(arrays.matrices, targets)
+    return float(np.sqrt(((there - wanted) ** 2).sum(axis=-1)).max())
+
+
 @kernel
 def _middle(points: FloatArray, known: BoolArray) -> FloatArray:
     """Mean (4,) of the ``known`` of ``points`` (m, 4)."""
@@ -296,6 +335,48 @@ def one_body(pose: GoalPose, points: FloatArray, targets: FloatArray, known: Boo
         "is it mirrored?",
         subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ReachedPose:
+    """Where an arm brings the markers nearest to set-points: its ``joints`` (n,), the ``points`` (m, 4) there, and
+    ``pixels`` (c, m, 2); the ``worst`` distance [px], of ``marker`` in ``camera``, their indices.
+    """
+
+    joints: FloatArray
+    points: FloatArray
+    pixels: FloatArray
+    worst: float
+    camera: int
+    marker: int
+
+
+def reached_pose(
+    arrays: ModelArrays, joints: FloatArray, set_points: FloatArray, wanted: FloatArray
+) -> ReachedPose:
+    """Least squares of set-points (c, m, 2) that are ``wanted`` (c, m) in the arm's own joints, from ``joints`` (n,).
+
+    Freedoms that the set-points do not ask for stay where they are.
+    """
+    q = joints.copy()
+    weights = np.repeat(wanted.reshape(-1), 2)
+    for _ in range(ARM_ROUNDS):
+        _, operators = chain_at(arrays, q)
+        points = markers_at(arrays, q)
+        pixels, _ = project_points(arrays.matrices, points)
+        jacobian = image_jacobian(operators, arrays.matrices, points).reshape(-1, q.size)
+        step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, ARM_DAMPING)
+        largest = float(np.abs(step).max())
+        if not isfinite(largest):
+            break
+        q = q + step * min(1.0, ARM_STEP / max(largest, ARM_STEP))
+        if largest < ARM_CONVERGED:
+            break
+    points = markers_at(arrays, q)
+    pixels, _ = project_points(arrays.matrices, points)
+    distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
+    camera, marker = divmod(int(distance.argmax()), distance.shape[1])
+    return ReachedPose(q, points, pixels, float(distance.max()), camera, marker)
 
 
 # -- what it has to keep there --------------------------------------------------------------------------------

@@ -13,10 +13,16 @@ import numpy as np
 from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
-from stereoservo.core.goals.marker_body import view_of
+from stereoservo.core.goals.marker_body import (
+    MAX_GOAL_RESIDUAL_PX,
+    RIGID_FREEDOMS,
+    left_by_components,
+    view_of,
+)
 from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import centre_of, chain_at, markers_at
+from stereoservo.core.sources.law import choose, goal_error, scene_and_task
 from stereoservo.core.state import PlanJob, ServoGoal
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.messages import goals
@@ -128,6 +134,8 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
     assert planning is not None
     plan = planning.plan
     if plan is not None:
+        if len(plan.joints[-1]) < RIGID_FREEDOMS and job.purpose in ("reply", "queue"):
+            _require_components(job, context)
         source.goal_joints = plan.joints[-1].copy()
         if context.derived.laws[source.law].planned:
             source.plan, source.plan_s, source.start_points = plan, 0.0, job.points.copy()
@@ -156,6 +164,35 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
     raise RefusalError(
         first.code, first.hint, subject=first.subject, value=first.value, threshold=first.threshold, unit=first.unit,
         further=reasons[1:], plan=report,
+    )  # fmt: skip
+
+
+def _require_components(job: PlanJob, context: StepContext) -> None:
+    """Raises RefusalError where a law in components would come to rest beside the goal, since the arm can make hinge
+    and turn of the face only together.
+    """
+    source, arrays = job.source, context.arrays
+    assert source is not None
+    assert arrays is not None
+    if (
+        context.derived.laws[source.law].path != "straight"
+        or context.weights is None
+        or context.pixels is None
+    ):
+        return
+    found = goal_error(source, context, arrays, context.weights, context.pixels)
+    _, task = choose(source, context, *scene_and_task(source, context, arrays, found))
+    operators = chain_at(arrays, job.joints)[1]
+    left = left_by_components(arrays, operators, job.points, source.target_points, task.face)
+    if left <= MAX_GOAL_RESIDUAL_PX:
+        return
+    others = ", ".join(repr(name) for name in (*LAWS.on_path("free"), *LAWS.on_path("planned")))
+    raise RefusalError(
+        "NOT_REACHABLE",
+        f"the arm reaches the goal, and not by law {source.law!r}, which makes each component of the motion by itself: "
+        f"with {len(job.joints)} joints it would stop {left:.1f} px beside it (up to {MAX_GOAL_RESIDUAL_PX:g} px is "
+        f"accepted); take one of {others}",
+        subject=source.law, value=left, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from stereoservo.control.face_choice import spread_in_images
 from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.marker_body import (
     LAW_STEPS,
+    MAX_GOAL_RESIDUAL_PX,
     MIN_MARKERS,
     REFINEMENTS,
     BodyState,
@@ -25,15 +26,18 @@ from stereoservo.core.goals.marker_body import (
     displacement_by_law,
     enough_in_view,
     enough_shown,
+    fewest_markers,
     in_front,
     keeps_its_shape,
     mirrored,
     one_body,
+    reached_pose,
     refined_pose,
     turned_to,
     view_of,
 )
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at
 from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.core.state import GoalResolution
 from stereoservo.kinematics.kernels import (
@@ -114,11 +118,12 @@ def _triangulated(aim: GoalResolution, place: BodyState) -> None:
         arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity
     )
     shown = int((aim.wanted.sum(axis=0) > 0).sum())
-    if shown < MIN_MARKERS:
+    needed = fewest_markers(len(place.operators))
+    if shown < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
-            f"the goal shows {shown} markers; at least {MIN_MARKERS} are needed to fix a pose",
-            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
+            f"the goal shows {shown} markers; at least {needed} are needed to fix a pose",
+            value=float(shown), threshold=float(needed), unit="markers",
         )  # fmt: skip
     aim.points = aim.targets
     aim.pose_known = aim.needs_pose or int(aim.known.sum()) >= MIN_MARKERS
@@ -244,11 +249,12 @@ def _numbers(rows: Iterable[Iterable[float]], width: int) -> FloatArray:
 
 def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
     arrays = place.arrays
-    if len(target.points) < MIN_MARKERS:
+    needed = fewest_markers(len(place.operators))
+    if len(target.points) < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
-            f"the goal gives {len(target.points)} points; at least {MIN_MARKERS} that are not on one line are needed",
-            value=float(len(target.points)), threshold=float(MIN_MARKERS), unit="markers",
+            f"the goal gives {len(target.points)} points; at least {needed} that are not on one line are needed",
+            value=float(len(target.points)), threshold=float(needed), unit="markers",
         )  # fmt: skip
     targets, known = given_points(target, arrays)
     _projected(aim, place, targets, known)
@@ -385,7 +391,7 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
 
 def _projected(aim: GoalResolution, place: BodyState, targets: FloatArray, known: BoolArray) -> None:
     """A body at ``targets`` (m, 4) of height 1 where ``known`` (m,): set-points by projection."""
-    if mirrored(place.points, targets, known):
+    if int(known.sum()) >= MIN_MARKERS and mirrored(place.points, targets, known):
         raise RefusalError(
             "MIRRORED_GOAL",
             "the points are those of the marker body's mirror image: are left and right, or ids, swapped?",
@@ -421,9 +427,40 @@ def _find_face(aim: GoalResolution, target: Resolvable, place: BodyState) -> boo
     """Where its markers are, as far as two cameras tell, and three of them that span a face."""
     if isinstance(target, FeatureTarget):
         _triangulated(aim, place)
+    if int((aim.wanted.sum(axis=0) > 0).sum()) < MIN_MARKERS:
+        _by_the_arm(aim, place)
+        aim.part = len(_PARTS) - 1  # the pose is found
+        return True
     if aim.pose_known:
         aim.face = _face(aim.set_points, aim.wanted, aim.known, place.arrays)
     return True
+
+
+def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
+    """The pose at a goal of too few markers to fix it alone: the one that an arm of few joints reaches with the least
+    motion. Raises RefusalError where it reaches none.
+    """
+    arrays, cameras = place.arrays, place.settings.cameras
+    start = aim.joints if aim.joints.size else arrays.zero
+    reached = reached_pose(arrays, start, aim.set_points, aim.wanted)
+    if not reached.worst <= MAX_GOAL_RESIDUAL_PX:
+        c, i = reached.camera, reached.marker
+        u, v = (float(x) for x in reached.pixels[c, i])
+        raise RefusalError(
+            "NOT_REACHABLE",
+            f"the arm's {start.size} joints cannot bring the markers there: {reached.worst:.1f} px are left of marker "
+            f"{arrays.marker_ids[i]} in camera {cameras[c].name!r} (up to {MAX_GOAL_RESIDUAL_PX:g} px is accepted); "
+            f"the nearest that they reach is ({u:.1f}, {v:.1f}) there",
+            subject=str(arrays.marker_ids[i]), threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
+            value=reached.worst if isfinite(reached.worst) else None,
+        )  # fmt: skip
+    aim.points = aim.targets = reached.points
+    aim.known, aim.pose_known = np.ones(len(reached.points), dtype=bool), True
+    in_front(place, aim.points, aim.known)
+    there, here = chain_at(arrays, reached.joints)[0], chain_at(arrays, start)[0]
+    aim.displacement = _product(there, invert4(here))
+    pixels, shown = view_of(place.settings, arrays, reached.points)
+    aim.face = _face(pixels, shown, aim.known, arrays)
 
 
 def _start_fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:

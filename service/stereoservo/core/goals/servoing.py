@@ -10,7 +10,7 @@ from stereoservo.control.face_choice import NOT_CHOSEN
 from stereoservo.control.law import JacobianChoice, Law
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
-from stereoservo.core.goals.marker_body import MIN_MARKERS
+from stereoservo.core.goals.marker_body import markers_needed
 from stereoservo.core.goals.resolve import camera_index, marker_indices, normalize_scale, of_this_model
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
@@ -97,12 +97,13 @@ def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatA
     for name in goal.cameras:
         used[camera_index(name, context.settings)] = 1.0
     shown = int((wanted * used[:, None]).max(axis=0).sum())
-    if shown < MIN_MARKERS:
+    needed = markers_needed(wanted)
+    if shown < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
-            f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {MIN_MARKERS} "
+            f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {needed} "
             "are needed",
-            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
+            value=float(shown), threshold=float(needed), unit="markers",
         )  # fmt: skip
     return used
 

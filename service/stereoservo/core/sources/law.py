@@ -15,7 +15,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.goals.marker_body import MIN_MARKERS
+from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
 from stereoservo.core.sources.streaming import feed_forward, follow
@@ -29,7 +29,6 @@ from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
 Progress = tuple[float | None, float | None]
 
-RIGID_FREEDOMS = 6
 SELF_MOTION_RATE = 0.5
 """[1/s], of a joint's half range: how fast self-motion takes it from a limit."""
 
@@ -42,7 +41,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     streamed = follow(source, context, arrays) if source.stream is not None else False
     found = goal_error(source, context, arrays, context.weights, pixels)
     error_px = found.error_px
-    ended = run_ended(source, context, error_px, found.seen, may_end=not streamed)
+    ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=not streamed)
     if ended is not None:
         return ended
     law = context.derived.laws[source.law]
@@ -147,19 +146,22 @@ def away_from_limits(context: StepContext) -> FloatArray:
 
 
 def run_ended(
-    source: LawRun, context: StepContext, error_px: float | None, seen: int, *, may_end: bool = True
-) -> SourceOutput | None:
+    source: LawRun, context: StepContext, error_px: float | None, seen: int, wanted: FloatArray | None = None, *,
+    may_end: bool = True,
+) -> SourceOutput | None:  # fmt: skip
     """What a law's step comes to where it is out of time, sees too little, or is there; None: it goes on.
 
-    ``seen``: markers of the goal that are seen. ``may_end``: off for a goal that moves still.
+    ``seen``: markers of the goal that are seen, of those ``wanted`` (c, m); None: of more than are needed. ``may_end``:
+    off for a goal that moves still.
     """
     source.moved_s += context.dt_s
     source.error_px = error_px
     if source.moved_s > source.time_limit_s:
         return _out_of_time(source, context, error_px)
-    if seen < MIN_MARKERS:
+    needed = MIN_MARKERS if seen >= MIN_MARKERS or wanted is None else markers_needed(wanted)
+    if seen < needed:
         reason = Reason(
-            "TOO_FEW_MARKERS", "hold", "", float(seen), float(MIN_MARKERS), "markers",
+            "TOO_FEW_MARKERS", "hold", "", float(seen), float(needed), "markers",
             "bring the goal's markers back into view",
         )  # fmt: skip
         return SourceOutput(

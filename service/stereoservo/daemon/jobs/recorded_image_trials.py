@@ -24,7 +24,7 @@ from stereoservo.core.sources.measure_at_pose import (
 )
 from stereoservo.daemon.camera_setup import RecordedCamera, recorded_camera, video_of
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
-from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.cell_file import CellFile, JointLimit, load_cell_file
 from stereoservo.messages.recording_request import IMAGES_SUFFIX
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointDriverDescription, JointSpec
@@ -106,7 +106,8 @@ def _settings(
 ) -> CoreSettings:
     """The core's settings for the current cell file, the recorded joints, and the detectors on the recorded cameras."""
     recorded = motion.settings
-    limits = {limit.joint: limit for limit in cell.safety.limit}
+    ranges = cell.safety.limit or _recorded_limits(recorded)  # of a simulated arm they may be left out
+    limits = {limit.joint: limit for limit in ranges}
     if set(limits) != set(recorded.joint_names):
         raise CalibrationError(
             "bad_data",
@@ -135,8 +136,18 @@ def _settings(
             )
         ),
         rate_hz=recorded.rate_hz, pacing="clock", command_timeout_s=0.1, call_budget_us=0.0,
+        home=() if recorded.trials is None else tuple(recorded.trials.base.tolist()),
+        simulated=not cell.safety.limit,
     )  # fmt: skip
     return core_settings(cell, joints, tuple(camera.description for camera in cameras))
+
+
+def _recorded_limits(recorded: CoreSettings) -> tuple[JointLimit, ...]:
+    limits = recorded.limits
+    rows = np.stack([limits.position_min, limits.position_max, limits.velocity_max, limits.acceleration_max])
+    return tuple(
+        JointLimit(name, *row) for name, row in zip(recorded.joint_names, rows.T.tolist(), strict=True)
+    )
 
 
 SAME_POSITION = 4.0

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 import stereoservo_drivers.canopen
-from stereoservo.messages.cell_file import CellFile
+from stereoservo.messages.cell_file import CellFile, Mount
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.options import decode_options, invalid
@@ -21,9 +21,11 @@ from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
 from stereoservo_sim.emulators.bus.plant import STEP_NS, AxisPlant, PlantSettings
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.emulators.nodes.node import EmulatedAxis, EmulatedNode
+from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, place_of
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
 from stereoservo_sim.world.mechanical_plant import MechanicalPlant
 from stereoservo_sim.world.mechanics import MechanicsOption, chosen_mechanics
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.velocity_drives import IdealPlant, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -34,8 +36,8 @@ DEFAULT_RATED_TORQUE = 100.0
 """[N m] of a joint of the simulated arm for which neither the driver's options nor ``[emulate.drives]`` say it."""
 
 
-class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Section ``[emulate.drives]`` of a cell file.
+class DrivesSettings(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Section ``[emulate.drives]`` of a cell file, with the options on which arm it is and where (`ArmPlace`).
 
     ``plant``: ``pybullet``, the simulated arm as rigid bodies (joints of its names), or ``ideal``, any joints, without
     mass. ``bit_time``: frames take their time on the wire. ``start``: positions by joint [rad or m] of an arm that was
@@ -48,10 +50,10 @@ class DrivesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     plant: Literal["pybullet", "ideal"] = "pybullet"
     bit_time: bool = False
-    start: dict[str, float] = {}
+    start: dict[str, float] = msgspec.field(default_factory=dict)
     resume: bool = True
     brake_ms: NonNegative = 50.0
-    rated_torques: dict[str, Positive] = {}
+    rated_torques: dict[str, Positive] = msgspec.field(default_factory=dict)
     eds: str = ""
     machine: PlantSettings = PlantSettings()
     mechanics: MechanicsOption = "none"
@@ -85,11 +87,12 @@ def make_bus_emulator(
     t_ns: int,
     runtime_dir: Path | None = None,
     cell_dir: Path = Path(),
+    mount: Mount = "eye_to_hand",
 ) -> BusEmulator:
     """The emulated drives of ``options``, switched on at ``t_ns``.
 
-    ``runtime_dir``: where the arm's truth is written; None: nowhere. ``cell_dir``: what an EDS is relative to.
-    Raises EmulationError.
+    ``runtime_dir``: where the arm's truth is written; None: nowhere. ``cell_dir``: what an EDS or URDF is
+    relative to. ``mount``: of the cell's cameras. Raises EmulationError.
     """
     settings = settings or DrivesSettings()
     names = [joint.name for joint in options.joint]
@@ -99,9 +102,10 @@ def make_bus_emulator(
                 raise EmulationError(f"emulate.drives.{key}: no joint {name!r}; joints: {', '.join(names)}")
     history = _history(runtime_dir, len(names), t_ns)
     newest = history.newest() if history is not None and settings.resume else None
-    start = _start(options, settings)
+    arm = _arm(options, settings, mount, cell_dir)
+    start = _start(options, settings, arm)
     positions = newest[1] if newest is not None else start
-    plant, rated = _plant(options, settings, positions)
+    plant, rated = _plant(options, settings, positions, arm)
     axes = [
         EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(options.joint, plant.motors, strict=True)
     ]
@@ -137,16 +141,38 @@ def _node(
     return Cia402Node(joint.node_id, axis, joint, eds=eds, settings=NodeSettings(brake_ms=settings.brake_ms))
 
 
-def _start(options: CanOptions, settings: DrivesSettings) -> FloatArray:
+def _arm(options: CanOptions, settings: DrivesSettings, mount: Mount, cell_dir: Path) -> SimulatedCell | None:
+    """The simulated cell of the arm that the drives move; None where it is of other joints, without mass."""
+    if settings.plant == "ideal" and not settings.urdf:
+        return None
+    try:
+        cell = cell_of(place_of(msgspec.to_builtins(settings)), mount, cell_dir)
+    except ValueError as error:
+        raise EmulationError(f"emulate.drives: {error}") from error
+    names = tuple(joint.name for joint in options.joint)
+    kinds = tuple(joint.kind for joint in options.joint)
+    if names != cell.robot.joint_names or kinds != tuple(joint.kind for joint in cell.robot.joints):
+        what = (
+            "emulate.drives.plant = 'pybullet'"
+            if not settings.urdf
+            else f"emulate.drives.urdf = {settings.urdf!r}"
+        )
+        has = ", ".join(
+            joint.name if joint.kind == "revolute" else f"{joint.name} ({joint.kind})"
+            for joint in cell.robot.joints
+        )
+        raise EmulationError(
+            f"{what} is the simulated arm with joints {has}; this cell has {', '.join(names)}: name them so, or take "
+            "plant = 'ideal'"
+        )
+    return cell
+
+
+def _start(options: CanOptions, settings: DrivesSettings, arm: SimulatedCell | None) -> FloatArray:
     """Initial joint positions: as configured, else the simulated cell's base, else mid-range."""
     positions = np.array([min(max(0.0, joint.position_min), joint.position_max) for joint in options.joint])
-    names = tuple(joint.name for joint in options.joint)
-    if settings.plant == "pybullet":
-        from stereoservo_sim.world.simulated_cell import demo_cell
-
-        cell = demo_cell()
-        if names == cell.robot.joint_names:
-            positions = cell.base.copy()
+    if arm is not None:
+        positions = arm.base.copy()
     for k, joint in enumerate(options.joint):
         value = settings.start.get(joint.name, float(positions[k]))
         if not joint.position_min <= value <= joint.position_max:
@@ -159,26 +185,24 @@ def _start(options: CanOptions, settings: DrivesSettings) -> FloatArray:
 
 
 def _plant(
-    options: CanOptions, settings: DrivesSettings, positions: FloatArray
+    options: CanOptions, settings: DrivesSettings, positions: FloatArray, arm: SimulatedCell | None
 ) -> tuple[Plant, list[float] | None]:
     """The plant, and the rated torques that its efforts are shares of."""
     names = tuple(joint.name for joint in options.joint)
     try:
-        mechanics = chosen_mechanics(settings.mechanics, names)
+        mechanics = chosen_mechanics(
+            settings.mechanics, names, [joint.kind == "prismatic" for joint in options.joint]
+        )
     except ValueError as error:
         raise EmulationError(f"emulate.drives.{error}") from error
     if settings.plant == "ideal":
         ideal = IdealPlant(positions)
-        return ideal if mechanics is None else MechanicalPlant(ideal, mechanics, None), None
+        robot = None if arm is None else arm.robot
+        return ideal if mechanics is None else MechanicalPlant(ideal, mechanics, robot), None
     from stereoservo_sim.world.physics import PhysicsError, PybulletPlant
-    from stereoservo_sim.world.simulated_cell import demo_cell
 
-    robot = demo_cell().robot
-    if names != robot.joint_names:
-        raise EmulationError(
-            f"emulate.drives.plant = 'pybullet' is the simulated arm with joints {', '.join(robot.joint_names)}; this "
-            f"cell has {', '.join(names)}: name them so, or take plant = 'ideal'"
-        )
+    assert arm is not None  # of plant "pybullet"
+    robot = arm.robot
     ratings: Mapping[str, Any] = settings.rated_torques
     rated = [
         float(ratings.get(joint.name) or joint.rated_torque or DEFAULT_RATED_TORQUE)

@@ -24,11 +24,24 @@ PRIORITY = 3
 """SCHED_FIFO where it is allowed: real cameras take no processor; below the servo process and emulated drives."""
 
 
-def make_camera_emulator(cell: CellFile, settings: CamerasSettings, runtime_dir: Path) -> CameraEmulator:
-    """The cameras of ``settings``, mounted as those of the cell are. Raises DriverError."""
+def make_camera_emulator(
+    cell: CellFile, settings: CamerasSettings, runtime_dir: Path, cell_dir: Path = Path()
+) -> CameraEmulator:
+    """The cameras of ``settings``, mounted as those of the cell are, before its arm; ``cell_dir``: of the cell file.
+
+    Raises DriverError.
+    """
     clock = MonotonicClock()
     cameras = [
-        EmulatedCamera(stream, settings, clock=clock, mount=cell.camera[0].mount, runtime_dir=runtime_dir)
+        EmulatedCamera(
+            stream,
+            settings,
+            clock=clock,
+            mount=cell.camera[0].mount,
+            runtime_dir=runtime_dir,
+            cell_dir=cell_dir,
+            arm=cell.arm_options,
+        )
         for stream in settings.camera
     ]
     return CameraEmulator(cameras, time.monotonic_ns())
@@ -36,17 +49,18 @@ def make_camera_emulator(cell: CellFile, settings: CamerasSettings, runtime_dir:
 
 def serve_cameras(
     cell: CellFile,
+    cell_dir: Path,
     *,
     channel: str | None,
     orders: Sequence[str],
     as_json: bool,
     ended: Callable[[], bool],
 ) -> None:
-    """Serve until ``ended``. Raises EmulationError, DriverError, FaultCommandError."""
+    """Serve until ``ended``; ``cell_dir``: of the cell file. Raises EmulationError, DriverError, FaultCommandError."""
     settings = cameras_of_cell(cell)
     port = settings.port if channel is None else port_of(channel)
     cv2.setNumThreads(1)  # on small images they only wait for each other
-    emulator = make_camera_emulator(cell, settings, cell_directories(cell.cell.name).runtime)
+    emulator = make_camera_emulator(cell, settings, cell_directories(cell.cell.name).runtime, cell_dir)
     for text in orders:
         emulator.order(text, emulator.start_ns)
     server = CameraServer(emulator, cell=cell.cell.name, port=port, connections=settings.connections)

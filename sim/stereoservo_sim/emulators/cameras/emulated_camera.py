@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,8 @@ class EmulatedCamera:
         mount: Mount = "eye_to_hand",
         runtime_dir: Path = Path(),
         services: dict[str, Any] | None = None,
+        cell_dir: Path = Path(),
+        arm: Mapping[str, Any] | None = None,
     ) -> None:
         self.name = stream.name
         self.stream = stream.stream
@@ -117,8 +120,8 @@ class EmulatedCamera:
             "blur": settings.blur, "background": settings.background, "workpiece": settings.workpiece,
         }  # fmt: skip
         context = DriverContext(
-            clock=clock, cell="emulated", runtime_dir=runtime_dir, cell_dir=Path(), camera=stream.name,
-            seed=settings.seed, services=services or {}, mount=mount,
+            clock=clock, cell="emulated", runtime_dir=runtime_dir, cell_dir=cell_dir, camera=stream.name,
+            seed=settings.seed, services=services or {}, mount=mount, arm=arm or {},
         )  # fmt: skip
         self.view = EmulatedView(options, context)
 

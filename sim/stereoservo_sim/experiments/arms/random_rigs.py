@@ -24,7 +24,7 @@ from stereoservo.calibration.bundle_adjustment import jacobian
 from stereoservo.calibration.bundle_statistics import covariance_root, variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
-from stereoservo.calibration.rig_model import Measurements, residuals
+from stereoservo.calibration.rig_model import Measurements, residuals, reversed_trials, with_joints_reversed
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo_sim.experiments.experiment import show_rows
@@ -114,15 +114,19 @@ def held_out_ratio(case: RandomCase, trials: TrialData, result: CalibrationFit) 
     """Squared errors of held-out pixels over their stated sum, its effective degrees of freedom, the rms error [px].
 
     With the errors ``L z``, ``z`` standard normal, the sum of squares has mean ``tr LᵀL`` and is taken for a
-    chi-square of ``(tr LᵀL)² / tr (LᵀL)²`` degrees of freedom of the same mean (Satterthwaite).
+    chi-square of ``(tr LᵀL)² / tr (LᵀL)²`` degrees of freedom of the same mean (Satterthwaite). With cameras on the arm
+    its joints are counted from them.
     """
+    positions = order = case.held_out()
+    if case.cell.mount == "eye_in_hand":
+        trials, order = reversed_trials(trials), positions[:, ::-1]
+        result = msgspec.structs.replace(result, model=with_joints_reversed(result.model))
     solution = solution_of(trials, result)
-    positions = case.held_out()
     kept = [i - FIRST_MARKER for i in result.model.marker_ids]
     seen = case.cell.in_view(positions)[:, :, kept]
     camera, stop, marker = np.nonzero(seen)
     exact = case.cell.pixels(positions)[:, :, kept][seen]
-    data = Measurements(positions - result.model.zero, camera, stop, marker, exact, np.ones(len(exact)))
+    data = Measurements(order - result.model.zero, camera, stop, marker, exact, np.ones(len(exact)))
     errors = residuals(solution.rig, data)
     roots = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data) @ covariance_root(
         solution

@@ -157,7 +157,7 @@ def test_cells_without_can_drives_are_refused():
 @pytest.mark.parametrize(
     ("drives", "told"),
     [
-        ({"plnat": "ideal"}, "no option 'plnat'; did you mean 'plant'\\? valid: plant, bit_time"),
+        ({"plnat": "ideal"}, "no option 'plnat'; did you mean 'plant'\\? valid: urdf, flange"),
         ({"plant": "gazebo"}, "plant"),
         ({"brake_ms": -1.0}, "brake_ms"),
         ({"machine": {"mass": 3.0}}, "mass"),

@@ -1,0 +1,247 @@
+"""The simulated cell of any arm: its place, marker body and cameras from a cell file's options; where they are not
+stated, the configuration around which the cell is laid out is searched for, and so are the demonstration's goals.
+
+Every process of a cell finds the same: the search is seeded, and depends on the options alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from stereoservo.messages.cell_file import Mount
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.world.arms.urdf_file import load_urdf, urdf_path
+from stereoservo_sim.world.body import roof_body
+from stereoservo_sim.world.camera_rig import inverse_pose, look_at, stereo_rig
+from stereoservo_sim.world.robots import Robot, flange_pose, joint_frames, shape_segments
+from stereoservo_sim.world.simulated_cell import SimulatedCell, simulated_cell
+from stereoservo_sim.world.synthetic import rotation, translation
+from stereoservo_sim.world.workpiece import Moved
+
+Length = Annotated[float, Meta(gt=0, le=20)]
+
+CANDIDATES, EXAMINED = 600, 8
+"""Configurations that are drawn for the base, and how many of the best are looked at through the cameras."""
+WIDEST = 2.4
+"""From the middle of its range a joint's base is drawn up to here [rad]: some turn several times."""
+CLEAR = {"revolute": 0.5, "prismatic": 0.1}
+"""From its limits a joint's base should stand so far at least [rad or m]."""
+LEVER = 0.3
+"""Length [m] at which a turn of the body counts as much as a translation."""
+HEIGHT = 0.25
+"""Above the floor, where the arm stands, of body and cameras [m]."""
+TRIALS = {"revolute": (0.1, 0.2, 0.3, 0.45), "prismatic": (0.04, 0.08, 0.12, 0.16)}
+"""Motions to either side of the base that are looked at [rad or m]."""
+BEHIND_BODY = 0.05
+"""From what the flange carries already to the ridge of the body [m]."""
+
+
+class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of a cell file on which arm is simulated, and where things stand; with no ``urdf`` the embedded one.
+
+    ``urdf``: a file, relative to the cell file, shipped here, or of pybullet_data. ``flange``: the link that carries
+    the body (default: see `urdf_file.load_urdf`). ``mounted``: the arm's root in the world. ``carried``: the marker
+    body on the flange (with cameras on the arm: the rig), from its default, which looks along the flange's z from in
+    front of what is there. ``base``: positions by joint [rad or m] around which the cell is laid out; of joints left
+    out they are searched for. ``distance_m`` from the rig to the body, by default 1.4 m, or 0.85 m with the cameras on
+    the arm; ``baseline_m`` between the cameras; ``focal_px`` of both.
+    """
+
+    urdf: str = ""
+    flange: str = ""
+    mounted: Moved = Moved()
+    carried: Moved = Moved()
+    base: dict[str, float] = {}
+    distance_m: Length | None = None
+    baseline_m: Length = 0.20
+    focal_px: Annotated[float, Meta(ge=100, le=5000)] | None = None
+
+
+def place_of(options: Mapping[str, Any]) -> ArmPlace:
+    """What ``options`` of a joint driver, or of emulated drives, say of the arm; the rest of them is left alone.
+
+    Raises ValueError.
+    """
+    mine = {name: options[name] for name in ArmPlace.__struct_fields__ if name in options}
+    try:
+        return msgspec.convert(mine, ArmPlace)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from error
+
+
+def cell_of(place: ArmPlace, mount: Mount, folder: Path) -> SimulatedCell:
+    """The simulated cell at ``place`` with cameras on ``mount``; ``folder``: of the cell file. Raises ValueError."""
+    if place.urdf:
+        return _found(msgspec.json.encode(place), mount, urdf_path(place.urdf, folder))
+    for name in ArmPlace.__struct_fields__:
+        if getattr(place, name) != getattr(ArmPlace(), name):
+            raise ValueError(f"{name} is of an arm of your own; give its urdf as well")
+    return simulated_cell(mount)
+
+
+@lru_cache(maxsize=16)
+def _found(encoded: bytes, mount: Mount, path: Path) -> SimulatedCell:
+    place = msgspec.json.decode(encoded, type=ArmPlace)
+    robot = load_urdf(path, flange=place.flange, mounted=place.mounted.matrix)
+    return laid_out(robot, place, mount, base_for(robot, place, mount))
+
+
+# -- the layout -----------------------------------------------------------------------------------------------
+
+
+def laid_out(robot: Robot, place: ArmPlace, mount: Mount, base: FloatArray) -> SimulatedCell:
+    """The cell around ``base`` (n,): eye-to-hand the body on the flange and the rig before it, else the other way."""
+    carried = translation(0.0, 0.0, _reach(robot) + BEHIND_BODY) @ place.carried.matrix
+    flange = flange_pose(robot, base)
+    if mount == "eye_in_hand":
+        distance = place.distance_m or 0.85
+        flange_to_rig = carried @ translation(0.03, -0.02, 0.0) @ rotation("z", 8.0) @ rotation("x", -2.0)
+        body = roof_body()
+        middle = body.marker_points.mean(axis=0)
+        facing = rotation("y", 6.0) @ rotation("x", 180.0) @ rotation("z", -85.0)
+        stand = flange @ flange_to_rig @ translation(0.0, 0.0, distance) @ facing @ translation(*-middle)
+        rig = stereo_rig(
+            inverse_pose(flange_to_rig), baseline=place.baseline_m, focal=place.focal_px or 500.0,
+            vergence=2.0 * float(np.arctan(0.5 * place.baseline_m / distance)),
+        )  # fmt: skip
+        return SimulatedCell(robot, body, rig, base, stand)
+    distance = place.distance_m or 1.4
+    body = roof_body(roll=float(np.deg2rad(-95.0)), stand_off=0.0)
+    body = replace(body, flange_to_face=carried @ body.flange_to_face)
+    target = flange[:3, 3] + flange[:3, :3] @ body.marker_points.mean(axis=0)
+    ahead = (flange @ carried)[:3, 2]
+    up = np.array([0.0, 0.0, 1.0]) if abs(ahead[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    rig = stereo_rig(
+        look_at(target + distance * ahead, target, up), baseline=place.baseline_m, focal=place.focal_px or 800.0,
+        vergence=2.4 * float(np.arctan(0.5 * place.baseline_m / distance)),
+    )  # fmt: skip
+    return SimulatedCell(robot, body, rig, base)
+
+
+def _reach(robot: Robot) -> float:
+    """How far [m] what moves with the flange stands out along its z."""
+    back = inverse_pose(robot.links[-1])
+    last = [shape for shape in robot.shapes if shape.link == len(robot.joints)]
+    tops = [
+        float((back[:3, :3] @ np.array(end) + back[:3, 3])[2]) + shape.radius
+        for shape in last
+        for end in (shape.start, shape.end)
+    ]
+    return max([0.0, *tops])
+
+
+# -- the base -------------------------------------------------------------------------------------------------
+
+
+def base_for(robot: Robot, place: ArmPlace, mount: Mount) -> FloatArray:
+    """Configuration (n,) with the joints clear of their limits, the body's motion well-conditioned, and the body in all
+    cameras there and while each joint moves alone. Raises ValueError where none is found.
+    """
+    stated = _stated(robot, place.base)
+    if not np.isnan(stated).any():
+        return stated
+    low, high = (np.array([getattr(j, f"position_{side}") for j in robot.joints]) for side in ("min", "max"))
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    drawn = np.random.default_rng(5).uniform(-0.9, 0.9, (CANDIDATES, len(middle)))
+    drawn = middle + drawn * np.minimum(half, WIDEST)
+    drawn = np.where(np.isnan(stated), drawn, stated)
+    scores = np.array([_suitability(robot, q) for q in drawn])
+    best, found = -np.inf, None
+    for index in np.argsort(-scores, kind="stable")[:EXAMINED]:
+        cell = laid_out(robot, place, mount, drawn[index])
+        score = scores[index] + _room_before_cameras(cell)
+        if score > best:
+            best, found = score, drawn[index]
+    if found is None:
+        raise ValueError(
+            f"{robot.name}: of {EXAMINED} configurations in none do both cameras see every marker while each joint "
+            "moves alone; state base = { joint = position, … }, or carried, distance_m (the body may be hidden by the "
+            "flange's own link)"
+        )
+    return np.asarray(found)
+
+
+def _stated(robot: Robot, base: Mapping[str, float]) -> FloatArray:
+    for name, value in base.items():
+        joint = next((joint for joint in robot.joints if joint.name == name), None)
+        if joint is None:
+            raise ValueError(f"base: no joint {name!r}; joints: {', '.join(robot.joint_names)}")
+        if not joint.position_min <= value <= joint.position_max:
+            raise ValueError(
+                f"base.{name} is {value:g}; the joint's range is {joint.position_min:g} to {joint.position_max:g}"
+            )
+    return np.array([base.get(name, np.nan) for name in robot.joint_names])
+
+
+def body_jacobian(robot: Robot, q: FloatArray, point: FloatArray) -> FloatArray:
+    """Translation at ``point`` (3,) in the world and rotation times ``LEVER`` by each joint at ``q`` (n,), (6, n)."""
+    frames, _ = joint_frames(robot, q)
+    axes = frames[:, :3, 2]
+    swung = np.cross(axes, point - frames[:, :3, 3])
+    straight = robot.prismatic[:, None]
+    return np.concatenate([np.where(straight, axes, swung), np.where(straight, 0.0, LEVER * axes)], axis=1).T
+
+
+def _suitability(robot: Robot, q: FloatArray) -> float:
+    """How good a base ``q`` (n,) is before one looks through cameras: more is better."""
+    pose = flange_pose(robot, q)
+    body = pose[:3, 3] + 0.1 * pose[:3, 2]
+    values = np.linalg.svd(body_jacobian(robot, q, body), compute_uv=False)
+    room = min(
+        min(value - joint.position_min, joint.position_max - value, CLEAR[joint.kind]) / CLEAR[joint.kind]
+        for value, joint in zip(q.tolist(), robot.joints, strict=True)
+    )
+    floor = float(robot.mounted[2, 3])
+    heights = np.array([body[2], body[2] + 0.7 * pose[2, 2]]) - floor
+    above = float(np.clip(heights / HEIGHT, 0.02, 1.0).prod())
+    away = float(np.clip(np.linalg.norm(body[:2] - robot.mounted[:2, 3]) / HEIGHT, 0.2, 1.0))
+    return float(
+        np.log(max(values[-1] / values[0], 1e-9)) + np.log(max(room, 1e-3)) + np.log(above) + np.log(away)
+    )
+
+
+def _room_before_cameras(cell: SimulatedCell) -> float:
+    """How far each joint may move alone with every marker in sight: more is better, minus infinity is not at all."""
+    if not seen_by_all(cell, cell.base) or _inside_arm(cell):
+        return -np.inf
+    score = 0.0
+    for k, joint in enumerate(cell.robot.joints):
+        shares = 0
+        for step in TRIALS[joint.kind]:
+            q = np.stack([cell.base, cell.base])
+            q[:, k] += (-step, step)
+            if not all(seen_by_all(cell, one) for one in q):
+                break
+            shares += 1
+        if shares == 0:
+            return -np.inf
+        score += float(np.log(shares / len(TRIALS[joint.kind]))) / len(cell.base)
+    return score
+
+
+def _inside_arm(cell: SimulatedCell) -> bool:
+    """Whether a camera, or with cameras on the arm the body, stands within a hand's breadth of the arm at its base."""
+    ends, radii = shape_segments(cell.robot, cell.base)
+    if cell.stand is not None:
+        points = cell.marker_positions(cell.base)
+    else:
+        points = np.array([camera.centre for camera in cell.rig.cameras])
+    for (start, end), radius in zip(ends, radii.tolist(), strict=True):
+        along = np.clip((points - start) @ (end - start) / ((end - start) @ (end - start)), 0.0, 1.0)
+        gaps = np.linalg.norm(points - start - along[:, None] * (end - start), axis=1)
+        if float(gaps.min()) < radius + 0.1:
+            return True
+    return False
+
+
+def seen_by_all(cell: SimulatedCell, q: FloatArray) -> bool:
+    """Whether every camera sees every marker at ``q`` (n,)."""
+    return all(bool(cell.visible(q, camera).all()) for camera in cell.rig.cameras)
