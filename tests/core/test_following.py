@@ -233,6 +233,23 @@ def test_a_late_joint_that_is_blocked_on_its_way_is_found_as_fast_as_a_prompt_on
     assert (k - blocked) * DT_S <= (0.175 if speed == 1.0 else 0.26)
 
 
+@pytest.mark.parametrize(("slow", "play"), [(0.05, 0.005), (0.1, 0.01), (0.25, 0.02)])
+def test_play_that_was_taken_for_a_delay_hides_no_blocked_joint(bench, slow, play):
+    """A prompt joint whose reading follows its play later, to and fro at low speed, then fast until it is blocked."""
+    settings = at_the_rate_of_these_tests(bench.settings)
+    there = setting_out(slow, 0.5)
+    slowly = np.concatenate([there, -there] * 3)
+    commands = np.concatenate([slowly, setting_out(1.0, 2.0)])
+    blocked = len(slowly) + round(1.25 * RATE_HZ)
+    readings, state = with_play(travelled(commands), play), initial_state(settings)
+    assert watched(settings, slowly, readings, state=state)[0] is None
+    assert state.delays.delay_s[0] > 0.05
+    readings[blocked:] = readings[blocked]
+    reason, k = watched(settings, commands, readings)
+    assert reason is not None
+    assert (k - blocked) * DT_S <= 0.175
+
+
 def test_a_drive_that_has_become_faster_is_not_blamed(bench):
     settings = at_the_rate_of_these_tests(bench.settings)
     state = initial_state(settings)
@@ -274,7 +291,7 @@ def test_goals_are_reached_by_late_drives_and_not_overshot(bench: Any, by: str, 
 
 
 def test_trial_motions_are_made_by_late_drives(bench: Any) -> None:
-    trials = msgspec.structs.replace(bench.settings.trials, stops=3, frames=1)
+    trials = msgspec.structs.replace(bench.settings.trials, stops=4, frames=1)
     bench.settings = msgspec.structs.replace(bench.settings, trials=trials)
     bench.core = ServoCore(bench.settings)
     bench.ready()
