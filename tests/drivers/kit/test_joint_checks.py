@@ -10,6 +10,8 @@ import typer
 from typer.testing import CliRunner
 
 from stereoservo_drivers.commands.driver_check import driver_check
+from stereoservo_drivers.fake import FakeJointDriver
+from stereoservo_drivers.kit.bench import JointDriverSetup
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
 
 from .faulty_drivers import FAULTY, Driver, SmallSetup
@@ -32,6 +34,20 @@ def test_a_planted_fault_is_caught_by_its_check_with_a_remedy(faulty, name, tmp_
     assert result.verdict == "failed", result
     assert result.measured
     assert result.remedy == check.remedy
+
+
+def test_outputs_are_left_as_they_were_found(tmp_path):
+    made = []
+
+    class Valves(JointDriverSetup):
+        def make_driver(self, context):
+            made.append(FakeJointDriver({"auxiliary": [{"name": "clamp", "kind": "digital"}]}, context))
+            return made[-1]
+
+    (check,) = (check for check in JOINT_CHECKS if check.name == "orders auxiliary joints")
+    result = run_check(check, Valves(), tmp_path)
+    assert (result.verdict, result.measured) == ("passed", "clamp 1")
+    assert made[-1].read_auxiliary() == {"clamp": 0.0}
 
 
 def command(*arguments):
