@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.ports.devices import (
     CommandReport,
     DriverError,
@@ -16,11 +17,17 @@ from stereoservo.ports.devices import (
     JointSpec,
     JointState,
 )
+from stereoservo_drivers.kit.auxiliary import AuxiliaryMotion
 from stereoservo_drivers.kit.bench import JointDriverSetup
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 
 CREATED, CONFIGURED, ACTIVE, CLOSED = LifecycleState
 LOW, HIGH, FASTEST, TIMEOUT_S, STEP = np.full(2, -1.0), np.full(2, 1.0), np.full(2, 1.0), 0.1, 1e-4
+
+AUXILIARY = (
+    AuxiliarySpec("gripper", "prismatic", 0.0, 0.08, 0.1),
+    AuxiliarySpec("clamp", "digital"),
+)
 
 
 class Device:
@@ -58,12 +65,15 @@ class Driver:
         self.life = DriverLifecycle("joint driver 'small'")
         self.device: Device | None = None
         self.reads = self.writes = 0
+        self.auxiliary = AuxiliaryMotion(AUXILIARY)
 
     def describe(self) -> JointDriverDescription:
         joints = tuple(
             JointSpec(name, "revolute", -1.0, 1.0, 1.0, 100.0, self.resolution) for name in ("a", "b")
         )
-        return JointDriverDescription("small", joints, 250.0, "clock", TIMEOUT_S, 500.0)
+        return JointDriverDescription(
+            "small", joints, 250.0, "clock", TIMEOUT_S, 500.0, auxiliary=AUXILIARY
+        )
 
     def configure(self) -> None:
         self.life.require("configure()", CREATED)
@@ -95,7 +105,18 @@ class Driver:
         reasons = ("limit",) if (sent != asked).any() else ()
         return CommandReport(self.writes, self.context.clock.now_ns(), asked, sent, reasons)
 
+    def write_auxiliary(self, values: Any) -> None:
+        self.life.require("write_auxiliary()", ACTIVE)
+        self.auxiliary.order(values, self.context.clock.now_ns())
+
+    def read_auxiliary(self) -> dict[str, float]:
+        return self.auxiliary.values(self.context.clock.now_ns())
+
+    def stop_auxiliary(self) -> None:
+        self.auxiliary.stop(self.context.clock.now_ns())
+
     def stop(self) -> None:
+        self.stop_auxiliary()
         try:
             if self.device is not None and self.life.state in (CONFIGURED, ACTIVE):
                 self.exchange(np.zeros(2))
@@ -143,6 +164,16 @@ class Driver:
             (self.device.positions <= LOW) & (velocities < 0.0)
         )
         return np.where(outward, 0.0, velocities)
+
+
+class GripperGoesOn(Driver):
+    def stop_auxiliary(self) -> None:
+        pass
+
+
+class GripperOfAnArmThatIsOff(Driver):
+    def write_auxiliary(self, values: Any) -> None:
+        self.auxiliary.order(values, self.context.clock.now_ns())
 
 
 class StaleStamps(Driver):
@@ -314,6 +345,8 @@ FAULTY = {
     LostDeviceUnnoticed: "reports a lost device",
     LostDeviceAsOSError: "reports a lost device",
     CommandsBeforeActivate: "refuses commands unless active",
+    GripperGoesOn: "orders auxiliary joints",
+    GripperOfAnArmThatIsOff: "orders auxiliary joints",
 }
 """Driver -> the check that is to catch its fault."""
 

@@ -10,8 +10,6 @@ import typer
 from typer.testing import CliRunner
 
 from stereoservo_drivers.commands.driver_check import driver_check
-from stereoservo_drivers.fake import FakeJointDriver
-from stereoservo_drivers.kit.bench import JointDriverSetup
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
 
 from .faulty_drivers import FAULTY, Driver, SmallSetup
@@ -39,15 +37,15 @@ def test_a_planted_fault_is_caught_by_its_check_with_a_remedy(faulty, name, tmp_
 def test_outputs_are_left_as_they_were_found(tmp_path):
     made = []
 
-    class Valves(JointDriverSetup):
+    class Kept(SmallSetup):
         def make_driver(self, context):
-            made.append(FakeJointDriver({"auxiliary": [{"name": "clamp", "kind": "digital"}]}, context))
+            made.append(super().make_driver(context))
             return made[-1]
 
     (check,) = (check for check in JOINT_CHECKS if check.name == "orders auxiliary joints")
-    result = run_check(check, Valves(), tmp_path)
-    assert (result.verdict, result.measured) == ("passed", "clamp 1")
-    assert made[-1].read_auxiliary() == {"clamp": 0.0}
+    result = run_check(check, Kept(), tmp_path)
+    assert (result.verdict, result.measured) == ("passed", "gripper 0.01, clamp 1")
+    assert made[-1].read_auxiliary() == {"gripper": pytest.approx(0.01), "clamp": 0.0}
 
 
 def command(*arguments):
