@@ -100,8 +100,9 @@ class PositionOutput:
         presses = (stands_off - self._load) * sign >= self._lead * _NEARLY
         self._pressed = np.where(sign == 0.0, self._pressed * ~released, sign * presses)
         learnt = np.abs(stands_off - self.offsets) < LEARNT_SHARE * self._lead
-        rests = standing & (sign == 0.0) & (self._pressed == 0.0) & learnt
-        self._rested_s = np.where(rests, self._rested_s + self._period_s, 0.0)
+        rests = ~moves & (sign == 0.0) & (self._pressed == 0.0) & learnt
+        # A reading that flickers hides a standing joint in many a step.
+        self._rested_s = np.where(rests, self._rested_s + self._period_s * standing, 0.0)
         moves = moves & ~np.isnan(self._load)
         known = np.where(self._rested_s >= LEARNS_S, stands_off, self._load)
         self._load = np.where(moves, self.offsets, known)

@@ -87,6 +87,21 @@ def test_a_joint_that_was_blocked_is_let_go_when_its_command_ends_or_turns(sag, 
     assert servo.position - start == pytest.approx(-0.2, abs=0.004)
 
 
+@pytest.mark.parametrize("sag", [0.0, np.radians(2.5)])
+@pytest.mark.parametrize("noise", [1e-4, 2e-4])
+def test_a_joint_whose_reading_flickers_is_let_go_too(sag, noise):
+    random, servo = np.random.default_rng(0), Servo(output(), sag)
+    blocked = np.inf
+    for velocity, seconds in ((0.0, 5.0), (0.4, 0.5), (0.4, 1.0), (0.0, 1.0)):
+        for _ in range(round(seconds / PERIOD)):
+            read = servo.position + random.normal(0.0, noise)
+            servo.order = float(servo.output.step(np.array([velocity]), np.array([read]), *LIMITS)[0])
+            servo.position += (servo.order - sag - servo.position) * PERIOD / LAG
+            servo.position = min(servo.position, blocked)
+        blocked = servo.position if velocity else blocked
+    assert servo.order - servo.position == pytest.approx(sag, abs=5e-3)
+
+
 def test_a_joint_whose_load_is_not_known_yet_is_not_let_go():
     servo = Servo(output(lead=0.03), np.radians(2.5))
     servo.run(0.1)
