@@ -159,7 +159,9 @@ class ServoProcess:
         if self._auxiliary is None or self._dry_run:
             return
         for request in inputs.requests:
-            if not isinstance(request.command, OrderAuxiliary) or not self._active:  # a failed driver is stopped
+            if (
+                not isinstance(request.command, OrderAuxiliary) or not self._active
+            ):  # a failed driver is stopped
                 continue
             if any(event.request == request.request and event.accepted for event in outputs.events):
                 try:

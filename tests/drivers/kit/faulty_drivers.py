@@ -71,9 +71,7 @@ class Driver:
         joints = tuple(
             JointSpec(name, "revolute", -1.0, 1.0, 1.0, 100.0, self.resolution) for name in ("a", "b")
         )
-        return JointDriverDescription(
-            "small", joints, 250.0, "clock", TIMEOUT_S, 500.0, auxiliary=AUXILIARY
-        )
+        return JointDriverDescription("small", joints, 250.0, "clock", TIMEOUT_S, 500.0, auxiliary=AUXILIARY)
 
     def configure(self) -> None:
         self.life.require("configure()", CREATED)
