@@ -32,7 +32,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
     well, and the constants that are compiled into them: after an upgrade, or an edit, nothing old is run.
     """
 
-    def __init__(self, py_func: FunctionType) -> None:
+    def __init__(self, py_func: Any) -> None:
         super().__init__(py_func)
         file_hash(
             inspect.getfile(py_func)
