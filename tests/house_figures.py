@@ -65,7 +65,7 @@ def traced(call: Callable[[], Any]) -> CallPath:
     def enter(frame: FrameType, event: str, argument: Any) -> None:
         nonlocal last, hops
         name = frame.f_code.co_filename
-        if event != "call" or not name.startswith(inside):
+        if event != "call" or not name.startswith(inside) or name.endswith(LOADING):
             return
         root = next(root for root in inside if name.startswith(root))
         files.add(str(installed[root] / name.removeprefix(root)))
@@ -97,6 +97,10 @@ def _load(name: str, path: Path) -> ModuleType:
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+LOADING = "numerics/kernel_cache.py"
+"""Runs where a kernel is loaded, which the service does before its loop."""
 
 
 def servo_paths(law: str, steps: int = 40) -> tuple[CallPath, CallPath]:

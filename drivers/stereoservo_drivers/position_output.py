@@ -12,6 +12,12 @@ STANDS_SHARE = 0.02
 """Of the largest velocity: below it a joint counts as standing."""
 LEARNT_SHARE = 0.1
 """Of the lead: an offset that is known so well counts as learnt."""
+LETS_GO_SHARE = 0.25
+"""Of the largest velocity: as fast an order goes back from what blocked its joint."""
+GIVES_WAY_SHARE, GIVES_WAY_AFTER = 0.8, 0.3
+"""Of the way of an order that goes back: a joint that goes along so far carries a load, and nothing blocks it; judged
+after so much of the lead. What blocks a joint, be it soft, takes part of the way.
+"""
 _NEARLY = 1.0 - 1e-9
 
 
@@ -22,8 +28,9 @@ class PositionOutput:
     joint stands, offset under load included: a joint whose orders end goes no further than this. The joint never drags
     its order along, so that one that gives way under load is held. The offset, by which a stiff drive stays behind its
     order under load, is learnt while the joint stands, up to ``largest_offset`` (n,). A joint whose order has reached
-    the lead is taken for blocked once it stands or is commanded back: its order then begins anew where it stands, with
-    the offset of before. ``largest_velocities`` (n,), ``period_s``: of the orders.
+    the lead is taken for blocked once it stands or is commanded back: its order then goes back to where it stands, with
+    the offset of before. One that gives way meanwhile carries more than was known: it is held, until its load is.
+    ``largest_velocities`` (n,), ``period_s``: of the orders.
     """
 
     def __init__(
@@ -40,6 +47,11 @@ class PositionOutput:
         self._load = np.full(len(lead), np.nan)
         self._pressed = np.zeros(len(lead))
         self._rested_s = np.zeros(len(lead))
+        self._lets_go = np.zeros(len(lead))
+        self._way_back = np.zeros(len(lead))
+        self._stood_at = np.zeros(len(lead))
+        self._heavy = np.zeros(len(lead), dtype=bool)
+        self._back = LETS_GO_SHARE * largest_velocities * period_s
 
     def follow(self, positions: FloatArray, held: BoolArray) -> FloatArray:
         """Orders of joints at ``positions`` (n,) that are commanded nowhere: they stand where they are; those that are
@@ -51,6 +63,8 @@ class PositionOutput:
         self._slow = np.where(free, positions, self._slow)
         self._load = np.where(free, np.nan, self._load)
         self._pressed = np.where(free, 0.0, self._pressed)
+        self._lets_go = np.where(free, 0.0, self._lets_go)
+        self._heavy &= ~free
         self._last = positions.copy()
         return self.orders
 
@@ -92,16 +106,34 @@ class PositionOutput:
         """
         sign = np.sign(velocities)
         turned = self._pressed * sign < 0.0
-        released = turned | ((self._pressed != 0.0) & (sign == 0.0) & standing)
-        load = np.clip(self._load, -self._largest_offset, self._largest_offset)
-        self.orders = np.where(released, positions + self._load, self.orders)
-        self.offsets = np.where(released, load, self.offsets)
+        begins = (turned | ((self._pressed != 0.0) & (sign == 0.0) & standing)) & ~self._heavy
+        self._lets_go = np.where(begins, self._pressed, self._lets_go * (self._lets_go * sign <= 0.0))
+        self._way_back = np.where(begins, 0.0, self._way_back)
+        self._stood_at = np.where(begins, positions, self._stood_at + velocities * self._period_s)
+        self._let_go(positions)
         stands_off = self.orders - positions
         presses = (stands_off - self._load) * sign >= self._lead * _NEARLY
-        self._pressed = np.where(sign == 0.0, self._pressed * ~released, sign * presses)
+        self._pressed = np.where(sign == 0.0, self._pressed * ~begins, sign * presses)
         learnt = np.abs(stands_off - self.offsets) < LEARNT_SHARE * self._lead
-        rests = standing & (sign == 0.0) & (self._pressed == 0.0) & learnt
-        self._rested_s = np.where(moves, 0.0, self._rested_s + self._period_s * rests)
+        still = (sign == 0.0) & (self._pressed == 0.0) & (self._lets_go == 0.0)
+        rests = ~moves & still & learnt
+        # A reading that flickers hides a standing joint in many a step.
+        self._rested_s = np.where(rests, self._rested_s + self._period_s * standing, 0.0)
+        rested = self._rested_s >= LEARNS_S
+        self._heavy &= ~rested
         moves = moves & ~np.isnan(self._load)
-        known = np.where(rests & (self._rested_s >= LEARNS_S), stands_off, self._load)
-        self._load = np.where(moves, self.offsets, known)
+        self._load = np.where(moves, self.offsets, np.where(rested, stands_off, self._load))
+
+    def _let_go(self, positions: FloatArray) -> None:
+        """One step back of the orders that let go: to where the joint stands, or until it is seen to carry a load."""
+        left = (self.orders - positions - self._load) * self._lets_go
+        step = np.where(self._lets_go != 0.0, np.clip(left, 0.0, self._back), 0.0)
+        self.orders = self.orders - self._lets_go * step
+        self._way_back = self._way_back + step
+        along = (self._stood_at - positions) * self._lets_go
+        judged = (self._lets_go != 0.0) & (self._way_back >= GIVES_WAY_AFTER * self._lead)
+        self._heavy |= judged & (along >= GIVES_WAY_SHARE * self._way_back)
+        ends = (self._lets_go != 0.0) & ~self._heavy & (left <= self._back)
+        load = np.clip(self._load, -self._largest_offset, self._largest_offset)
+        self.offsets = np.where(ends, load, self.offsets)
+        self._lets_go = np.where(ends | self._heavy, 0.0, self._lets_go)

@@ -11,6 +11,7 @@ import pytest
 
 from stereoservo.core.monitor import detect_following_error
 from stereoservo.core.monitors.following import PLAY, SILENCE_S
+from stereoservo.core.move import unknown_delays
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import CoreState, initial_state
 from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Jog, JointTarget, Reset
@@ -242,6 +243,21 @@ def test_play_before_an_encoder_is_no_delay(bench):
     assert watched(settings, commands, with_play(travelled(commands), 0.015), state=state)[0] is None
     assert state.delays is not None
     assert state.delays.delay_s[0] == 0.0
+
+
+@pytest.mark.parametrize("known_s", [0.1, 0.2])
+def test_a_delay_that_is_too_long_hides_no_blocked_joint(bench, known_s):
+    """A joint whose play was taken for a delay: in a steady motion it is ahead of it, and is prompt from there on."""
+    settings = at_the_rate_of_these_tests(bench.settings)
+    state = initial_state(settings)
+    state.delays = unknown_delays(settings)
+    state.delays.samples[:, 0] = state.delays.delay_s[0] = known_s
+    commands, blocked = setting_out(1.0, 2.0), round(1.25 * RATE_HZ)
+    readings = travelled(commands)
+    readings[blocked:] = readings[blocked]
+    reason, k = watched(settings, commands, readings, state=state)
+    assert reason is not None
+    assert (k - blocked) * DT_S <= 0.175
 
 
 def test_a_drive_that_has_become_faster_is_not_blamed(bench):

@@ -602,6 +602,24 @@ def test_a_stop_stops_the_gripper_and_refuses_its_orders_until_resume(gripping: 
     assert gripping.arm.calls.count("write_auxiliary") == 1
 
 
+def test_a_gripper_that_is_ordered_in_the_cycle_of_a_stop_is_stopped(gripping: Bench) -> None:
+    enabled(gripping)
+    gripping.run(10)
+    gripping.arm.positions = gripping.arm.positions + 1.5  # a contact, or as here a reading that cannot be
+    assert gripping.ask(CLOSE).accepted
+    assert gripping.kinds()[-1] == "stopped"
+    assert gripping.arm.calls[-2:] == ["write_auxiliary", "stop_auxiliary"]
+
+
+def test_a_gripper_is_not_ordered_by_a_driver_that_has_just_failed(gripping: Bench) -> None:
+    enabled(gripping)
+    gripping.arm.fail["write_velocity"] = DriverError("connection_lost", "unplugged")
+    gripping.ask(CLOSE)
+    gripping.run(3)
+    assert gripping.state().status.lifecycle == "fault"
+    assert "write_auxiliary" not in gripping.arm.calls
+
+
 def test_a_driver_that_refuses_an_order_to_its_gripper_is_a_fault(gripping: Bench) -> None:
     enabled(gripping)
     gripping.arm.fail["write_auxiliary"] = DriverError("connection_lost", "unplugged")

@@ -28,6 +28,31 @@ FACTOR = {factor}
 def twice(x):
     return {count} * x
 """
+REACHES = """
+from acme import between
+from acme.called import default, enclosed
+from stereoservo.numerics.compilation import kernel
+
+@kernel
+def caller(x):
+    return between.FACTOR * default(x) * enclosed(x)
+"""
+REACHED = """
+from acme.constants import FACTOR
+from stereoservo.numerics.compilation import kernel
+
+@kernel
+def default(x, factor=FACTOR):
+    return factor * x
+
+def around(factor):
+    @kernel
+    def enclosed(x):
+        return factor * x
+    return enclosed
+
+enclosed = around(FACTOR)
+"""
 
 
 @pytest.fixture
@@ -41,12 +66,12 @@ def acme(tmp_path: Path) -> Path:
     return package
 
 
-def run(acme: Path, cache: Path, **environment: str) -> tuple[float, set[str]]:
-    """What a new process computes, and the kernels that it compiles."""
+def run(acme: Path, cache: Path, first: str = "", **environment: str) -> tuple[float, set[str]]:
+    """What a new process computes, after ``first``, and the kernels that it compiles."""
     log = cache.with_suffix(".log")
     log.unlink(missing_ok=True)
     done = subprocess.run(
-        [sys.executable, "-c", "from acme.caller import caller; print(caller(1.0))"],
+        [sys.executable, "-c", f"{first}\nfrom acme.caller import caller; print(caller(1.0))"],
         env=os.environ
         | {
             "PYTHONPATH": os.pathsep.join([str(acme.parent), os.environ.get("PYTHONPATH", "")]),
@@ -72,6 +97,25 @@ def test_a_kernel_is_renewed_with_what_it_calls(
     assert run(acme, tmp_path / "cache") == (20.0, set())
     (acme / "called.py").write_text(CALLED.format(**{"factor": 10.0, "count": 2} | change))
     assert run(acme, tmp_path / "cache") == (result, {"caller", "twice"})
+
+
+def test_a_kernel_is_renewed_with_constants_of_modules_of_defaults_and_of_functions_around_it(
+    acme: Path, tmp_path: Path
+) -> None:
+    (acme / "constants.py").write_text("FACTOR = 10.0\n")
+    (acme / "between.py").write_text("from acme.constants import FACTOR\n")
+    (acme / "called.py").write_text(REACHED)
+    (acme / "caller.py").write_text(REACHES)
+    assert run(acme, tmp_path / "cache")[0] == 1000.0
+    (acme / "constants.py").write_text("FACTOR = 7.0\n")
+    assert run(acme, tmp_path / "cache") == (343.0, {"caller", "default", "around.<locals>.enclosed"})
+
+
+def test_a_kernel_of_before_an_upgrade_is_not_taken_for_one_of_after(acme: Path, tmp_path: Path) -> None:
+    file, after = acme / "called.py", CALLED.format(factor=10.0, count=3)
+    upgrade = f"import pathlib, acme.caller; pathlib.Path({str(file)!r}).write_text({after!r})"
+    assert run(acme, tmp_path / "cache", upgrade)[0] == 20.0
+    assert run(acme, tmp_path / "cache")[0] == 30.0
 
 
 def test_installed_kernels_are_used_where_they_fit(acme: Path, tmp_path: Path) -> None:

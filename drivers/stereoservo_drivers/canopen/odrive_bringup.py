@@ -332,17 +332,18 @@ def check_settings(axis: odrive.Axis, values: dict[str, float], options: CanOpti
     ``limit`` (below the joint's largest velocity), ``mode`` (not the one that was set).
     """
     data = {"node_id": axis.node_id, "joint": axis.joint.name}
-    on, timeout_s = bool(values[WATCHDOG]), values[WATCHDOG_S]
-    if not (on and timeout_s > 0.0) and "watch" not in axis.joint.accept_missing:
+    timeout_s = values[WATCHDOG_S]
+    on = bool(values[WATCHDOG]) and timeout_s > 0.0
+    if not on and "watch" not in axis.joint.accept_missing:
         raise DriverError(
             "no_watch",
-            f"{axis.name}: its watchdog is off ({WATCHDOG} = {on}, {WATCHDOG_S} = {timeout_s:g} s): if this computer "
-            "dies, it goes on with the last velocity. Set both over USB and save, or say that a safety relay cuts its "
-            'power: accept_missing = ["watch"] of this joint',
+            f"{axis.name}: its watchdog is off ({WATCHDOG} = {bool(values[WATCHDOG])}, {WATCHDOG_S} = {timeout_s:g} "
+            "s): if this computer dies, it goes on with the last velocity. Set both over USB and save, or say that a "
+            'safety relay cuts its power: accept_missing = ["watch"] of this joint',
             **data,
         )
     least, most = LEAST_CYCLES / options.rate_hz, options.heartbeat_timeout_ms * 1e-3
-    if on and timeout_s > 0.0 and not least <= timeout_s <= most * (1.0 + 1e-6):
+    if on and not least <= timeout_s <= most * (1.0 + 1e-6):
         raise DriverError(
             "watchdog",
             f"{axis.name}: {WATCHDOG_S} = {timeout_s:g} s; valid: {least:g} s, {LEAST_CYCLES:g} cycles at rate_hz, to "
@@ -351,7 +352,7 @@ def check_settings(axis: odrive.Axis, values: dict[str, float], options: CanOpti
             **data,
         )
     speed, scale = values[SPEED], abs(axis.turns_per_unit)
-    if speed < axis.velocity_max * (1.0 - 1e-5):
+    if not speed >= axis.velocity_max * (1.0 - 1e-5):
         raise DriverError(
             "limit",
             f"{axis.name}: {SPEED} = {speed:g} turns/s, {speed / scale:.3g} rad/s or m/s at the joint, is below "

@@ -22,8 +22,9 @@ from stereoservo_drivers.kit.bench import JointDriverSetup
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, CheckResult, run_check
 
 WARNING = (
-    "THE ARM IS GOING TO MOVE: every joint, at a twentieth of its speed, for fractions of a second{far}. Is its "
-    "surrounding clear and a hand on the emergency stop? Begin"
+    "THE ARM IS GOING TO MOVE: every joint, at a twentieth of its speed, for fractions of a second{far}. Grippers and "
+    "other auxiliary joints move at their own speed, and all digital outputs (valves, clamps) are switched for half a "
+    "second. Is its surrounding clear and a hand on the emergency stop? Begin"
 )
 
 

@@ -27,13 +27,31 @@ def verify_order(values: Mapping[str, float], specs: tuple[AuxiliarySpec, ...]) 
             )
 
 
+def verify_specs(specs: tuple[AuxiliarySpec, ...]) -> None:
+    """Raises DriverError (``options``) for a name that occurs twice, no range, or a joint that would never move."""
+    names = [spec.name for spec in specs]
+    for spec in specs:
+        if names.count(spec.name) > 1:
+            raise DriverError(
+                "options",
+                f"auxiliary name {spec.name!r} occurs {names.count(spec.name)} times; once is valid",
+            )
+        if spec.kind != "digital" and not (spec.low < spec.high and spec.velocity > 0.0):
+            raise DriverError(
+                "options",
+                f"auxiliary {spec.name!r}: low {spec.low:g}, high {spec.high:g}, velocity {spec.velocity:g}; low below "
+                "high and a velocity above 0 are valid",
+            )
+
+
 class AuxiliaryMotion:
     """Simulated auxiliary joints, which go where they are ordered at their velocities, and outputs, at once.
 
-    Begins with every joint at the bound that is nearer to zero, and outputs off.
+    Begins with every joint at the bound that is nearer to zero, and outputs off. Raises DriverError (``options``).
     """
 
     def __init__(self, specs: tuple[AuxiliarySpec, ...]) -> None:
+        verify_specs(specs)
         self.specs = specs
         self._values = {spec.name: min(max(0.0, spec.low), spec.high) for spec in specs}
         self._orders = dict(self._values)

@@ -456,24 +456,26 @@ def _orders_auxiliary(bench: JointBench) -> str:
     for spec in specs:
         too_far = {spec.name: spec.high + 1.0}
         refused(lambda too_far=too_far: driver.write_auxiliary(too_far), f"{too_far} beyond its limits")
-    driver.write_auxiliary(ends)
-    bench.drive(driver, _zero(driver), 0.1)
-    driver.stop()
-    _call_stop(driver, "while an auxiliary joint moves")
-    bench.settle(driver, 0.2)
-    stopped = driver.read_auxiliary()
-    bench.settle(driver, 0.3)
-    after = driver.read_auxiliary()
+    try:
+        driver.write_auxiliary(ends)
+        bench.drive(driver, _zero(driver), 0.1)
+        _call_stop(driver, "while an auxiliary joint moves")
+        bench.settle(driver, 0.2)
+        stopped = driver.read_auxiliary()
+        bench.settle(driver, 0.3)
+        after = driver.read_auxiliary()
+    finally:  # a stop leaves outputs switched
+        outputs = {spec.name: before[spec.name] for spec in specs if spec.kind == "digital"}
+        if outputs:
+            driver.write_auxiliary(outputs)
     for spec in specs:
-        toward = (stopped[spec.name] - before[spec.name]) * (ends[spec.name] - before[spec.name])
+        now, was = stopped[spec.name], before[spec.name]
         require(
-            toward > 0.0,
-            f"{spec.name} is at {stopped[spec.name]:g}, ordered to {ends[spec.name]:g}",
+            (now - was) * (ends[spec.name] - was) > 0.0,
+            f"{spec.name} is at {now:g}, ordered to {ends[spec.name]:g}",
         )
-        still = abs(after[spec.name] - stopped[spec.name]) <= 1e-3 * (spec.high - spec.low)
-        require(
-            still, f"{spec.name} moves on after stop(), from {stopped[spec.name]:g} to {after[spec.name]:g}"
-        )
+        still = abs(after[spec.name] - now) <= 1e-3 * (spec.high - spec.low)
+        require(still, f"{spec.name} moves on after stop(), from {now:g} to {after[spec.name]:g}")
     driver.deactivate()
     refused(lambda: driver.write_auxiliary(before), "an order to auxiliary joints of an arm that is off")
     return ", ".join(f"{name} {value:.3g}" for name, value in after.items())

@@ -9,6 +9,7 @@ import typer
 
 from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit, pairs
 from stereoservo.client import Client
+from stereoservo.messages.wire import StateMessage
 
 SWITCHED = {"on": "1", "off": "0"}
 SHARE = 0.01
@@ -36,16 +37,25 @@ def auxiliary(
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         near = {spec.name: SHARE * (spec.high - spec.low) for spec in client.info().auxiliary}
         client.auxiliary(ordered)
-        until = time.monotonic() + wait
-        state, moved_at = client.status(), time.monotonic()
-        while (now := time.monotonic()) < until and now - moved_at < STANDS_S:
-            if _near(state.auxiliary, ordered, near):
-                break
-            time.sleep(POLL_S)
-            before, state = state, client.status()
-            if not _near(state.auxiliary, before.auxiliary, near):
-                moved_at = time.monotonic()
+        state = _arrived(client, ordered, near, wait)
     emit(state, "  ".join(f"{name} {value:g}" for name, value in state.auxiliary.items()), json)
+
+
+def _arrived(
+    client: Client, ordered: dict[str, float], near: dict[str, float], wait_s: float
+) -> StateMessage:
+    """The state once all are where they were ordered, or have stood for a while, or ``wait_s`` have passed."""
+    until = time.monotonic() + wait_s
+    state = stood = client.status()
+    moved_at = time.monotonic()
+    while (now := time.monotonic()) < until and now - moved_at < STANDS_S:
+        if _near(state.auxiliary, ordered, near):
+            break
+        time.sleep(POLL_S)
+        state = client.status()
+        if not _near(state.auxiliary, stood.auxiliary, near):  # however slowly
+            stood, moved_at = state, time.monotonic()
+    return state
 
 
 def _near(values: dict[str, float], wanted: dict[str, float], near: dict[str, float]) -> bool:

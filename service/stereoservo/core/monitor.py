@@ -293,8 +293,9 @@ def detect_following_error(
     told = state.last_joints_ns != state.last_followed_ns
     account_travel(
         state.command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, 1.0 / settings.rate_hz, delays.steps,
+        answers,
         (delays.delay_s, delays.sent, delays.past, delays.velocity, delays.under_way, delays.accounted, delays.missing),
-        state.untold_travel, state.missing_travel,
+        delays.samples, state.untold_travel, state.missing_travel,
     )  # fmt: skip
     delays.steps += 1
     account_silence(

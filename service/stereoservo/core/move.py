@@ -316,6 +316,8 @@ ONSET_TRAVEL = 2.0
 """The travel that is timed, times that by which a reading answers."""
 WAITS, RESTS, SETS_OUT = 0.0, 1.0, 2.0
 """Phases of a measurement."""
+STEADY = 0.1
+"""Share of a joint's command from which the one that arrives may differ in a motion that tells of the delay."""
 PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S, TOWARDS = range(7)
 """Rows of `DriveDelays.onset`."""
 
@@ -386,12 +388,14 @@ def _median(samples: FloatArray) -> float:
 @kernel
 def account_travel(
     command: FloatArray, moved: FloatArray, told: bool, keep: float, dt_s: float, period_s: float, step: int,
-    delays: tuple[FloatArray, ...], untold: FloatArray, missing: FloatArray,
+    answers: FloatArray, delays: tuple[FloatArray, ...], samples: FloatArray, untold: FloatArray, missing: FloatArray,
 ) -> None:  # fmt: skip
     """Account for ``dt_s`` [s] of travel, sent as of now in ``untold`` and ``missing`` (n,), as of the delays in
     ``delays``: `DriveDelays`' ``delay_s``, ``sent``, ``past``, ``velocity``, ``under_way``, ``accounted``, ``missing``.
 
-    ``moved`` (n,): of the readings since they were last ``told``; ``keep``: share of what is missing that is kept.
+    ``moved`` (n,): of the readings since they were last ``told``; ``keep``: share of what is missing that is kept. A
+    joint that makes, in steady motion, what has not arrived yet by its delay is less late: what it is goes into the
+    ``samples``.
     """
     delay_s, sent, past, velocity, under_way, accounted, missing_late = delays
     rows = past.shape[0]
@@ -412,3 +416,9 @@ def account_travel(
         missing[j] = keep * (missing[j] + untold[j] - moved[j])
         missing_late[j] = keep * (missing_late[j] + arrived - accounted[j] - moved[j])
         untold[j], accounted[j] = 0.0, arrived
+        speed, travel = abs(velocity[j]), ONSET_TRAVEL * answers[j]
+        ahead = -math.copysign(missing_late[j], missing_late[j] * velocity[j])
+        steady = abs(velocity[j] - command[j]) <= STEADY * speed and speed * ONSET_S >= travel
+        if back > 0 and steady and ahead > LEAST_S * speed + travel:  # it was play that took so long
+            _push(samples[:, j], max(delay_s[j] - ahead / speed, 0.0))
+            delay_s[j] = samples[-1, j] if samples[-1, j] >= LEAST_S else 0.0

@@ -158,16 +158,19 @@ class ServoProcess:
         """Hand orders of auxiliary joints, which the core has accepted, to the driver; a stop stops them, too."""
         if self._auxiliary is None or self._dry_run:
             return
-        if inputs.stop or any(event.kind in ("stopped", "fault") for event in outputs.events):
-            self._auxiliary.stop_auxiliary()
         for request in inputs.requests:
-            if not isinstance(request.command, OrderAuxiliary):
+            if (
+                not isinstance(request.command, OrderAuxiliary) or not self._active
+            ):  # a failed driver is stopped
                 continue
             if any(event.request == request.request and event.accepted for event in outputs.events):
                 try:
                     self._auxiliary.write_auxiliary(request.command.values)
                 except DriverError as error:
                     self._latch_fault(error, now_ns)
+        # After the orders: what stops the arm in this cycle, a contact say, may come after their answers.
+        if inputs.stop or any(event.kind in ("stopped", "fault") for event in outputs.events):
+            self._auxiliary.stop_auxiliary()
 
     def _auxiliary_values(self) -> dict[str, float]:
         if self._auxiliary is None or not self._configured or self._fault is not None:

@@ -32,6 +32,12 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
     well, and the constants that are compiled into them: after an upgrade, or an edit, nothing old is run.
     """
 
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        file_hash(
+            inspect.getfile(py_func)
+        )  # as imported: an upgrade may change the file before this is compiled
+
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return (*super()._index_key(sig, codegen), dependencies(self._py_func))
 
@@ -85,7 +91,7 @@ def shipped_folder() -> Path | None:
 
 def dependencies(function: Callable[..., Any]) -> str:
     """Hash of what a kernel is compiled of besides its own code: the source files of all kernels, functions and classes
-    of its distribution that it reaches by name, and the constants.
+    of its distribution that it reaches by name, the constants, and the defaults of arguments.
     """
     found: set[str] = set()
     seen: set[Callable[..., Any]] = set()
@@ -105,15 +111,13 @@ def _named_by(function: FunctionType) -> tuple[frozenset[str], tuple[FunctionTyp
     """A text for its own source file and each constant that a function names; and the functions that it names."""
     texts, called = {file_hash(inspect.getfile(function))}, []
     root = function.__module__.partition(".")[0]
-    for name in sorted(set(_names(function.__code__)) & function.__globals__.keys()):
-        value = function.__globals__[name]
-        value = getattr(value, "py_func", value)  # of a kernel
+    for name, value in _values(function, root):
         if isinstance(value, FunctionType) and not _foreign(value, root):
             called.append(value)
         elif isinstance(value, (type, ModuleType)):
             module = value.__name__ if isinstance(value, ModuleType) else value.__module__
             if not _foreign(value, root):
-                texts.add(file_hash(str(sys.modules[module].__file__)))
+                texts.add(file_hash(str(getattr(sys.modules[module], "__file__", module))))
         elif isinstance(value, np.ndarray):
             texts.add(f"{name} = {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}")
         elif isinstance(value, (bool, int, float, complex, str, tuple, np.generic)):
@@ -121,10 +125,29 @@ def _named_by(function: FunctionType) -> tuple[frozenset[str], tuple[FunctionTyp
     return frozenset(texts), tuple(called)
 
 
+def _values(function: FunctionType, root: str) -> Iterator[tuple[str, Any]]:
+    """What a function refers to, with its name: globals, variables of the functions around it, defaults of arguments,
+    and attributes of its distribution's modules; of a kernel its Python function.
+    """
+    names = sorted(set(_names(function.__code__)))
+    around = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    waiting = [(name, function.__globals__[name]) for name in names if name in function.__globals__]
+    waiting += [(name, cell.cell_contents) for name, cell in around]
+    waiting += [(f"default {k}", value) for k, value in enumerate(function.__defaults__ or ())]
+    waiting += (function.__kwdefaults__ or {}).items()
+    modules: set[str] = set()
+    while waiting:
+        name, value = waiting.pop()
+        if isinstance(value, ModuleType) and not _foreign(value, root) and value.__name__ not in modules:
+            modules.add(value.__name__)
+            waiting += [(f"{name}.{n}", getattr(value, n)) for n in names if hasattr(value, n)]
+        yield name, getattr(value, "py_func", value)
+
+
 def _foreign(value: Any, root: str) -> bool:
     """Whether a function, class or module belongs to a distribution that has a version of its own: numba, numpy."""
     name = value.__name__ if isinstance(value, ModuleType) else value.__module__
-    return not str(name).startswith((root.partition("_")[0], "stereoservo"))
+    return not str(name).startswith((root.partition("_")[0] or root, "stereoservo"))
 
 
 def _names(code: CodeType) -> Iterator[str]:

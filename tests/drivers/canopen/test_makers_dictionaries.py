@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.devices import DriverError
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.bringup import Subscriptions
 from stereoservo_drivers.canopen.cia402 import Cia402Codec
-from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
+from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup, DigitalOutputs
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
+from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CanOutput
 
@@ -264,6 +267,8 @@ def test_digital_outputs_are_switched_beside_the_cycle_and_told_once_confirmed()
     outputs.write(bench.bus, {"light": 1.0, "valve": 1.0})
     assert outputs.values() == {"valve": 0.0, "light": 0.0}, "nothing has been confirmed yet"
     bench.go(0.02, SPEED)
+    outputs.values()
+    bench.go(0.02, SPEED)
     assert bench.drive.get(0x60FE, 1) == 0x000B_0001, "the other bits stay"
     assert outputs.values() == {"valve": 1.0, "light": 1.0}
     outputs.write(bench.bus, {"valve": 0.0})
@@ -281,6 +286,57 @@ def test_an_output_that_the_drive_refuses_is_not_told_as_switched():
     bench.bringup.outputs.write(bench.bus, {"valve": 1.0})
     bench.go(0.02)
     assert bench.bringup.outputs.values()["valve"] == 0.0
+
+
+class SilentLine(Subscriptions):
+    """A bus whose drive answers what the test says, one order at a time; ``orders``: bits as they came."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.orders: list[int] = []
+        self.t_ns = 0
+
+    def send(self, frames: list[CanFrame]) -> None:
+        self.orders += [int.from_bytes(frame.data[4:], "little") for frame in frames]
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+    def answer(self, command: int) -> None:
+        self.tell(CanFrame(0x585, bytes([command, 0xFE, 0x60, 1]) + bytes(4)))
+
+
+@pytest.fixture
+def line() -> tuple[SilentLine, DigitalOutputs]:
+    names = ("valve", "light")
+    outputs = DigitalOutputs(tuple(CanOutput(name=n, node_id=5, bit=16 + k) for k, n in enumerate(names)))
+    bench, found = Bench(SHIPPED_EDS, (9,)), SilentLine()
+    bench.run()
+    with RemoteDrive(bench.bus, bench.codec.axes[0], bench.drive.node.object_dictionary) as drive:
+        outputs.prepare(drive)
+    outputs.listen(found)
+    return found, outputs
+
+
+def test_an_output_that_was_taken_stays_though_the_one_before_it_was_refused(line):
+    bus, outputs = line
+    outputs.write(bus, {"valve": 1.0})
+    outputs.write(bus, {"light": 1.0})
+    bus.answer(0x80)
+    outputs.values()
+    bus.answer(0x60)
+    outputs.write(bus, {"light": 0.0})
+    assert bus.orders[-1] & 0x1_0000, "the valve that was switched on by the second order"
+
+
+def test_an_answer_that_is_lost_does_not_shift_those_that_follow(line):
+    bus, outputs = line
+    outputs.write(bus, {"valve": 1.0})
+    bus.t_ns += 1_000_000_000
+    outputs.write(bus, {"valve": 0.0})
+    bus.answer(0x60)
+    assert outputs.values()["valve"] == 0.0
+    assert bus.orders == [0x1_0000, 0]
 
 
 def test_outputs_of_a_drive_without_any_are_refused():

@@ -404,6 +404,7 @@ def test_watchdog_limit_and_mode_are_read_back_where_the_release_is_known(tmp_pa
         ({"watchdog_timeout": struct.pack("<f", 0.005)}, "watchdog", "cycles"),
         ({"watchdog_timeout": struct.pack("<f", math.nan)}, "no_watch", "nan"),
         ({"vel_limit": struct.pack("<f", 2.0)}, "limit", "0.251 rad/s"),
+        ({"vel_limit": struct.pack("<f", math.nan)}, "limit", "nan"),
         ({"input_mode": b"\x02"}, "mode", r"\(2, 2\)"),
     ],
 )
@@ -415,8 +416,11 @@ def test_settings_that_do_not_keep_an_axis_safe_are_refused(tmp_path, changed, c
     assert not states_asked(link.sent, 3).count(8)
 
 
-def test_an_axis_without_watchdog_is_used_where_the_cell_file_says_that_it_is_known(tmp_path):
-    link, start = with_endpoints(tmp_path, axis=joint(accept_missing=("watch",)), enable_watchdog=b"\x00")
+@pytest.mark.parametrize(
+    "changed", [{"enable_watchdog": b"\x00"}, {"watchdog_timeout": struct.pack("<f", 0.0)}]
+)
+def test_an_axis_without_watchdog_is_used_where_the_cell_file_says_that_it_is_known(tmp_path, changed):
+    link, start = with_endpoints(tmp_path, axis=joint(accept_missing=("watch",)), **changed)
     start.connect(link)
     assert start.safety[3][0] is False
     assert "accept_missing" in start.safety[3][1]

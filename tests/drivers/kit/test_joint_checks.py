@@ -37,6 +37,20 @@ def test_a_planted_fault_is_caught_by_its_check_with_a_remedy(faulty, name, tmp_
     assert result.remedy == check.remedy
 
 
+def test_outputs_are_left_as_they_were_found(tmp_path):
+    made = []
+
+    class Kept(SmallSetup):
+        def make_driver(self, context):
+            made.append(super().make_driver(context))
+            return made[-1]
+
+    (check,) = (check for check in JOINT_CHECKS if check.name == "orders auxiliary joints")
+    result = run_check(check, Kept(), tmp_path)
+    assert (result.verdict, result.measured) == ("passed", "gripper 0.01, valve 1")
+    assert made[-1].read_auxiliary() == {"gripper": pytest.approx(0.01), "clamp": 0.0}
+
+
 def command(*arguments):
     app = typer.Typer()
     app.command()(driver_check)
