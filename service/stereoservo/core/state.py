@@ -30,7 +30,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
-STATE_VERSION = 8
+STATE_VERSION = 9
 OLDEST_VERSION = 6  # of states that are read
 HISTORY = 128  # joint samples kept for interpolation: a third of a second at 1 kHz, half of one at 250 Hz
 LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
@@ -589,12 +589,12 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
     midst of trial motions, whose course is another one now.
     """
-    if state["source"]["type"] == "trials":
+    if version < 8 and state["source"]["type"] == "trials":
         raise StateVersionError(version)
     if version == 6:  # before stamps and gaps of the loop were checked
         nothing = msgspec.to_builtins(Refused())
         state |= {"last_step_ns": 0, "refused_joints": nothing, "stop_reason": state["contact"].pop("reason")}
         state["refused_frames"] = [nothing for _ in state["cameras"]]
-    if (planning := state.get("planning")) is not None:  # before large bodies were planned in parts
+    if version < 8 and (planning := state.get("planning")) is not None:  # before large bodies were planned in parts
         planning["goal"] = planning["source"]["goal"]
     return state | {"version": STATE_VERSION}

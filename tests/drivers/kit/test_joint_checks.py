@@ -48,7 +48,7 @@ def test_outputs_are_left_as_they_were_found(tmp_path):
     (check,) = (check for check in JOINT_CHECKS if check.name == "orders auxiliary joints")
     result = run_check(check, Kept(), tmp_path)
     assert (result.verdict, result.measured) == ("passed", "gripper 0.01, valve 1")
-    assert made[-1].read_auxiliary() == {"gripper": pytest.approx(0.01), "clamp": 0.0}
+    assert made[-1].read_auxiliary() == {"gripper": pytest.approx(0.01), "valve": 0.0}
 
 
 def command(*arguments):
