@@ -595,6 +595,6 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
         nothing = msgspec.to_builtins(Refused())
         state |= {"last_step_ns": 0, "refused_joints": nothing, "stop_reason": state["contact"].pop("reason")}
         state["refused_frames"] = [nothing for _ in state["cameras"]]
-    if version < 8 and (planning := state.get("planning")) is not None:  # before large bodies were planned in parts
+    if version < 8 and (planning := state.get("planning")) is not None:  # large bodies are planned in parts
         planning["goal"] = planning["source"]["goal"]
     return state | {"version": STATE_VERSION}
