@@ -75,9 +75,10 @@ def test_weights_are_made_for_the_variance_that_they_show():
 
 def drawn(rows, rng, deviations):
     """The rows with pixels drawn anew, and errors of the joints with these deviations (18,)."""
-    errors = rng.standard_normal(rows.Z.shape[1]) * deviations[rows.component]
+    columns, component = rows.columns()
+    errors = rng.standard_normal(len(component)) * deviations[component]
     return rows._replace(
-        y=rng.standard_normal(len(rows.y)) + rows.Z @ errors, squares=float(rng.chisquare(rows.freedom))
+        y=rng.standard_normal(len(rows.y)) + columns @ errors, squares=float(rng.chisquare(rows.freedom))
     )
 
 

@@ -191,9 +191,9 @@ class _JointErrorsError(Exception):
     """Errors of the joint readings seemed to explain the data, and do not."""
 
 
-JointErrorsTaken = Literal["none", "beside scales", "scales too"]
-"""What joint readings are taken for: exact; with errors that scales of the joints do not explain better; with errors
-that scales may be among."""
+JointErrorsTaken = Literal["none", "at most likely", "beside scales", "scales too"]
+"""What joint readings are taken for: exact; exact, with what makes errors likely stated; with errors that scales of the
+joints do not explain better; with errors that scales may be among."""
 
 _FitOfTrials = Callable[[TrialData, FitOptions, JointErrorsTaken], _Fitted]
 
@@ -207,7 +207,7 @@ def _first_fit(
     """
 
     def exact() -> CalibrationFit:
-        return fit(chain, options, "none").fit
+        return fit(chain, options, "at most likely").fit
 
     try:
         tried = fit(chain, options, "beside scales")
@@ -347,12 +347,12 @@ def _fit(
     try:
         start, inexact = _start(trials, report_progress, options, priors, bend), False
     except CalibrationError as error:
-        if joint_errors == "none" or error.code not in OF_JOINT_ERRORS:
+        if joint_errors in ("none", "at most likely") or error.code not in OF_JOINT_ERRORS:
             raise
         start, inexact = _inexact_start(trials, report_progress, options, priors, bend, error), True
     components, doubtful, chance = None, False, 0.0
-    beside_scales = joint_errors == "beside scales"
-    found = None if joint_errors == "none" else _components_at_start(start, beside_scales)
+    beside_scales, proven = joint_errors == "beside scales", joint_errors not in ("none", "at most likely")
+    found = _components_at_start(start, beside_scales) if proven else None
     if inexact and found is None:
         raise _JointErrorsError
     if found is not None:
@@ -363,7 +363,11 @@ def _fit(
         bundles = _bundles(start, report_progress, options)
         if joint_errors != "none":
             rows = _reduced_rows(start, bundles.final)
-            refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
+            refined = (
+                _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
+                if proven
+                else None
+            )
             if refined is not None:
                 start, bundles, components, doubtful = refined
             elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
@@ -448,9 +452,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
-    final, inliers = refine_to_convergence(
-        raised.solution.rig, every, raised.solution.stratum, options, solution.lenses
-    )
+    final, inliers = _settled(raised.solution, every, options)
     for _ in range(2 if options.lens == "auto" else 0):
         wanted = lens_wanted(final)
         if wanted == final.lenses and raised.bent and final.lenses != FULL_LENS:
@@ -458,14 +460,20 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
         if wanted == final.lenses:
             break
         # Only the constraints of the higher stratum have separated distortion from kinematics.
-        solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, wanted, 1e-6)
-        raised = select_stratum(solution, _inside(every, solution, inliers), options)
-        final, inliers = refine_to_convergence(
-            raised.solution.rig, every, raised.solution.stratum, options, wanted
+        solution, inliers = refine_to_convergence(
+            solution.rig, every.corrected(solution.data.joint_errors), "projective", options, wanted, 1e-6
         )
+        raised = select_stratum(solution, _inside(every, solution, inliers), options)
+        final, inliers = _settled(raised.solution, every, options)
     refuse_poor_fit(trials, final, every, inliers, options)
     refuse_undetermined(final, raised.notes)
     return _Bundles(solution, raised, final, inliers)
+
+
+def _settled(raised: Solution, every: Measurements, options: FitOptions) -> tuple[Solution, BoolArray]:
+    """The final bundle and its inliers, from a solution of the stratum and its errors of the joints."""
+    from_there = every.corrected(raised.data.joint_errors)
+    return refine_to_convergence(raised.rig, from_there, raised.stratum, options, raised.lenses)
 
 
 def _reduced_rows(start: _Start, solution: Solution) -> ReducedRows:
@@ -543,6 +551,9 @@ def _refined_by_joint_errors(
         if (factors != 1.0).any():
             raise ScalesError(factors, beside)
     components = estimate_components(rows, scales=False, near=beside)
+    if near is None and components is not None and final.lenses != "none" and not start.decided:
+        bundles = _bundled_anew(start.with_joint_noise(components.noise(at)), options) or bundles
+        final, inliers = bundles.final, bundles.inliers
     inliers = with_whole_stops(start.every, inliers)
     for _ in range(2):
         if components is None:
@@ -561,6 +572,16 @@ def _refined_by_joint_errors(
     refuse_undetermined(final, bundles.raised.notes)
     doubtful = one_thing_happened(start.trials, final)
     return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
+
+
+def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
+    """Bundles of a start with joint noise; None where there are none. Lenses were found with exact readings, and may
+    have been bent by errors of the joints.
+    """
+    try:
+        return _bundles(noisy, _silent, options)
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+        return None
 
 
 def _from_other_lenses(

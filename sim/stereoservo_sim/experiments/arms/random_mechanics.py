@@ -37,7 +37,7 @@ NOISES = (0.01, 0.5)
 """[px], log-uniform."""
 MECHANISMS = ("ripple", "encoder", "play", "sag", "coupling")
 """The mechanism of seed k is the one at k modulo their number."""
-TOGETHER = 8
+TOGETHER = 16
 """Stops of all joints at once, as a cell file has by default."""
 INSIDE = 5.991
 """Squared distance that holds 95 % of two Gaussian coordinates."""
