@@ -485,9 +485,9 @@ def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Meas
     return every.corrected(solution.data.joint_errors).select(inliers)
 
 
-def _components_at_start(start: _Start, scales: bool) -> VarianceComponents | None:
-    """Significant variance components of the linked joints, with cameras free, beside ``scales`` of these where wanted;
-    None where there are none.
+def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponents | None:
+    """Significant variance components of the linked joints, with cameras free; None where there are none.
+    ``beside_scales``: none either where scales of the joints explain what is left. Raises ScalesError.
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
@@ -497,8 +497,17 @@ def _components_at_start(start: _Start, scales: bool) -> VarianceComponents | No
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     near = squares <= WILD * max(1.0, float(np.median(squares)))
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
-    found = estimate_components(_reduced_rows(start, free), scales=scales)
-    return found if found is not None and found.significant else None
+    rows = _reduced_rows(start, free)
+    found = estimate_components(rows, scales=beside_scales)
+    if found is None or not found.significant:
+        return None
+    if not beside_scales:
+        return found
+    factors = wrong_scales(start.trials, found)
+    if (factors != 1.0).any():
+        raise ScalesError(factors, found)
+    # Errors by posture that scales would have taken are the joints' own where these are right.
+    return estimate_components(rows, scales=False, near=found)
 
 
 def _bundles_with_joint_errors(
@@ -512,10 +521,6 @@ def _bundles_with_joint_errors(
     they do not explain the data, ScalesError.
     """
     at = readings(start.trials.positions - start.zero)
-    if beside_scales:
-        factors = wrong_scales(start.trials, found)
-        if (factors != 1.0).any():
-            raise ScalesError(factors, found)
     try:
         noisy = start.with_joint_noise(found.noise(at))
         first = _bundles(noisy, report_progress, options)

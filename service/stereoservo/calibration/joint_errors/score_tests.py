@@ -83,9 +83,7 @@ def score_tests(reduced: ReducedRows) -> ScoreTests | None:
 
     kinds = np.arange(3)
     single = [[probability(component == kind * n + joint) for joint in range(n)] for kind in kinds]
-    return ScoreTests(
-        np.array(single), np.array([probability(component // n == kind) for kind in kinds])
-    )
+    return ScoreTests(np.array(single), np.array([probability(component // n == kind) for kind in kinds]))
 
 
 def point_optimal_weights(sizes: FloatArray) -> FloatArray:
