@@ -78,7 +78,7 @@ def drawn(rows, rng, deviations):
     columns, component = rows.columns()
     errors = rng.standard_normal(len(component)) * deviations[component]
     return rows._replace(
-        y=rng.standard_normal(len(rows.y)) + columns @ errors, squares=float(rng.chisquare(rows.freedom))
+        y=np.linalg.cholesky(rows.pixels) @ rng.standard_normal(len(rows.y)) + columns @ errors, squares=float(rng.chisquare(rows.freedom))
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.stats import norm
 
@@ -67,6 +68,7 @@ def score_tests(reduced: ReducedRows) -> ScoreTests | None:
         return None
     n = reduced.joints
     columns, component = reduced.columns()
+    columns = solve_triangular(exact.root, columns, lower=True)
     columns -= exact.basis @ (exact.basis.T @ columns)
     scores = (exact.left @ columns) / np.sqrt(exact.pixels)
     products = columns.T @ columns

@@ -37,6 +37,8 @@ ROUNDS = 40
 """Rounds of Fisher scoring at most."""
 SETTLED = 1e-3
 """Gain in log-likelihood below which the components have converged."""
+FIXED = 0.01
+"""Length that a unit direction of the parameters has in the rows that no joint moves, from which they fix it."""
 RANK_TOLERANCE = 1e-9
 """Singular value of the unit columns below which a direction of the parameters is open."""
 
@@ -166,13 +168,15 @@ def noise_of_accuracy(accuracy: JointAccuracy, at: Readings) -> JointNoise:
 class ReducedRows(NamedTuple):
     """Rows that carry the components of ``joints`` joints: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales``
     (N, r), ``slopes`` (N, n) by the errors of the joints at the row's own stop, which begins at row ``begins`` (s,);
-    no row before the first has any. ``at``: the stops' readings. ``squares`` of the ``freedom`` rows left, which only
-    pixels scatter.
+    no row before the first has any. ``pixels`` (N, N): covariance by a unit variance of the pixels, those included by
+    which other rows have fixed parameters. ``at``: the stops' readings. ``squares`` of the ``freedom`` rows left, which
+    only pixels scatter.
     """
 
     y: FloatArray
     X: FloatArray
     scales: FloatArray
+    pixels: FloatArray
     slopes: FloatArray
     begins: IntArray
     at: Readings
@@ -249,15 +253,49 @@ def reduced_rows(solution: Solution, at_stops: Readings) -> ReducedRows:
     _, values, vectors = np.linalg.svd(X / np.where(size > 0.0, size, 1.0), full_matrices=False)
     known = values > RANK_TOLERANCE * values[0]
     X = (X / np.where(size > 0.0, size, 1.0)) @ (vectors[known].T / values[known])
-    return ReducedRows(
+    reduced = ReducedRows(
         whole[:, -1],
         X,
         whole[:, p:-1],
+        np.eye(len(whole)),
         slopes,
         at[:-1],
         Readings(at_stops.places[used], at_stops.features[used]),
         float((triangle[~carries, -1] ** 2).sum()),
         freedom - int(carries.sum()),
+    )
+    return _condensed(reduced)
+
+
+def _condensed(reduced: ReducedRows) -> ReducedRows:
+    """The rows without those before the first stop, as far as these fix parameters well: what they say of a parameter
+    is known before, with the pixels' variance (a recursive least squares step; the restricted likelihood is the same).
+    """
+    first = int(reduced.begins[0])
+    beside = np.column_stack([reduced.y, reduced.scales])
+    left, values, right = np.linalg.svd(reduced.X[:first])
+    sizes = np.zeros(len(right))
+    sizes[: len(values)] = values
+    fixed = sizes > FIXED
+    known, ahead = int(fixed.sum()), left.T @ beside[:first]
+    turned = reduced.X[first:] @ right.T
+    moved = turned[:, fixed] / sizes[fixed]
+    below = beside[first:] - moved @ ahead[:known]
+    weak = len(values) - known
+    rows = np.vstack([ahead[known : known + weak], below])
+    X = np.vstack([np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]])
+    pixels = np.eye(len(rows))
+    pixels[weak:, weak:] += moved @ moved.T
+    slopes = np.vstack([np.zeros((weak, reduced.joints)), reduced.slopes[first:]])
+    return reduced._replace(
+        y=rows[:, 0],
+        X=X,
+        scales=rows[:, 1:],
+        pixels=pixels,
+        slopes=slopes,
+        begins=reduced.begins - first + weak,
+        squares=reduced.squares + float((ahead[known + weak :, 0] ** 2).sum()),
+        freedom=reduced.freedom + first - known - weak,
     )
 
 
@@ -268,7 +306,7 @@ class _Likelihood:
         self.reduced, self.variances = reduced, variances
         n, first = reduced.joints, int(reduced.begins[0])
         counts = np.diff(np.append(reduced.begins, len(reduced.y)))
-        matrix = np.zeros((len(reduced.y), len(reduced.y)))
+        matrix = variances[0] * reduced.pixels
         for joint in np.flatnonzero(variances[1:].reshape(3, n).any(axis=0)):
             slopes = reduced.slopes[first:, joint]
             places, courses = reduced.shared(int(joint))
@@ -277,7 +315,6 @@ class _Likelihood:
             errors[np.diag_indices(len(errors))] += own
             errors = np.repeat(np.repeat(errors, counts, axis=0), counts, axis=1)
             matrix[first:, first:] += slopes[:, None] * slopes * errors
-        matrix[np.diag_indices(len(matrix))] += variances[0]
         self.root = np.linalg.cholesky(matrix)
         self.basis, triangle = np.linalg.qr(solve_triangular(self.root, X, lower=True))
         white = solve_triangular(self.root, reduced.y, lower=True)
@@ -306,7 +343,6 @@ class _Likelihood:
             mine = slice(1 + joint, None, n)
             up[mine] = _squares([pulled, *(spread.T @ pulled for spread in shared[joint])])
             down[mine] = np.trace(within), *((spread * (within @ spread)).sum() for spread in shared[joint])
-            information[0, mine] = _squares([whole, *(whole @ spread for spread in shared[joint])])
             for other in range(joint, n):
                 inner = reduced.by_stop(reduced.slopes[:, joint, None] * by_own[other])
                 ahead = [inner, *(inner @ spread for spread in shared[other])]
@@ -314,10 +350,16 @@ class _Likelihood:
                 block = np.array([_squares(row) for row in rows])
                 information[mine, 1 + other :: n] = block
                 information[1 + other :: n, mine] = block.T
-        up[0] = float(Py @ Py) + reduced.squares / pixels**2
-        down[0] = float(np.trace(P)) + reduced.freedom / pixels
+        # Of the pixels by what all variances do together: P V P = P.
+        freedom = len(Py) - self.basis.shape[1]
+        up[0] = (float(self.white @ self.white) - self.variances[1:] @ up[1:]) / pixels
+        down[0] = (freedom - self.variances[1:] @ down[1:]) / pixels
+        information[0] = (down - self.variances[1:] @ information[1:]) / pixels
         information[1:, 0] = information[0, 1:]
-        information[0, 0] = float((P**2).sum()) + reduced.freedom / pixels**2
+        information[0, 0] = (down[0] - self.variances[1:] @ information[1:, 0]) / pixels
+        up[0] += reduced.squares / pixels**2
+        down[0] += reduced.freedom / pixels
+        information[0, 0] += reduced.freedom / pixels**2
         factors = np.sqrt(up / np.where(down > 0.0, down, 1.0))
         return 0.5 * (up - down), 0.5 * information, np.where(down > 0.0, factors, 1.0)
 
@@ -357,10 +399,12 @@ def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[
 
 
 class ExactReadings(NamedTuple):
-    """Reduced rows under exact joint readings: ``basis`` (N, p) of the parameters, unit and orthogonal, what is
-    ``left`` (N,) beside them, and the variance of ``pixels`` over the stated one.
+    """Reduced rows under exact joint readings, whitened by the ``root`` (N, N) of the pixels: ``basis`` (N, p) of the
+    parameters, unit and orthogonal, what is ``left`` (N,) beside them, and the variance of ``pixels`` over the stated
+    one.
     """
 
+    root: FloatArray
     basis: FloatArray
     left: FloatArray
     pixels: float
@@ -371,9 +415,11 @@ def exact_readings(reduced: ReducedRows, X: FloatArray) -> ExactReadings | None:
     freedom = len(reduced.y) - X.shape[1] + reduced.freedom
     if freedom <= 0 or len(reduced.y) <= X.shape[1]:
         return None
-    basis = np.linalg.qr(X)[0]
-    left = reduced.y - basis @ (basis.T @ reduced.y)
-    return ExactReadings(basis, left, max((float(left @ left) + reduced.squares) / freedom, 1e-12))
+    root = np.linalg.cholesky(reduced.pixels)
+    basis = np.linalg.qr(solve_triangular(root, X, lower=True))[0]
+    left = solve_triangular(root, reduced.y, lower=True)
+    left -= basis @ (basis.T @ left)
+    return ExactReadings(root, basis, left, max((float(left @ left) + reduced.squares) / freedom, 1e-12))
 
 
 def estimate_components(
