@@ -77,8 +77,10 @@ def drawn(rows, rng, deviations):
     """The rows with pixels drawn anew, and errors of the joints with these deviations (18,)."""
     columns, component = rows.columns()
     errors = rng.standard_normal(len(component)) * deviations[component]
+    pixels = np.linalg.cholesky(rows.pixels) @ rng.standard_normal(len(rows.y))
     return rows._replace(
-        y=np.linalg.cholesky(rows.pixels) @ rng.standard_normal(len(rows.y)) + columns @ errors, squares=float(rng.chisquare(rows.freedom))
+        y=pixels + columns @ errors,
+        squares=float(rng.chisquare(rows.freedom)),
     )
 
 

@@ -68,7 +68,11 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
     solution = solution_of(mended, result)
     joints = estimate_components(reduced_rows(solution, readings(solution.data.offsets)), scales=False)
     # What moves all markers of a stop alike is no noise of pixels.
-    if joints is not None and joints.significant and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2:
+    if (
+        joints is not None
+        and joints.significant
+        and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2
+    ):
         return _inexact_joints(trials, joints)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
     factors = np.maximum(scatter[:, kept], 1.0) * factor

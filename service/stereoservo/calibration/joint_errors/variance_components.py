@@ -283,7 +283,9 @@ def _condensed(reduced: ReducedRows) -> ReducedRows:
     below = beside[first:] - moved @ ahead[:known]
     weak = len(values) - known
     rows = np.vstack([ahead[known : known + weak], below])
-    X = np.vstack([np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]])
+    X = np.vstack(
+        [np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]]
+    )
     pixels = np.eye(len(rows))
     pixels[weak:, weak:] += moved @ moved.T
     slopes = np.vstack([np.zeros((weak, reduced.joints)), reduced.slopes[first:]])
