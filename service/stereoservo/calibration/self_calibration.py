@@ -28,9 +28,9 @@ from stereoservo.calibration.diagnosis.joint_errors import (
     ScalesError,
     explains,
     one_thing_happened,
+    refuse_wrong_scales,
     scales_error,
     small_scales,
-    wrong_scales,
 )
 from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
@@ -363,11 +363,9 @@ def _fit(
         bundles = _bundles(start, report_progress, options)
         if joint_errors != "none":
             rows = _reduced_rows(start, bundles.final)
-            refined = (
-                _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
-                if proven
-                else None
-            )
+            refined = None
+            if proven:
+                refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
             elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
@@ -472,8 +470,8 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
 
 def _settled(raised: Solution, every: Measurements, options: FitOptions) -> tuple[Solution, BoolArray]:
     """The final bundle and its inliers, from a solution of the stratum and its errors of the joints."""
-    from_there = every.corrected(raised.data.joint_errors)
-    return refine_to_convergence(raised.rig, from_there, raised.stratum, options, raised.lenses)
+    every = every.corrected(raised.data.joint_errors)
+    return refine_to_convergence(raised.rig, every, raised.stratum, options, raised.lenses)
 
 
 def _reduced_rows(start: _Start, solution: Solution) -> ReducedRows:
@@ -499,13 +497,9 @@ def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponen
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
     rows = _reduced_rows(start, free)
     found = estimate_components(rows, scales=beside_scales)
-    if found is None or not found.significant:
-        return None
-    if not beside_scales:
-        return found
-    factors = wrong_scales(start.trials, found)
-    if (factors != 1.0).any():
-        raise ScalesError(factors, found)
+    if found is None or not found.significant or not beside_scales:
+        return found if found is not None and found.significant else None
+    refuse_wrong_scales(start.trials, found)
     # Errors by posture that scales would have taken are the joints' own where these are right.
     return estimate_components(rows, scales=False, near=found)
 
@@ -552,9 +546,7 @@ def _refined_by_joint_errors(
         beside = estimate_components(rows, scales=True, near=near)
         if beside is None or not beside.significant:
             return None
-        factors = wrong_scales(start.trials, beside)
-        if (factors != 1.0).any():
-            raise ScalesError(factors, beside)
+        refuse_wrong_scales(start.trials, beside)
     components = estimate_components(rows, scales=False, near=beside)
     if near is None and components is not None and final.lenses != "none" and not start.decided:
         bundles = _bundled_anew(start.with_joint_noise(components.noise(at)), options) or bundles
@@ -580,9 +572,7 @@ def _refined_by_joint_errors(
 
 
 def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
-    """Bundles of a start with joint noise; None where there are none. Lenses were found with exact readings, and may
-    have been bent by errors of the joints.
-    """
+    """Bundles of a start with joint noise; None where there are none: lenses bend by errors of exact readings."""
     try:
         return _bundles(noisy, _silent, options)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError):

@@ -118,6 +118,13 @@ def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArra
     return factors
 
 
+def refuse_wrong_scales(trials: TrialData, components: VarianceComponents) -> None:
+    """Raise ScalesError where scales are wrong beside the errors of the joints."""
+    factors = wrong_scales(trials, components)
+    if (factors != 1.0).any():
+        raise ScalesError(factors, components)
+
+
 def small_scales(cause: CalibrationError) -> str:
     """What may be instead of wrong scales where gears that give way may report as much, as a note; "" where they
     cannot.

@@ -186,7 +186,7 @@ class ReducedRows(NamedTuple):
     @property
     def joints(self) -> int:
         """Their number."""
-        return self.slopes.shape[1]
+        return int(self.slopes.shape[1])
 
     def shared(self, joint: int) -> tuple[FloatArray, FloatArray]:
         """Which errors of a joint stops share: the repeatable ones (s, places), none where every stop or no stop shares
@@ -417,7 +417,7 @@ def exact_readings(reduced: ReducedRows, X: FloatArray) -> ExactReadings | None:
     freedom = len(reduced.y) - X.shape[1] + reduced.freedom
     if freedom <= 0 or len(reduced.y) <= X.shape[1]:
         return None
-    root = np.linalg.cholesky(reduced.pixels)
+    root = np.asarray(np.linalg.cholesky(reduced.pixels), dtype=np.float64)
     basis = np.linalg.qr(solve_triangular(root, X, lower=True))[0]
     left = solve_triangular(root, reduced.y, lower=True)
     left -= basis @ (basis.T @ left)
