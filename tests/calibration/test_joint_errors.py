@@ -22,7 +22,7 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
-from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, judged_mechanics, share_inside
+from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, judged_mechanics, unseen
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.mechanical_trials import mechanical_trials
 from stereoservo_sim.world.mechanics import preset
@@ -205,7 +205,7 @@ def test_the_presets_calibrate_and_are_checked(name):
     result = fit_model(hidden_out_of_view(case.cell, trials), epoch=1)
     assert result.model.statistics.chi2_ok
     assert result.model.joint_accuracy is not None
-    assert share_inside(case, gears, result.model) > 0.6
+    assert unseen(case, gears, result.model)[1] > 0.6
     assert "Joint readings have errors" in assess_fit(result.model, result.report).text
     smaller = replace(case, cell=replace(case.cell, ranges=0.6 * case.cell.ranges), stops=5)
     check = hidden_out_of_view(

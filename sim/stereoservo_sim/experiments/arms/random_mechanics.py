@@ -173,13 +173,6 @@ def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
     return np.array(motors), np.array(moved, dtype=np.int64)
 
 
-def share_inside(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> float:
-    """Share of the markers in view, at poses that the trials have not seen, inside the ellipses that the model states
-    for them.
-    """
-    return unseen(case, gears, model)[1]
-
-
 def unseen(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> tuple[float, float]:
     """Root mean square error [px] of the markers in view, at what joints report at poses that the trials have not seen,
     and their share inside the ellipses that the model states for them.
