@@ -166,8 +166,7 @@ def build_fit(
     exact_joints_chance: float = 0.0,
 ) -> CalibrationFit:
     """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame; ``components``: of its
-    joint noise, or where readings are exact with some chance of the noise that is stated beside them. Raises
-    CalibrationError (``no_convergence``) where it is none.
+    joint noise, or where readings are exact with some chance of the noise stated beside them. Raises CalibrationError.
     """
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
