@@ -114,3 +114,9 @@ def test_noise_leads_no_axis_astray(seed):
     """The linear start finds no rotation here, and the nominal one creeps along a valley beside the minimum."""
     verdict = judged(seed)
     assert verdict.outcome == "success", verdict
+
+
+@pytest.mark.slow
+def test_a_lens_that_no_model_has_is_a_cause_that_fails():
+    """A correction that was tried ended in a distortion of -1.8, and the whole fit in a `ModelFileError`."""
+    assert judged(21040).code == "not_identifiable"

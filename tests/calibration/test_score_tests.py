@@ -75,9 +75,12 @@ def test_weights_are_made_for_the_variance_that_they_show():
 
 def drawn(rows, rng, deviations):
     """The rows with pixels drawn anew, and errors of the joints with these deviations (18,)."""
-    errors = rng.standard_normal(rows.Z.shape[1]) * deviations[rows.component]
+    columns, component = rows.columns()
+    errors = rng.standard_normal(len(component)) * deviations[component]
+    pixels = np.linalg.cholesky(rows.pixels) @ rng.standard_normal(len(rows.y))
     return rows._replace(
-        y=rng.standard_normal(len(rows.y)) + rows.Z @ errors, squares=float(rng.chisquare(rows.freedom))
+        y=pixels + columns @ errors,
+        squares=float(rng.chisquare(rows.freedom)),
     )
 
 
@@ -129,15 +132,14 @@ def test_exact_parameters_scatter_by_the_errors_of_the_joints(bundle):
 
 
 @pytest.mark.parametrize(
-    "seed", [10, *(pytest.param(k, marks=pytest.mark.slow) for k in (30, 33, 38, 64, 70))]
+    "seed", [10, *(pytest.param(k, marks=pytest.mark.slow) for k in (13, 25, 30, 33, 38, 64, 70, 109))]
 )
 def test_ellipses_hold_where_errors_are_likely(seed):
-    """Ripple, sag and coupling that pixels bury: all were called good, with 70 to 84 % inside the 95 % ellipses, from
-    single joints at equal steps.
+    """Ripple, sag and coupling that pixels bury: all were called good, with 49 to 84 % inside the 95 % ellipses, from
+    single joints at equal steps or with eight stops of all.
     """
     verdict = judged_mechanics(seed)
     assert verdict.usable
-    assert verdict.grade == "usable"
     assert verdict.inside > WELL
 
 

@@ -25,7 +25,7 @@ from stereoservo.calibration.bundle_statistics import (
 from stereoservo.calibration.joint_errors.variance_components import VarianceComponents, readings
 from stereoservo.calibration.lens_significance import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
-from stereoservo.calibration.trial_data import TrialData
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
@@ -36,6 +36,7 @@ from stereoservo.kinematics.model import (
     FitStatistics,
     JointStatistics,
     ModelCovariance,
+    ModelFileError,
     Stratum,
     check_model,
 )
@@ -165,7 +166,7 @@ def build_fit(
     exact_joints_chance: float = 0.0,
 ) -> CalibrationFit:
     """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame; ``components``: of its
-    joint noise, or where readings are exact with some chance of the noise that is stated beside them.
+    joint noise, or where readings are exact with some chance of the noise stated beside them. Raises CalibrationError.
     """
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
@@ -332,7 +333,12 @@ def build_model(
         source="trial motions",
         covariance=_covariance(solution, frame, back, cameras, points),
     )
-    check_model(model)
+    try:
+        check_model(model)
+    except ModelFileError as error:
+        raise CalibrationError(
+            "no_convergence", f"the fit ends in what is no model: {error}. Are positions and markers as said?"
+        ) from error
     return model
 
 

@@ -67,6 +67,8 @@ REMEDIES = {
     "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
     "camera, a wrong joint scale, a detector that understates its noise",
     "noise_understated": "raise the detector's sigma to what the text says; look whether images are dark or blurred",
+    "joints_inexact": "look for play, a loose coupling or a damaged encoder in the joints named; larger motions "
+    "(calibration.range) make such errors smaller beside them",
     "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",
     "lens_implausible": "show markers all over the images, or straight edges (--lines); larger motions, more stops",
     "wrong_scale": "correct the drive's scale: revolute joints report rad, with the gear taken into account",

@@ -28,9 +28,9 @@ from stereoservo.calibration.diagnosis.joint_errors import (
     ScalesError,
     explains,
     one_thing_happened,
+    refuse_wrong_scales,
     scales_error,
     small_scales,
-    wrong_scales,
 )
 from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
@@ -191,9 +191,9 @@ class _JointErrorsError(Exception):
     """Errors of the joint readings seemed to explain the data, and do not."""
 
 
-JointErrorsTaken = Literal["none", "beside scales", "scales too"]
-"""What joint readings are taken for: exact; with errors that scales of the joints do not explain better; with errors
-that scales may be among."""
+JointErrorsTaken = Literal["none", "at most likely", "beside scales", "scales too"]
+"""What joint readings are taken for: exact; exact, with what makes errors likely stated; with errors that scales of the
+joints do not explain better; with errors that scales may be among."""
 
 _FitOfTrials = Callable[[TrialData, FitOptions, JointErrorsTaken], _Fitted]
 
@@ -207,7 +207,7 @@ def _first_fit(
     """
 
     def exact() -> CalibrationFit:
-        return fit(chain, options, "none").fit
+        return fit(chain, options, "at most likely").fit
 
     try:
         tried = fit(chain, options, "beside scales")
@@ -347,12 +347,12 @@ def _fit(
     try:
         start, inexact = _start(trials, report_progress, options, priors, bend), False
     except CalibrationError as error:
-        if joint_errors == "none" or error.code not in OF_JOINT_ERRORS:
+        if joint_errors in ("none", "at most likely") or error.code not in OF_JOINT_ERRORS:
             raise
         start, inexact = _inexact_start(trials, report_progress, options, priors, bend, error), True
     components, doubtful, chance = None, False, 0.0
-    beside_scales = joint_errors == "beside scales"
-    found = None if joint_errors == "none" else _components_at_start(start, beside_scales)
+    beside_scales, proven = joint_errors == "beside scales", joint_errors not in ("none", "at most likely")
+    found = _components_at_start(start, beside_scales) if proven else None
     if inexact and found is None:
         raise _JointErrorsError
     if found is not None:
@@ -363,7 +363,9 @@ def _fit(
         bundles = _bundles(start, report_progress, options)
         if joint_errors != "none":
             rows = _reduced_rows(start, bundles.final)
-            refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
+            refined = None
+            if proven:
+                refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
             elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
@@ -448,9 +450,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
-    final, inliers = refine_to_convergence(
-        raised.solution.rig, every, raised.solution.stratum, options, solution.lenses
-    )
+    final, inliers = _settled(raised.solution, every, options)
     for _ in range(2 if options.lens == "auto" else 0):
         wanted = lens_wanted(final)
         if wanted == final.lenses and raised.bent and final.lenses != FULL_LENS:
@@ -458,14 +458,20 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
         if wanted == final.lenses:
             break
         # Only the constraints of the higher stratum have separated distortion from kinematics.
-        solution, inliers = refine_to_convergence(solution.rig, every, "projective", options, wanted, 1e-6)
-        raised = select_stratum(solution, _inside(every, solution, inliers), options)
-        final, inliers = refine_to_convergence(
-            raised.solution.rig, every, raised.solution.stratum, options, wanted
+        solution, inliers = refine_to_convergence(
+            solution.rig, every.corrected(solution.data.joint_errors), "projective", options, wanted, 1e-6
         )
+        raised = select_stratum(solution, _inside(every, solution, inliers), options)
+        final, inliers = _settled(raised.solution, every, options)
     refuse_poor_fit(trials, final, every, inliers, options)
     refuse_undetermined(final, raised.notes)
     return _Bundles(solution, raised, final, inliers)
+
+
+def _settled(raised: Solution, every: Measurements, options: FitOptions) -> tuple[Solution, BoolArray]:
+    """The final bundle and its inliers, from a solution of the stratum and its errors of the joints."""
+    every = every.corrected(raised.data.joint_errors)
+    return refine_to_convergence(raised.rig, every, raised.stratum, options, raised.lenses)
 
 
 def _reduced_rows(start: _Start, solution: Solution) -> ReducedRows:
@@ -477,9 +483,9 @@ def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Meas
     return every.corrected(solution.data.joint_errors).select(inliers)
 
 
-def _components_at_start(start: _Start, scales: bool) -> VarianceComponents | None:
-    """Significant variance components of the linked joints, with cameras free, beside ``scales`` of these where wanted;
-    None where there are none.
+def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponents | None:
+    """Significant variance components of the linked joints, with cameras free; None where there are none.
+    ``beside_scales``: none either where scales of the joints explain what is left. Raises ScalesError.
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
@@ -489,8 +495,13 @@ def _components_at_start(start: _Start, scales: bool) -> VarianceComponents | No
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     near = squares <= WILD * max(1.0, float(np.median(squares)))
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
-    found = estimate_components(_reduced_rows(start, free), scales=scales)
-    return found if found is not None and found.significant else None
+    rows = _reduced_rows(start, free)
+    found = estimate_components(rows, scales=beside_scales)
+    if found is None or not found.significant or not beside_scales:
+        return found if found is not None and found.significant else None
+    refuse_wrong_scales(start.trials, found)
+    # Errors by posture that scales would have taken are the joints' own where these are right.
+    return estimate_components(rows, scales=False, near=found)
 
 
 def _bundles_with_joint_errors(
@@ -504,10 +515,6 @@ def _bundles_with_joint_errors(
     they do not explain the data, ScalesError.
     """
     at = readings(start.trials.positions - start.zero)
-    if beside_scales:
-        factors = wrong_scales(start.trials, found)
-        if (factors != 1.0).any():
-            raise ScalesError(factors, found)
     try:
         noisy = start.with_joint_noise(found.noise(at))
         first = _bundles(noisy, report_progress, options)
@@ -539,10 +546,11 @@ def _refined_by_joint_errors(
         beside = estimate_components(rows, scales=True, near=near)
         if beside is None or not beside.significant:
             return None
-        factors = wrong_scales(start.trials, beside)
-        if (factors != 1.0).any():
-            raise ScalesError(factors, beside)
+        refuse_wrong_scales(start.trials, beside)
     components = estimate_components(rows, scales=False, near=beside)
+    if near is None and components is not None and final.lenses != "none" and not start.decided:
+        bundles = _bundled_anew(start.with_joint_noise(components.noise(at)), options) or bundles
+        final, inliers = bundles.final, bundles.inliers
     inliers = with_whole_stops(start.every, inliers)
     for _ in range(2):
         if components is None:
@@ -561,6 +569,14 @@ def _refined_by_joint_errors(
     refuse_undetermined(final, bundles.raised.notes)
     doubtful = one_thing_happened(start.trials, final)
     return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
+
+
+def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
+    """Bundles of a start with joint noise; None where there are none: lenses bend by errors of exact readings."""
+    try:
+        return _bundles(noisy, _silent, options)
+    except (CalibrationError, GeometryError, np.linalg.LinAlgError):
+        return None
 
 
 def _from_other_lenses(

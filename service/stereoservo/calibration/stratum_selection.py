@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import f as f_distribution
 
 from stereoservo.calibration import stratum_upgrade
 from stereoservo.calibration.alternative_axes import with_other_axes
@@ -194,11 +195,19 @@ class StratumSelector:
         return (solution, plane) if certain or self._close(solution) else None
 
     def _worse(self, solution: Solution, tail: float, projective: Solution | None = None) -> bool:
-        """Whether the constraints raise chi-square by more than true ones do with probability ``tail``."""
+        """Whether the constraints raise chi-square by more than true ones do with probability ``tail``.
+
+        Variances of the joints' errors are known with few freedoms, the projective bundle's too: what the joints of its
+        own trial may do. Fisher's distribution has them.
+        """
         beside = projective or self.projective
         fewer = max(1, beside.charts.size - solution.charts.size)
-        allowed = float(chi2_distribution.isf(tail, fewer)) * max(1.0, variance_factor(beside))
-        return solution.cost - beside.cost > allowed
+        if solution.data.joint_noise is None:
+            allowed = float(chi2_distribution.isf(tail, fewer))
+        else:
+            stops, joints = solution.data.offsets.shape
+            allowed = fewer * float(f_distribution.isf(tail, fewer, max(stops // joints - 3, 1)))
+        return solution.cost - beside.cost > allowed * max(1.0, variance_factor(beside))
 
     def _close(self, solution: Solution) -> bool:
         beside = max(1.0, variance_factor(self.projective))

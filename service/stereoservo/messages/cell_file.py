@@ -174,8 +174,8 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Smallest motion of a joint [rad or m] that can be used."""
     wait_s: Positive = 2.0
     """How long to wait at a stop for enough frames before backing off."""
-    together: Annotated[int, Meta(ge=0, le=8)] = 8
-    """Stops, after those of single joints, at which all joints stand apart from the base by about half of what each was
+    together: Annotated[int, Meta(ge=0, le=16)] = 16
+    """Stops, after those of single joints, at which all joints stand apart from the base by 0.4 to 0.8 of what each was
     driven; 0: none."""
     spread: SpreadSection | None = None
 

@@ -22,6 +22,12 @@ from stereoservo.calibration.diagnosis.joint_scales import (
 )
 from stereoservo.calibration.diagnosis.marker_tracks import path_noise
 from stereoservo.calibration.diagnosis.outlier_causes import predictions
+from stereoservo.calibration.joint_errors.variance_components import (
+    VarianceComponents,
+    estimate_components,
+    readings,
+    reduced_rows,
+)
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.numerics.arrays import FloatArray
@@ -34,13 +40,15 @@ UNDERSTATED = 1.5
 """How many times the stated sigmas paths must scatter for the detector to be looked into."""
 UNEVEN = 1.5
 """Residual of one joint's trial over another's up to which both are one noise."""
+NOTABLE = 0.1
+"""Share of the largest error of a joint, over its way, from which others are named beside it."""
 WHITE = 0.8
 """Noise about smooth paths in what a model leaves, over its residual, from which the residual is noise alone."""
 
 
 def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -> CalibrationError | None:
-    """Error of sigmas that are stated too small; None unless the trials fit with the sigmas that the markers'
-    tracks show, and only noise is left.
+    """Error of sigmas that are stated too small, or of joints that stand as much beside their readings; None unless the
+    trials fit with the sigmas that the markers' tracks show, and only noise is left.
     """
     scatter = path_noise(trials)
     if not float(scatter.max()) > UNDERSTATED:
@@ -57,6 +65,15 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
     uneven = max(joint.rms_px for joint in used.joints) > UNEVEN * min(joint.rms_px for joint in used.joints)
     if smooth or wild or uneven:
         return None  # noise is none of these: the model is wrong, or positions or times are
+    solution = solution_of(mended, result)
+    joints = estimate_components(reduced_rows(solution, readings(solution.data.offsets)), scales=False)
+    # What moves all markers of a stop alike is no noise of pixels.
+    if (
+        joints is not None
+        and joints.significant
+        and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2
+    ):
+        return _inexact_joints(trials, joints)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
     factors = np.maximum(scatter[:, kept], 1.0) * factor
     camera, marker = (int(i) for i in np.unravel_index(factors.argmax(), factors.shape))
@@ -72,6 +89,24 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
         worst=worst,
         maximum=options.max_sigma_factor,
         cameras={one.name: float(np.median(row)) for one, row in zip(trials.cameras, factors, strict=True)},
+    )
+
+
+def _inexact_joints(trials: TrialData, found: VarianceComponents) -> CalibrationError:
+    """Error of joints that stand so far beside their readings that no fit starts from these."""
+    deviations = np.sqrt(found.random + found.repeatable)
+    ways = np.ptp(trials.positions, axis=0)
+    listed = ", ".join(
+        f"{trials.joint_names[j]!r} by {1e3 * deviations[j]:.2g} {'mrad' if kind == 'revolute' else 'mm'} "
+        f"({deviations[j] / ways[j]:.0%} of its way)"
+        for j, kind in enumerate(trials.joint_kinds)
+        if deviations[j] > NOTABLE * float((deviations / ways).max()) * ways[j]
+    )
+    return CalibrationError(
+        "joints_inexact",
+        f"the joints do not stand where they report: joint {listed}, as standard deviations. That is too much beside "
+        "their motion for a fit; the pixels scatter as stated",
+        joints={name: float(one) for name, one in zip(trials.joint_names, deviations, strict=True)},
     )
 
 

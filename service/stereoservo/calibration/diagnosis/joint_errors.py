@@ -4,6 +4,7 @@ one wrong stop, a step.
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from scipy.stats import t as student
 
@@ -16,6 +17,7 @@ from stereoservo.calibration.joint_errors.variance_components import (
     SAME_READING,
     VarianceComponents,
 )
+from stereoservo.calibration.rig_model import predicted
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
@@ -23,9 +25,14 @@ EXPLAINED = 1.5
 """Residual over stated noise that may be left beside errors of the joints for these to be the cause."""
 MOST_OUTLIERS = 0.02
 """Share of the pixels that may be left out beside them."""
-ONE_STOP = 200.0
-"""Largest over median square of a joint's errors, from which a single stop is wrong: Gaussian ones of nine stops get
-there twice in a thousand."""
+ONE_STOP, OTHERS = 45.0, 0.75
+"""Largest square of a joint's errors, over the one that three quarters of them do not exceed, from which a single stop
+is wrong: Gaussian ones of nine stops get there twice in a thousand, and half of them may lie on one flank of a play.
+"""
+ONE_STEP = 0.5
+"""Share of what the model leaves at the reported positions that a step must explain to be what happened: errors of the
+joints leave more.
+"""
 WRONG_SHARE = 0.5
 """Error over reported displacement of a joint that stands elsewhere in another's trial, from which it is wrong."""
 LEAST_STOPS = 4
@@ -76,9 +83,14 @@ def one_thing_happened(trials: TrialData, solution: Solution) -> bool:
     for joint in range(errors.shape[1]):
         own = errors[trials.trials == joint, joint]
         squares = (own - np.median(own)) ** 2
-        if len(own) >= LEAST_STOPS and squares.max() > ONE_STOP * np.median(squares):
+        if len(own) >= LEAST_STOPS and squares.max() > ONE_STOP * np.quantile(squares, OTHERS):
             return True
-    return find_step(trials) is not None
+    reported = solution.data.corrected(None)
+    left = np.full_like(trials.pixels, np.nan)
+    left[reported.camera, reported.stop, reported.marker] = reported.pixels - predicted(
+        solution.rig, reported
+    )
+    return find_step(msgspec.structs.replace(trials, pixels=left), ONE_STEP) is not None
 
 
 def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArray:
@@ -104,6 +116,13 @@ def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArra
         ):
             factors[joint] = float(np.exp(log))
     return factors
+
+
+def refuse_wrong_scales(trials: TrialData, components: VarianceComponents) -> None:
+    """Raise ScalesError where scales are wrong beside the errors of the joints."""
+    factors = wrong_scales(trials, components)
+    if (factors != 1.0).any():
+        raise ScalesError(factors, components)
 
 
 def small_scales(cause: CalibrationError) -> str:

@@ -175,14 +175,14 @@ def paths_are_smooth(trials: TrialData) -> bool:
     return float(np.median(path_noise(trials))) < SMOOTH
 
 
-def find_step(trials: TrialData) -> TrackStep | None:
+def find_step(trials: TrialData, share: float = 0.0) -> TrackStep | None:
     """A step at one stop of all markers in one camera, of one marker in all cameras, or of all in all; None if
     there is none.
 
     Stops are in order of time. Each path is compared with polynomials in the moving joint about the common
-    base, one for each trial; None where no step explains what they leave.
+    base, one for each trial; None where no step explains what they leave, or less than a ``share`` of it.
     """
-    gains, sizes = _step_gains(trials)
+    gains, sizes, shares = _step_gains(trials)
     c, m = gains.shape[:2]
     found: list[tuple[float, TrackStep]] = []
     candidates: list[tuple[tuple[int, ...], tuple[int, ...]]] = [
@@ -194,7 +194,7 @@ def find_step(trials: TrialData) -> TrackStep | None:
         inside = np.zeros((c, m), dtype=bool)
         inside[np.ix_(cameras, markers)] = True
         stop = int(np.argmax(np.minimum(gains[inside], 1e6).sum(axis=0)))
-        steps = gains[:, :, stop] > STEP_STATISTIC
+        steps = (gains[:, :, stop] > STEP_STATISTIC) & (shares[:, :, stop] >= share)
         elsewhere = steps[~inside]
         if steps[inside].mean() >= STEP_SHARE and (not elsewhere.size or elsewhere.mean() <= 1 - STEP_SHARE):
             size = float(np.median(sizes[inside, stop]))
@@ -229,13 +229,15 @@ def path_basis(trials: TrialData) -> FloatArray:
     return np.stack([*bases.values(), *columns], axis=1) if bases else np.zeros((len(positions), 0))
 
 
-def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray]:
-    """Reduction of chi-square by a step before each stop in each track (c, m, s), and the step's size [px]."""
+def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Reduction of chi-square by a step before each stop in each track (c, m, s), the step's size [px], and the
+    reduction over what polynomials leave.
+    """
     c, s, m = trials.sigmas.shape
     basis = path_basis(trials)
     used = basis.any(axis=1)
     after = np.tri(s, s).astype(np.float64)  # column k: from stop k on
-    gains, sizes = np.zeros((c, m, s)), np.zeros((c, m, s))
+    gains, sizes, shares = np.zeros((c, m, s)), np.zeros((c, m, s)), np.zeros((c, m, s))
     for camera in range(c):
         for marker in range(m):
             rows = np.flatnonzero(used & trials.visible[camera, :, marker])
@@ -259,8 +261,9 @@ def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray]:
             noise = np.maximum(1.0, ((rest**2).sum() - gain) / freedom)
             noise = np.maximum(noise, _trial_noise(rest, steps, size, trials.trials[rows], trials.trials))
             gains[camera, marker] = gain / noise
+            shares[camera, marker] = gain / max(float((rest**2).sum()), 1e-300)
             sizes[camera, marker] = np.linalg.norm(size, axis=1)
-    return gains, sizes
+    return gains, sizes, shares
 
 
 def _trial_noise(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.stats import norm
 
@@ -66,7 +67,8 @@ def score_tests(reduced: ReducedRows) -> ScoreTests | None:
     if exact is None:
         return None
     n = reduced.joints
-    columns = reduced.Z.toarray()
+    columns, component = reduced.columns()
+    columns = solve_triangular(exact.root, columns, lower=True)
     columns -= exact.basis @ (exact.basis.T @ columns)
     scores = (exact.left @ columns) / np.sqrt(exact.pixels)
     products = columns.T @ columns
@@ -82,10 +84,8 @@ def score_tests(reduced: ReducedRows) -> ScoreTests | None:
         return weighted_chi2_tail(float(weights @ squares), weights)
 
     kinds = np.arange(3)
-    single = [[probability(reduced.component == kind * n + joint) for joint in range(n)] for kind in kinds]
-    return ScoreTests(
-        np.array(single), np.array([probability(reduced.component // n == kind) for kind in kinds])
-    )
+    single = [[probability(component == kind * n + joint) for joint in range(n)] for kind in kinds]
+    return ScoreTests(np.array(single), np.array([probability(component // n == kind) for kind in kinds]))
 
 
 def point_optimal_weights(sizes: FloatArray) -> FloatArray:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.sparse import csc_array, diags_array
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
@@ -38,6 +37,8 @@ ROUNDS = 40
 """Rounds of Fisher scoring at most."""
 SETTLED = 1e-3
 """Gain in log-likelihood below which the components have converged."""
+FIXED = 0.01
+"""Length that a unit direction of the parameters has in the rows that no joint moves, from which they fix it."""
 RANK_TOLERANCE = 1e-9
 """Singular value of the unit columns below which a direction of the parameters is open."""
 
@@ -166,19 +167,53 @@ def noise_of_accuracy(accuracy: JointAccuracy, at: Readings) -> JointNoise:
 
 class ReducedRows(NamedTuple):
     """Rows that carry the components of ``joints`` joints: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales``
-    (N, r), ``Z`` (N, e) of the joints' errors with the ``component`` (e,) of each, counted by joint, first the random
-    ones, then the repeatable, then those by posture; ``squares`` of the ``freedom`` rows left, which only pixels
-    scatter.
+    (N, r), ``slopes`` (N, n) by the errors of the joints at the row's own stop, which begins at row ``begins`` (s,);
+    no row before the first has any. ``pixels`` (N, N): covariance by a unit variance of the pixels, those included by
+    which other rows have fixed parameters. ``at``: the stops' readings. ``squares`` of the ``freedom`` rows left, which
+    only pixels scatter.
     """
 
-    joints: int
     y: FloatArray
     X: FloatArray
     scales: FloatArray
-    Z: csc_array
-    component: IntArray
+    pixels: FloatArray
+    slopes: FloatArray
+    begins: IntArray
+    at: Readings
     squares: float
     freedom: int
+
+    @property
+    def joints(self) -> int:
+        """Their number."""
+        return int(self.slopes.shape[1])
+
+    def shared(self, joint: int) -> tuple[FloatArray, FloatArray]:
+        """Which errors of a joint stops share: the repeatable ones (s, places), none where every stop or no stop shares
+        one, and those by posture (s, r).
+        """
+        places, where = np.unique(self.at.places[:, joint], return_inverse=True)
+        own = np.arange(len(places)) if 1 < len(places) < len(self.begins) else np.zeros(0)
+        return (where[:, None] == own).astype(np.float64), self.at.features
+
+    def by_stop(self, rows: FloatArray) -> FloatArray:
+        """Sums (s, ...) of ``rows`` (N, ...) over each stop's own."""
+        return np.asarray(np.add.reduceat(rows, self.begins, axis=0))
+
+    def columns(self) -> tuple[FloatArray, IntArray]:
+        """All errors of the joints as columns (N, e), and the component (e,) of each, counted by joint, first the
+        random ones, then the repeatable, then those by posture.
+        """
+        stops, n = len(self.begins), self.joints
+        at = np.searchsorted(self.begins, np.arange(len(self.y)), side="right") - 1
+        own = (at[:, None] == np.arange(stops)).astype(np.float64)
+        columns, component = [], []
+        for joint in range(n):
+            of_joint = own * self.slopes[:, joint, None]
+            for kind, spread in enumerate((np.eye(stops), *self.shared(joint))):
+                columns.append(of_joint @ spread)
+                component += [kind * n + joint] * spread.shape[1]
+        return np.hstack(columns), np.array(component, dtype=np.int64)
 
 
 def reduced_rows(solution: Solution, at_stops: Readings) -> ReducedRows:
@@ -212,33 +247,57 @@ def reduced_rows(solution: Solution, at_stops: Readings) -> ReducedRows:
     carries = np.linalg.norm(triangle[:, :p] / np.where(lengths > 0.0, lengths, 1.0), axis=1) > 1e-10
     whole = np.vstack([triangle[carries], *tops])
     at = int(carries.sum()) + np.concatenate([[0], np.cumsum([len(top) for top in tops])])
-    Z, component = [], []
-    for joint in range(n):
-        own = np.zeros((len(whole), len(blocks)))
-        for k, block in enumerate(blocks):
-            own[at[k] : at[k + 1], k] = block[:, joint]
-        Z.append(own)
-        component += [joint] * len(blocks)
-        places, where = np.unique(at_stops.places[used, joint], return_inverse=True)
-        if 1 < len(places) < len(blocks):
-            Z.append(own @ (where[:, None] == np.arange(len(places))))
-            component += [n + joint] * len(places)
-        Z.append(own @ at_stops.features[used])
-        component += [2 * n + joint] * at_stops.features.shape[1]
+    slopes = np.vstack([np.zeros((int(carries.sum()), n)), *blocks])
     X = whole[:, :p]
     size = np.linalg.norm(X, axis=0)
     _, values, vectors = np.linalg.svd(X / np.where(size > 0.0, size, 1.0), full_matrices=False)
     known = values > RANK_TOLERANCE * values[0]
     X = (X / np.where(size > 0.0, size, 1.0)) @ (vectors[known].T / values[known])
-    return ReducedRows(
-        n,
+    reduced = ReducedRows(
         whole[:, -1],
         X,
         whole[:, p:-1],
-        csc_array(np.hstack(Z)),
-        np.array(component),
+        np.eye(len(whole)),
+        slopes,
+        at[:-1],
+        Readings(at_stops.places[used], at_stops.features[used]),
         float((triangle[~carries, -1] ** 2).sum()),
         freedom - int(carries.sum()),
+    )
+    return _condensed(reduced)
+
+
+def _condensed(reduced: ReducedRows) -> ReducedRows:
+    """The rows without those before the first stop, as far as these fix parameters well: what they say of a parameter
+    is known before, with the pixels' variance (a recursive least squares step; the restricted likelihood is the same).
+    """
+    first = int(reduced.begins[0])
+    beside = np.column_stack([reduced.y, reduced.scales])
+    left, values, right = np.linalg.svd(reduced.X[:first])
+    sizes = np.zeros(len(right))
+    sizes[: len(values)] = values
+    fixed = sizes > FIXED
+    known, ahead = int(fixed.sum()), left.T @ beside[:first]
+    turned = reduced.X[first:] @ right.T
+    moved = turned[:, fixed] / sizes[fixed]
+    below = beside[first:] - moved @ ahead[:known]
+    weak = len(values) - known
+    rows = np.vstack([ahead[known : known + weak], below])
+    X = np.vstack(
+        [np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]]
+    )
+    pixels = np.eye(len(rows))
+    pixels[weak:, weak:] += moved @ moved.T
+    slopes = np.vstack([np.zeros((weak, reduced.joints)), reduced.slopes[first:]])
+    return reduced._replace(
+        y=rows[:, 0],
+        X=X,
+        scales=rows[:, 1:],
+        pixels=pixels,
+        slopes=slopes,
+        begins=reduced.begins - first + weak,
+        squares=reduced.squares + float((ahead[known + weak :, 0] ** 2).sum()),
+        freedom=reduced.freedom + first - known - weak,
     )
 
 
@@ -247,11 +306,17 @@ class _Likelihood:
 
     def __init__(self, reduced: ReducedRows, X: FloatArray, variances: FloatArray) -> None:
         self.reduced, self.variances = reduced, variances
-        weights = variances[1 + reduced.component]
-        used = weights > 0.0
-        scaled = reduced.Z[:, used] @ diags_array(np.sqrt(weights[used]))
-        matrix = (scaled @ scaled.T).toarray()
-        matrix[np.diag_indices(len(matrix))] += variances[0]
+        n, first = reduced.joints, int(reduced.begins[0])
+        counts = np.diff(np.append(reduced.begins, len(reduced.y)))
+        matrix = variances[0] * reduced.pixels
+        for joint in np.flatnonzero(variances[1:].reshape(3, n).any(axis=0)):
+            slopes = reduced.slopes[first:, joint]
+            places, courses = reduced.shared(int(joint))
+            own, repeatable, posture = variances[1 + joint :: n]
+            errors = repeatable * places @ places.T + posture * courses @ courses.T
+            errors[np.diag_indices(len(errors))] += own
+            errors = np.repeat(np.repeat(errors, counts, axis=0), counts, axis=1)
+            matrix[first:, first:] += slopes[:, None] * slopes * errors
         self.root = np.linalg.cholesky(matrix)
         self.basis, triangle = np.linalg.qr(solve_triangular(self.root, X, lower=True))
         white = solve_triangular(self.root, reduced.y, lower=True)
@@ -264,26 +329,46 @@ class _Likelihood:
         """Derivative by the variances, the expected information, and the factor that each takes in a step of
         minorise-maximise, which never lowers the likelihood.
         """
-        reduced, pixels = self.reduced, self.variances[0]
+        reduced, pixels, n = self.reduced, self.variances[0], self.reduced.joints
         half = solve_triangular(self.root, np.eye(len(self.root)), lower=True)
         half -= self.basis @ (self.basis.T @ half)
         P = half.T @ half
         Py = half.T @ self.white
-        PZ = (reduced.Z.T @ P).T
-        inner = reduced.Z.T @ PZ
-        count = len(self.variances)
-        member = reduced.component[None] == np.arange(count - 1)[:, None]
-        up, down = np.zeros(count), np.zeros(count)
-        up[1:] = member @ (reduced.Z.T @ Py) ** 2
-        down[1:] = member @ np.diag(inner)
-        up[0] = float(Py @ Py) + reduced.squares / pixels**2
-        down[0] = float(np.trace(P)) + reduced.freedom / pixels
-        information = np.zeros((count, count))
-        information[1:, 1:] = 0.5 * member @ inner**2 @ member.T
-        information[0, 1:] = information[1:, 0] = 0.5 * member @ (PZ**2).sum(axis=0)
-        information[0, 0] = 0.5 * (float((P**2).sum()) + reduced.freedom / pixels**2)
+        shared = [reduced.shared(joint) for joint in range(n)]
+        # P times the columns of each joint's errors at each stop, (N, s).
+        by_own = [reduced.by_stop(reduced.slopes[:, joint, None] * P).T for joint in range(n)]
+        up, down = np.zeros(1 + 3 * n), np.zeros(1 + 3 * n)
+        information = np.zeros((1 + 3 * n, 1 + 3 * n))
+        for joint, whole in enumerate(by_own):
+            pulled = reduced.by_stop(reduced.slopes[:, joint] * Py)
+            within = reduced.by_stop(reduced.slopes[:, joint, None] * whole)
+            mine = slice(1 + joint, None, n)
+            up[mine] = _squares([pulled, *(spread.T @ pulled for spread in shared[joint])])
+            down[mine] = np.trace(within), *((spread * (within @ spread)).sum() for spread in shared[joint])
+            for other in range(joint, n):
+                inner = reduced.by_stop(reduced.slopes[:, joint, None] * by_own[other])
+                ahead = [inner, *(inner @ spread for spread in shared[other])]
+                rows = [ahead, *([spread.T @ one for one in ahead] for spread in shared[joint])]
+                block = np.array([_squares(row) for row in rows])
+                information[mine, 1 + other :: n] = block
+                information[1 + other :: n, mine] = block.T
+        # Of the pixels by what all variances do together: P V P = P.
+        freedom = len(Py) - self.basis.shape[1]
+        up[0] = (float(self.white @ self.white) - self.variances[1:] @ up[1:]) / pixels
+        down[0] = (freedom - self.variances[1:] @ down[1:]) / pixels
+        information[0] = (down - self.variances[1:] @ information[1:]) / pixels
+        information[1:, 0] = information[0, 1:]
+        information[0, 0] = (down[0] - self.variances[1:] @ information[1:, 0]) / pixels
+        up[0] += reduced.squares / pixels**2
+        down[0] += reduced.freedom / pixels
+        information[0, 0] += reduced.freedom / pixels**2
         factors = np.sqrt(up / np.where(down > 0.0, down, 1.0))
-        return 0.5 * (up - down), information, np.where(down > 0.0, factors, 1.0)
+        return 0.5 * (up - down), 0.5 * information, np.where(down > 0.0, factors, 1.0)
+
+
+def _squares(arrays: list[FloatArray]) -> list[float]:
+    """Sum of the squares of each."""
+    return [float((one**2).sum()) for one in arrays]
 
 
 def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[_Likelihood, FloatArray]:
@@ -316,10 +401,12 @@ def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[
 
 
 class ExactReadings(NamedTuple):
-    """Reduced rows under exact joint readings: ``basis`` (N, p) of the parameters, unit and orthogonal, what is
-    ``left`` (N,) beside them, and the variance of ``pixels`` over the stated one.
+    """Reduced rows under exact joint readings, whitened by the ``root`` (N, N) of the pixels: ``basis`` (N, p) of the
+    parameters, unit and orthogonal, what is ``left`` (N,) beside them, and the variance of ``pixels`` over the stated
+    one.
     """
 
+    root: FloatArray
     basis: FloatArray
     left: FloatArray
     pixels: float
@@ -330,9 +417,11 @@ def exact_readings(reduced: ReducedRows, X: FloatArray) -> ExactReadings | None:
     freedom = len(reduced.y) - X.shape[1] + reduced.freedom
     if freedom <= 0 or len(reduced.y) <= X.shape[1]:
         return None
-    basis = np.linalg.qr(X)[0]
-    left = reduced.y - basis @ (basis.T @ reduced.y)
-    return ExactReadings(basis, left, max((float(left @ left) + reduced.squares) / freedom, 1e-12))
+    root = np.asarray(np.linalg.cholesky(reduced.pixels), dtype=np.float64)
+    basis = np.linalg.qr(solve_triangular(root, X, lower=True))[0]
+    left = solve_triangular(root, reduced.y, lower=True)
+    left -= basis @ (basis.T @ left)
+    return ExactReadings(root, basis, left, max((float(left @ left) + reduced.squares) / freedom, 1e-12))
 
 
 def estimate_components(
@@ -355,7 +444,7 @@ def estimate_components(
         return None
     there = np.diag(information)[1:] > 0.0
     guess = np.zeros(3 * n)
-    guess[there] = pixels / np.array([_mean_square(reduced, int(c)) for c in np.flatnonzero(there)])
+    guess[there] = pixels / _mean_squares(reduced)[there]
     first = np.append(min(pixels, 1.0), guess)
     if near is not None:
         first = np.concatenate([[near.pixels], near.random, near.repeatable, near.posture])
@@ -386,11 +475,14 @@ def _unit(columns: FloatArray) -> FloatArray:
     return np.asarray(columns / np.where(sizes > 0.0, sizes, 1.0))
 
 
-def _mean_square(reduced: ReducedRows, component: int) -> float:
-    """Mean squared length of a component's columns: what a unit of its variance adds to a row, over its rows."""
-    return float((reduced.Z[:, reduced.component == component] ** 2).sum()) / int(
-        (reduced.component == component).sum()
-    )
+def _mean_squares(reduced: ReducedRows) -> FloatArray:
+    """Mean squared length (3 n,) of each component's columns: what a unit of its variance adds to a row, over its
+    rows.
+    """
+    columns, component = reduced.columns()
+    counts = np.bincount(component, minlength=3 * reduced.joints)
+    sums = np.bincount(component, (columns**2).sum(axis=0), 3 * reduced.joints)
+    return np.asarray(sums / np.maximum(counts, 1))
 
 
 def _scale_estimates(best: _Likelihood, reduced: ReducedRows) -> tuple[FloatArray, FloatArray]:

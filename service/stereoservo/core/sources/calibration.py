@@ -99,6 +99,8 @@ def _move(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
         enter(trials, "settle", context)
         return _rest(context)
     reason = too_slow(trials, context, settings)
+    if reason is not None and _combining(trials) and trials.phase == "move":
+        return _left_out(trials, context, f"is not reached: {reason.hint}")
     if reason is not None:
         return _abort(trials, context, reason)
     if trials.phase == "move" and trials.joint >= 0 and markers_lost(trials, context, settings):
@@ -255,13 +257,7 @@ def _turn_done(
     if trials.joint < 0 or (_combining(trials) and not lost):
         return _next(trials, context, settings)
     if _combining(trials):
-        context.emit(
-            "warning", id=trials.id,
-            message=f"calibration: stop {trials.k} of all joints loses the markers {lost}; left out",
-        )  # fmt: skip
-        trials.target = settings.base.copy()
-        enter(trials, "return", context)
-        return _rest(context)
+        return _left_out(trials, context, f"loses the markers {lost}")
     if trials.seen_turns == 0:
         return _back_off(trials, context, settings, lost)
     trials.stops[trials.joint] += 1
@@ -437,6 +433,16 @@ def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSet
             "warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints left out {why}"
         )
     return False
+
+
+def _left_out(trials: CalibrationMotion, context: StepContext, why: str) -> SourceOutput:
+    """Leave out a stop of all joints, by way of the base."""
+    context.emit(
+        "warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints {why}; left out"
+    )
+    trials.target = trial_settings(context.settings).base.copy()
+    enter(trials, "return", context)
+    return _rest(context)
 
 
 def _back_off(

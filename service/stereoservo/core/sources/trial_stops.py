@@ -19,9 +19,12 @@ from stereoservo.ports.devices import JointKindName
 GOLDEN = 0.6180339887498949
 UNEVEN_STEP = 0.5
 """Share of a step by which stops of a single joint stand nearer at most."""
-SHARE, UNEVEN = 0.55, 0.25
+SHARE, UNEVEN = 0.8, 0.5
 """Of half the way that a joint was driven, how far it stands from the middle of that way at most; share of that by
-which stops differ, so that a gear's ripple does not repeat."""
+which stops differ, so that a gear's ripple does not repeat and what grows with the way shows."""
+ORDER = 16
+"""Of the Hadamard matrix that gives the sides on which joints stand: its columns after the first, of ones, are as many
+joints as a cell has at most."""
 SHRUNK = (1.0, 0.75, 0.5)
 """Shares of a stop that are tried one after the other until the markers stay in view."""
 
@@ -42,11 +45,11 @@ def combined_offsets(k: int, low: FloatArray, high: FloatArray) -> FloatArray:
     """Offsets (n,) from the base of stop ``k`` of all joints, which single ones were driven from ``low`` to ``high``
     (n,).
 
-    Signs are those of the columns of a Hadamard matrix of order 8: every pair of seven joints meets equally often on
-    either side.
+    Signs are those of the columns of a Hadamard matrix: within ``ORDER`` stops every pair of joints meets equally often
+    on either side.
     """
     joint = np.arange(len(low))
-    signs = np.array([1.0 - 2.0 * (((k % 8) & (1 + j % 7)).bit_count() % 2) for j in joint.tolist()])
+    signs = np.array([1.0 - 2.0 * (((k % ORDER) & (1 + j)).bit_count() % 2) for j in joint.tolist()])
     shares = SHARE * (1.0 - UNEVEN * ((GOLDEN * (k + 1) * (joint + 1)) % 1.0))
     return np.asarray(0.5 * (low + high) + signs * shares * 0.5 * (high - low))
 

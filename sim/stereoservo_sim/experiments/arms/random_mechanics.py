@@ -26,6 +26,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.experiments.experiment import show_rows
 from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.summaries import wilson
 from stereoservo_sim.world.mechanical_trials import links_and_readings, mechanical_trials
 from stereoservo_sim.world.mechanics import Mechanics
 from stereoservo_sim.world.random_cells import MIN_SHOWN, RandomCase, hidden_out_of_view, random_case
@@ -37,7 +38,7 @@ NOISES = (0.01, 0.5)
 """[px], log-uniform."""
 MECHANISMS = ("ripple", "encoder", "play", "sag", "coupling")
 """The mechanism of seed k is the one at k modulo their number."""
-TOGETHER = 8
+TOGETHER = 16
 """Stops of all joints at once, as a cell file has by default."""
 INSIDE = 5.991
 """Squared distance that holds 95 % of two Gaussian coordinates."""
@@ -47,7 +48,9 @@ WELL = 0.85
 
 class MechanicsVerdict(msgspec.Struct, frozen=True):
     """Outcome of a case: ``size`` of its mechanism [rad or share], ``inside``: share of unseen markers inside their
-    95 % ellipses, ``code`` and ``message`` of a refusal.
+    95 % ellipses, ``code`` and ``message`` of a refusal. ``over_told``: error of these markers over that of a fit which
+    is told where the joints stood in the trials, a perfect arm's, and ``seconds_told`` of its CPU beside ``seconds`` of
+    ours; 0 where it fails.
     """
 
     seed: int
@@ -61,6 +64,8 @@ class MechanicsVerdict(msgspec.Struct, frozen=True):
     code: str = ""
     message: str = ""
     seconds: float = 0.0
+    over_told: float = 0.0
+    seconds_told: float = 0.0
 
 
 def random_mechanics(seed: int) -> tuple[RandomCase, str, float, tuple[Mechanics, ...], float]:
@@ -107,11 +112,37 @@ def judged_mechanics(seed: int) -> MechanicsVerdict:
             seed, mechanism, size, sigma, False, code=error.code, message=error.message, seconds=seconds
         )
     seconds = time.process_time() - begin
-    inside = share_inside(case, gears, result.model)
-    grade = assess_fit(result.model, result.report).grade
+    error_px, inside = unseen(case, gears, result.model)
+    told_px, seconds_told = _told(case, gears, sigma, seed)
     return MechanicsVerdict(
-        seed, mechanism, size, sigma, True, inside, grade, result.model.stratum, seconds=seconds
+        seed,
+        mechanism,
+        size,
+        sigma,
+        True,
+        inside,
+        assess_fit(result.model, result.report).grade,
+        result.model.stratum,
+        seconds=seconds,
+        over_told=error_px / told_px if told_px else 0.0,
+        seconds_told=seconds_told,
     )
+
+
+def _told(case: RandomCase, gears: tuple[Mechanics, ...], sigma: float, seed: int) -> tuple[float, float]:
+    """Error of unseen markers [px], at what joints with these ``gears`` report there, of a fit that is told where they
+    stood in the trials: of a perfect arm's, with the same noise; and its CPU time [s]. Zeros where it fails.
+    """
+    perfect = (Mechanics(),) * len(gears)
+    rng = np.random.default_rng([seed, 1])
+    trials = mechanical_trials(case.cell, perfect, sigma, rng, positions=driven_stops(case))
+    begin = time.process_time()
+    try:
+        model = fit_model(hidden_out_of_view(case.cell, trials), epoch=1).model
+    except CalibrationError:
+        return 0.0, 0.0
+    seconds = time.process_time() - begin
+    return unseen(case, gears, model)[0], seconds
 
 
 def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
@@ -142,16 +173,17 @@ def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
     return np.array(motors), np.array(moved, dtype=np.int64)
 
 
-def share_inside(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> float:
-    """Share of the markers in view, at poses that the trials have not seen, inside the ellipses that the model states
-    for them.
+def unseen(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> tuple[float, float]:
+    """Root mean square error [px] of the markers in view, at what joints report at poses that the trials have not seen,
+    and their share inside the ellipses that the model states for them.
     """
     links, readings = links_and_readings(case.cell, gears, case.held_out())
     kept = [i - FIRST_MARKER for i in model.marker_ids]
     pixels, covariances = pixel_covariances(model, readings)
     off = pixels - case.cell.pixels(links)[:, :, kept]
     squares = np.einsum("csma,csmab,csmb->csm", off, np.linalg.inv(covariances), off)
-    return float((squares[case.cell.in_view(links)[:, :, kept]] < INSIDE).mean())
+    shown = case.cell.in_view(links)[:, :, kept]
+    return float(np.sqrt((off[shown] ** 2).sum(axis=1).mean())), float((squares[shown] < INSIDE).mean())
 
 
 def run_random_mechanics(
@@ -171,12 +203,15 @@ def run_random_mechanics(
             progress("cases", k + 1, seeds)
     refused = [verdict for verdict in verdicts if not verdict.usable]
     praised = [v for v in verdicts if v.usable and v.grade == "good" and v.inside < WELL]
+    low, high = wilson(len(verdicts) - len(refused), len(verdicts))
     return {
         "experiment": "random-mechanics",
         "seed": seed,
         "seeds": seeds,
         "title": f"random-mechanics: cases {seed} to {seed + seeds - 1} by mechanism",
         "usable": len(verdicts) - len(refused),
+        "usable_low": low,
+        "usable_high": high,
         "refused_by_cause": dict(Counter(verdict.code for verdict in refused)),
         "rows": [_row(name, [v for v in verdicts if v.mechanism == name]) for name in MECHANISMS],
         "refused": [msgspec.structs.asdict(verdict) for verdict in refused],
@@ -195,8 +230,16 @@ def _row(name: str, verdicts: list[MechanicsVerdict]) -> dict[str, Any]:
         "good": sum(verdict.grade == "good" for verdict in usable),
         "inside_mean": float(np.mean(shares)) if shares else None,
         "inside_least": min(shares, default=None),
-        "seconds_median": float(np.median([verdict.seconds for verdict in verdicts])) if verdicts else None,
+        "over_told_median": _median([verdict.over_told for verdict in usable if verdict.over_told]),
+        "seconds_median": _median([verdict.seconds for verdict in verdicts]),
+        "seconds_over_told_median": _median(
+            [verdict.seconds / verdict.seconds_told for verdict in usable if verdict.seconds_told]
+        ),
     }
+
+
+def _median(values: list[float]) -> float | None:
+    return float(np.median(values)) if values else None
 
 
 def draw_random_mechanics(answer: dict[str, Any], folder: Path) -> list[Path]:
@@ -227,7 +270,8 @@ def show_random_mechanics(answer: dict[str, Any], console: Console) -> None:
     show_rows(answer, console)
     causes = ", ".join(f"{code} {count}" for code, count in sorted(answer["refused_by_cause"].items()))
     console.print(
-        f"{answer['usable']} of {answer['seeds']} usable" + (f"; refused: {causes}" if causes else "")
+        f"{answer['usable']} of {answer['seeds']} usable ({answer['usable_low']:.1%} to {answer['usable_high']:.1%})"
+        + (f"; refused: {causes}" if causes else "")
     )
     for case in answer["refused"]:
         console.print(
