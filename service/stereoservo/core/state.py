@@ -589,7 +589,7 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
     midst of trial motions, whose course is another one now.
     """
-    if version < 8 and state["source"]["type"] == "trials":
+    if state["source"]["type"] == "trials":
         raise StateVersionError(version)
     if version == 6:  # before stamps and gaps of the loop were checked
         nothing = msgspec.to_builtins(Refused())
