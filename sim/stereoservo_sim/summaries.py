@@ -26,3 +26,9 @@ def wilson(successes: int, cases: int, confidence: float = 0.95) -> tuple[float,
     middle = (share + z**2 / (2 * cases)) / (1 + z**2 / cases)
     half = z / (1 + z**2 / cases) * float(np.sqrt(share * (1 - share) / cases + z**2 / (4 * cases**2)))
     return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def count_row(what: str, count: int, of: int) -> dict[str, Any]:
+    """A row of counts with its Wilson bounds at 95 %."""
+    low, high = wilson(count, of) if of else (0.0, 1.0)
+    return {"goals": what, "count": count, "of": of, "wilson_low": low, "wilson_high": high}

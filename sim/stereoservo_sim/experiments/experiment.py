@@ -27,7 +27,6 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from stereoservo_sim.progress import ProgressCall
-from stereoservo_sim.summaries import wilson
 
 LISTED, WIDEST = 200, 400
 """Rows of a table that a person still reads; its characters across at most."""
@@ -195,12 +194,6 @@ def cell_text(value: Any) -> str:
     if isinstance(value, list):
         return " to ".join(cell_text(item) for item in value)
     return "-" if value is None else str(value)
-
-
-def count_row(what: str, count: int, of: int) -> dict[str, Any]:
-    """A row of counts with its Wilson bounds at 95 %."""
-    low, high = wilson(count, of) if of else (0.0, 1.0)
-    return {"goals": what, "count": count, "of": of, "wilson_low": low, "wilson_high": high}
 
 
 def draw_sorted(

@@ -121,5 +121,6 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "soak",
         "soak-live",
         "startup",
+        "wire",
     ]
     assert "wheels" in error["message"]

@@ -98,4 +98,4 @@ def test_trial_motions_are_done(operated: tuple[LockstepOperator, TrueJointHisto
     )
     assert end.kind == "calibration_finished", end.message
     stops = [event for event in cell.events if event.kind == "calibration_sample"]
-    assert len(stops) == 1 + 4 * 6 + 8
+    assert len(stops) == 1 + 4 * 6 + 16

@@ -16,9 +16,9 @@ from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.demonstration.truth import true_cell
+from stereoservo_sim.world.arms.arm_goals import goals_of
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.simulated_cell import goals_of
 
 TERMINAL = ("goal_reached", "goal_aborted", "goal_cancelled")
 
@@ -51,7 +51,7 @@ def test_goal_is_reached_with_an_exact_model(tmp_path: Path, name: str, law: Any
     file = check_cell(faked(name))
     truth = true_cell(file)
     history = TrueJointHistory.in_memory(6, capacity=1 << 15)
-    shown = goals_of(file.camera[0].mount)[goal]
+    shown = goals_of(truth)[goal]
     pixels = truth.truth_pixels(shown)
     target = FeatureTarget(
         {camera: {int(i): (float(u), float(v)) for i, (u, v) in zip(truth.body.ids, seen, strict=True)}

@@ -24,8 +24,9 @@ from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.arms.random_mechanics import driven_stops
-from stereoservo_sim.experiments.experiment import ExperimentError, count_row, draw_sorted, show_rows
+from stereoservo_sim.experiments.experiment import ExperimentError, draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.summaries import count_row
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX, DrivenCell, GoalEnd, Imperfections
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.mechanical_trials import mechanical_trials, synthetic_load

@@ -21,8 +21,9 @@ from rich.console import Console
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.experiments.experiment import count_row, draw_sorted, show_rows
+from stereoservo_sim.experiments.experiment import draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.summaries import count_row
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX, DrivenCell, Imperfections
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.mechanics import Mechanics

@@ -19,8 +19,9 @@ from rich.console import Console
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.shutter_stamps import ShutterOffset
-from stereoservo_sim.experiments.experiment import count_row, draw_sorted, show_rows
+from stereoservo_sim.experiments.experiment import draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.summaries import count_row
 from stereoservo_sim.tasks.driven_cell import DrivenCell, Imperfections
 from stereoservo_sim.world.random_cells import random_case
 
