@@ -20,6 +20,8 @@ from stereoservo.numerics.arrays import FloatArray
 
 CHI2_TAIL = 0.0005
 """Probability of each tail outside the two-sided 99.9 % interval."""
+OVERSTATED = 1.1
+"""Sigmas that are stated so many times too large are no misfit: deviations are too large by as much, at most."""
 RANK_TOLERANCE = 1e-9
 """Singular value of the column-normalised Jacobian, relative to the largest, below which a direction is
 not known.
@@ -37,8 +39,10 @@ def variance_factor(solution: Solution) -> float:
 
 
 def chi2_within(chi2: float, freedom: int) -> bool:
-    """Whether ``chi2`` lies inside the two-sided 99.9 % interval of ``freedom`` degrees of freedom."""
-    low = float(chi2_distribution.ppf(CHI2_TAIL, freedom))
+    """Whether ``chi2`` lies inside the two-sided 99.9 % interval of ``freedom`` degrees of freedom, for sigmas that are
+    as stated or up to `OVERSTATED` times smaller.
+    """
+    low = float(chi2_distribution.ppf(CHI2_TAIL, freedom)) / OVERSTATED**2
     high = float(chi2_distribution.isf(CHI2_TAIL, freedom))
     return bool(low <= chi2 <= high)
 

@@ -75,7 +75,7 @@ REMEDIES = {
     "joints_exchanged": "two joints answer under each other's names: correct the order in the joint driver's options",
     "joint_order": "list the joints base first: correct the order in the joint driver's options",
     "moved_together": "something under all the cameras, or the marker body itself, was moved during the trials: fasten "
-    "it, calibrate again",
+    "it, calibrate again. Where it happens at the same stop again it is the play of a joint: take another base",
     "camera_moved": "a camera was moved during the trials: fasten it, calibrate again",
     "marker_slipped": "a marker slipped during the trials: fasten it, calibrate again",
     "markers_disagree": "run the trials again, with larger motions (calibration.range) or less noise; look whether the "

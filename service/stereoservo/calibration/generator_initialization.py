@@ -77,6 +77,8 @@ def linear_generator(
         )
         rights.append(-np.einsum("kij,kj->ki", rows, source[keep]).ravel())
     system, right = np.concatenate(blocks), np.concatenate(rights)
+    if not right.size:  # no two stops far apart show a marker in common
+        return None
     # The scale of a point moved by the identity alone is fixed: the system is inhomogeneous, its unit
     # eigenvalue exact.
     solution = _robust_least_squares(system, right)

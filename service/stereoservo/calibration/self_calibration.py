@@ -80,7 +80,7 @@ Progress = Callable[[str, float], None]
 
 OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
 """Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
-OF_JOINT_ERRORS = frozenset({"joint_kind", "joint_without_effect", "too_few_stops"})
+OF_JOINT_ERRORS = frozenset({"joint_kind", "joint_without_effect", "too_few_markers", "too_few_stops"})
 """Causes by which single joints are refused that errors of the readings imitate."""
 WILD = 100.0
 """Squared residual over the median from which a pixel of the linked joints is a wrong one."""

@@ -64,7 +64,7 @@ class FitStatistics(msgspec.Struct, frozen=True, eq=False):
     """Statistics of the final least-squares fit.
 
     ``chi2`` is the sum of squared residuals in sigmas, with ``degrees_of_freedom`` = measurements -
-    parameters net of gauge; ``chi2_ok``: inside the two-sided 99.9 % interval.
+    parameters net of gauge; ``chi2_ok``: inside the 99.9 % interval.
     """
 
     rms_px: float

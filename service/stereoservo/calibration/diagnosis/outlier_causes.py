@@ -165,7 +165,8 @@ def moved_together(stop: int) -> CalibrationError:
     return CalibrationError(
         "moved_together",
         f"all markers jump in all cameras between stops {stop - 1} and {stop} and stay off. The images from there on "
-        "are of another arm or body, or the body, the arm's base or both cameras moved. Run all trials again",
+        "are of another arm or body, or the body, the arm's base or both cameras moved, or a joint fell through its "
+        "play where its load changed sides. Run all trials again: only a joint does it at the same stop again",
         stop=stop,
     )
 

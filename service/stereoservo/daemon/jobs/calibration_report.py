@@ -210,7 +210,7 @@ def _facts(model: CellModel, report: CalibrationReport) -> str:
         f"{statistics.images} images, {statistics.measurements} measurements, {statistics.parameters} parameters "
         f"net of gauge; residual {statistics.rms_px:.4g} px rms; chi-square {statistics.chi2:.0f} with "
         f"{statistics.degrees_of_freedom} degrees of freedom ({'' if statistics.chi2_ok else 'NOT '}inside the "
-        f"two-sided 99.9 % interval); residuals {report.sigma_factor:.3f} times the stated noise; predicted pixels "
+        f"99.9 % interval); residuals {report.sigma_factor:.3f} times the stated noise; predicted pixels "
         f"known to {report.prediction_rms_px:.3g} px rms, {report.prediction_max_px:.3g} px at worst. "
         f"Stratum {STRATA[model.stratum]}."
     )
