@@ -24,6 +24,7 @@ from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_fi
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import (
+    AuxiliaryDriver,
     CameraDescription,
     Clock,
     DriverContext,
@@ -70,9 +71,17 @@ def describe_cell(
     }
     joint_context = DriverContext(**common, mount=cell.camera[0].mount)  # type: ignore[arg-type]
     with _named(cell_path, "joints.options"):
-        joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
+        joint_driver = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
             cell.joints.options, joint_context
-        ).describe()
+        )
+        joints: JointDriverDescription = joint_driver.describe()
+    if joints.auxiliary and not isinstance(joint_driver, AuxiliaryDriver):
+        raise DriverError(
+            "auxiliary",
+            f"joint driver {cell.joints.driver!r} declares auxiliary joints or outputs "
+            f"({', '.join(spec.name for spec in joints.auxiliary)}), and lacks write_auxiliary, read_auxiliary or "
+            "stop_auxiliary: orders would be told as obeyed",
+        )
     if joints.pacing != "clock":
         raise CellFileError(
             cell_path,
