@@ -159,11 +159,10 @@ def _residuals(model: CellModel, report: CalibrationReport, reasons: list[str], 
         return
     factor = report.sigma_factor
     if factor < 1.0:
-        if factor < 1.0 / NOTABLE_NOISE:
-            reasons.append(
-                f"residuals are only {factor:.2f} times the stated noise: the detector states too much of it, and "
-                "deviations here are too large by as much"
-            )
+        reasons.append(
+            f"residuals are only {factor:.2f} times the stated noise: the detector states too much of it, and "
+            "deviations here are too large by as much"
+        )
         return
     if factor <= NOTABLE_NOISE:
         return
