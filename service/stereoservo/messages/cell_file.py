@@ -463,4 +463,9 @@ _SECTIONS: dict[str, type[msgspec.Struct]] = {
 }  # fmt: skip
 
 
-__all__ = ["CellFile", "CellFileError", "check_cell", "check_joints", "check_limits", "load_cell_file"]
+def sections() -> dict[str, type[msgspec.Struct]]:
+    """The structs of a cell file's sections by path, the top level's ``""`` first."""
+    return dict(_SECTIONS)
+
+
+__all__ = ["CellFile", "CellFileError", "check_cell", "check_joints", "check_limits", "load_cell_file", "sections"]

@@ -1,0 +1,147 @@
+"""The documents' commands are commands of this version, their links lead somewhere, and the site can be built."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+from stereoservo.cli.dispatch import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    [*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("deploy/*/README.md")]
+)
+PLACEHOLDER = re.compile(r"[A-Z][A-Z_]*\d*")
+"""A word that stands for a value of the reader's."""
+
+pytestmark = pytest.mark.skipif(not (ROOT / "docs").exists(), reason="an installation without the documents")
+
+
+def commands(text: str) -> Iterator[tuple[str, bool]]:
+    """Command lines of a page, and whether each is whole: a block's, not a sentence's."""
+    fenced = False
+    for line in text.splitlines():
+        fenced ^= line.lstrip().startswith("```")
+        block = (
+            re.match(r"(?: {4,})?(?=stereoservo |pip )(.*)", line)
+            if fenced or line.startswith("    ")
+            else None
+        )
+        found = [block[1]] if block else re.findall(r"`((?:stereoservo|pip install) [^`]+)`", line)
+        for command in found:
+            for part in re.split(r"&&|(?<!\|)\|(?!\|)", re.sub(r"(?:\s#\s|\s{2,}#).*", "", command)):
+                if part.strip().startswith("stereoservo "):
+                    yield part.strip().removesuffix("&").strip(), block is not None
+
+
+def examined(command: str, whole: bool) -> str:
+    """What is wrong with a command line of a document; empty where nothing is."""
+    words = [
+        word for word in shlex.split(re.sub(r"[\[\]]", "", command)[12:]) if word != "…" and "…" not in word
+    ]
+    if not words or PLACEHOLDER.fullmatch(words[0]) or words[0].startswith("--"):
+        return ""
+    group: Any = get_command(app)
+    context = group.make_context("stereoservo", [], resilient_parsing=True)
+    verb = group.get_command(context, words[0])
+    if verb is None:
+        return f"{command}: no command {words[0]!r}"
+    known = {name for parameter in verb.params for name in (*parameter.opts, *parameter.secondary_opts)}
+    unknown = [
+        word for word in words if word.startswith("--") and word.partition("=")[0] not in {*known, "--help"}
+    ]
+    if unknown:
+        return f"{command}: {words[0]} has no {', '.join(unknown)}"
+    if not whole:
+        return ""
+    try:
+        verb.make_context(words[0], words[1:], parent=context)
+    except Exception as error:
+        if any(PLACEHOLDER.fullmatch(word) for word in words[1:]) and "Invalid value" in repr(error):
+            return ""
+        return f"{command}: {error!r}"
+    return ""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_documented_command_is_one(page: Path) -> None:
+    found = list(commands(page.read_text(encoding="utf-8")))
+    assert [problem for command, whole in found if (problem := examined(command, whole))] == []
+
+
+def test_commands_that_are_none_are_found() -> None:
+    text = "    stereoservo gaol mycell dock\n    stereoservo goal mycell --chekc\nas `stereoservo status --all` says\n"
+    assert sum(bool(examined(command, whole)) for command, whole in commands(text)) == 3
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, as they are made on the site and where repositories are hosted."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower()).strip()) for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_link_leads_somewhere(page: Path) -> None:
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if re.match(r"https?://|mailto:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path) if path else page
+        if path.startswith("reference/") and path in generated():
+            continue
+        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
+            broken.append(target)
+    assert broken == []
+
+
+@cache
+def generated() -> dict[str, str]:
+    """The pages of the site that are made from the code."""
+    spec = importlib.util.spec_from_file_location("pages", ROOT / "docs" / "site" / "pages.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.generated()
+
+
+def test_the_reference_holds_every_key_command_message_and_method() -> None:
+    from stereoservo.client import Client
+    from stereoservo.messages.cell_file import sections
+    from stereoservo.messages.wire import SCHEMAS
+
+    pages = generated()
+    for section in sections().values():
+        for field in section.__struct_fields__:
+            assert f"| `{field}` |" in pages["reference/cell-file.md"]
+    group: Any = get_command(app)
+    for name in group.list_commands(None):
+        assert f"\n## {name}\n" in pages["reference/commands.md"]
+    for name in SCHEMAS:
+        assert f"\n## {name}\n" in pages["reference/messages.md"]
+    for name in ("goal", "teach", "stop", "calibrate", "watch"):
+        assert hasattr(Client, name)
+        assert f"\n### `{name}`\n" in pages["reference/client.md"]
+    assert "| 5.21 |" in pages["reference/thesis.md"]
+    assert "| `JOINTS_STALE` |" in pages["reference/codes.md"]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs .[docs]: mkdocs-material")
+def test_the_site_can_be_built(tmp_path: Path) -> None:
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        check=False, cwd=ROOT, capture_output=True, text=True, timeout=240,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    assert "Cell file" in (tmp_path / "site" / "reference" / "cell-file" / "index.html").read_text(
+        encoding="utf-8"
+    )
