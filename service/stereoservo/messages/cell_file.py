@@ -468,4 +468,12 @@ def sections() -> dict[str, type[msgspec.Struct]]:
     return dict(_SECTIONS)
 
 
-__all__ = ["CellFile", "CellFileError", "check_cell", "check_joints", "check_limits", "load_cell_file", "sections"]
+__all__ = [
+    "CellFile",
+    "CellFileError",
+    "check_cell",
+    "check_joints",
+    "check_limits",
+    "load_cell_file",
+    "sections",
+]
