@@ -76,7 +76,9 @@ class LazyGroup(TyperGroup):
             lacking = plugins.missing_extra(error)
             if lacking is None:
                 raise
-            return _command(cmd_name, _broken("missing_extra", f"`{cmd_name}` cannot run: {lacking}"), ANYTHING)
+            return _command(
+                cmd_name, _broken("missing_extra", f"`{cmd_name}` cannot run: {lacking}"), ANYTHING
+            )
         return _command(cmd_name, function)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -128,7 +130,7 @@ def _broken(code: str, message: str) -> Any:
     def broken(ctx: typer.Context, json: bool = typer.Option(False, "--json")) -> None:
         raise CommandError(code, message, arguments=ctx.args)
 
-    broken.__doc__ = f"(broken) {message}"
+    broken.__doc__ = f"(broken) {message}" if code == "plugin" else message
     return broken
 
 

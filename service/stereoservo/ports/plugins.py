@@ -22,7 +22,11 @@ EXTRAS = {
     "watch": ("rerun",),
 }
 """Top-level modules that each extra of the distribution installs, as in pyproject.toml."""
-PYBULLET_RUNS = "pybullet has wheels for Python 3.11 on Linux x86_64 alone; elsewhere, `pip install pybullet` builds it"
+BESIDE = {
+    "cell": ", or with the simulated cell: pip install 'stereoservo[demo]'",
+    "sim": " on Python 3.11, Linux x86_64; elsewhere pybullet has no wheel, and `pip install pybullet` compiles it",
+}
+"""What is to be said of an extra."""
 
 
 class PluginError(Exception):
@@ -42,8 +46,7 @@ def missing_extra(error: BaseException) -> str | None:
     module = error.name.partition(".")[0]
     for extra, modules in EXTRAS.items():
         if module in modules:
-            where = f" ({PYBULLET_RUNS})" if extra == "sim" else ""
-            return f"{module} is not installed; it comes with: pip install 'stereoservo[{extra}]'{where}"
+            return f"{module} is not installed; it comes with: pip install 'stereoservo[{extra}]'{BESIDE.get(extra, '')}"
     return None
 
 
