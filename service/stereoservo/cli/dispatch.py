@@ -31,7 +31,7 @@ COMMANDS: dict[str, str] = {
     "auxiliary": "auxiliary:auxiliary",
     "home": "home:home",
     "calibrate": "calibrate.command:calibrate",
-    "watch": "watch:watch",
+    "watch": "watch.command:watch",
     "enable": "operator_commands:enable",
     "disable": "operator_commands:disable",
     "hold": "operator_commands:hold",

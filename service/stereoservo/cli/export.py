@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.cli.output import CommandError, JsonOption, emit, note
 from stereoservo.recording.flight_export import export_flight
+
+SAME = 1e-9
+"""Relative error up to which a replay on another processor tells the same."""
 
 
 def export(
@@ -30,6 +33,12 @@ def export(
             f"{target} is written, but the replay that it is made from differs from the recording at step "
             f"{result.replay.first_difference}: joints and markers are those recorded, states and errors may not be",
         )
+    error = result.replay.max_relative_error
+    if error > SAME:
+        note(
+            f"the replay on this machine or version differs from the recording (largest relative error {error:.2g}): "
+            "joints and markers are those recorded, states and errors those of the replay"
+        )
     sizes = file.stat().st_size, target.stat().st_size
     lines = [f"{topic:32} {count} messages" for topic, count in sorted(result.messages.items())]
     lines.append(f"{target}: {sizes[1] / 1e6:.1f} MB, {sizes[1] / max(sizes[0], 1):.2f} times the recording")
@@ -38,6 +47,7 @@ def export(
     figures = {
         "file": str(target),
         "identical": result.replay.identical,
+        "max_relative_error": error,
         "steps": result.replay.steps,
         "messages": result.messages,
         "bytes": sizes[1],

@@ -46,7 +46,8 @@ def missing_extra(error: BaseException) -> str | None:
     module = error.name.partition(".")[0]
     for extra, modules in EXTRAS.items():
         if module in modules:
-            return f"{module} is not installed; it comes with: pip install 'stereoservo[{extra}]'{BESIDE.get(extra, '')}"
+            beside = BESIDE.get(extra, "")
+            return f"{module} is not installed; it comes with: pip install 'stereoservo[{extra}]'{beside}"
     return None
 
 

@@ -28,9 +28,10 @@ from stereoservo.recording.foxglove_channels import (
     CellStatus,
     Published,
     Scene,
-    annotations,
     joints,
     log,
+    markers_seen,
+    reasons,
     schema_of,
     set_points_of,
     stamp,
@@ -56,6 +57,7 @@ class FlightChannels:
     _targets: dict[str, Any] = field(default_factory=dict)
     _scene: Scene | None = None
     _epoch: int = -1
+    _codes: tuple[str, ...] = ()
     _state_ns: int = -STATE_EVERY_NS
     _scene_ns: int = -SCENE_EVERY_NS
 
@@ -70,12 +72,16 @@ class FlightChannels:
         now_ns = inputs.now_ns + self.shift_ns
         for event in outputs.events:
             yield log(event.t_ns + self.shift_ns, event.kind, event.message, "core")
+        codes = tuple(reason.code for reason in status.reasons)
+        if codes != self._codes:
+            self._codes = codes
+            yield reasons(now_ns, status.reasons)
         priors = {prior.camera: prior.pixels for prior in outputs.priors}
         target = self._targets.get(status.goal)
         for seen in inputs.observations:
             wanted = set_points_of(target, seen.camera)
             t_ns = seen.t_shutter_ns + self.shift_ns
-            yield annotations(seen.camera, t_ns, seen.pixels, priors.get(seen.camera), wanted)
+            yield markers_seen(seen.camera, t_ns, seen.pixels, priors.get(seen.camera), wanted)
         if inputs.now_ns - self._state_ns >= STATE_EVERY_NS:
             self._state_ns = inputs.now_ns
             yield from self._state(now_ns, status)
@@ -85,7 +91,12 @@ class FlightChannels:
     def _state(self, t_ns: int, status: Status) -> Iterator[Published]:
         names = self.settings.joint_names
         yield joints(
-            "/joints", t_ns, names, positions=status.positions, velocities=status.velocities, efforts=status.efforts
+            "/joints",
+            t_ns,
+            names,
+            positions=status.positions,
+            velocities=status.velocities,
+            efforts=status.efforts,
         )
         yield joints("/command", t_ns, names, velocities=status.command)
         yield Published("/status", t_ns, cell_status(status))

@@ -42,6 +42,7 @@ from stereoservo.geometry.strata import upper_triangular
 from stereoservo.kinematics.axes import euclidean_centres, joint_axes, stratum_frame
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 
 CELL_FRAME = "cell"
@@ -98,7 +99,10 @@ def schema_of(content: Any) -> ChannelSchema:
     """The schema of a message's channel."""
     if isinstance(content, CellStatus):
         return ChannelSchema(
-            "stereoservo.CellStatus", "jsonschema", msgspec.json.encode(msgspec.json.schema(CellStatus)), "json"
+            "stereoservo.CellStatus",
+            "jsonschema",
+            msgspec.json.encode(msgspec.json.schema(CellStatus)),
+            "json",
         )
     found = type(content).get_schema()
     return ChannelSchema(found.name, found.encoding, found.data, "protobuf")
@@ -124,7 +128,9 @@ def joints(
         return None if array is None else float(array[j])
 
     states = [
-        JointState(name=name, position=value(positions, j), velocity=value(velocities, j), effort=value(efforts, j))
+        JointState(
+            name=name, position=value(positions, j), velocity=value(velocities, j), effort=value(efforts, j)
+        )
         for j, name in enumerate(names)
     ]
     return Published(topic, t_ns, JointStates(timestamp=stamp(t_ns), joints=states))
@@ -137,7 +143,14 @@ def log(t_ns: int, kind: str, message: str, origin: str) -> Published:
     return Published("/log", t_ns, Log(timestamp=stamp(t_ns), level=level, message=text, name=origin))
 
 
-def annotations(
+def reasons(t_ns: int, found: Sequence[Reason]) -> Published:
+    """Why the arm does not do more, as a line of a log."""
+    text = "; ".join(f"{reason.code} {reason.subject}: {reason.hint}" for reason in found) or "none"
+    level = LogLevel.Warning if found else LogLevel.Info
+    return Published("/reasons", t_ns, Log(timestamp=stamp(t_ns), level=level, message=text, name="reasons"))
+
+
+def markers_seen(
     camera: str,
     t_ns: int,
     seen: FloatArray,
@@ -264,7 +277,9 @@ def _sphere(v: FloatArray, size: float) -> SpherePrimitive:
 
 def _camera(centre: FloatArray, rotation: FloatArray) -> LinePrimitive:
     """A pyramid from a camera's centre towards what it sees."""
-    corners = [centre + 0.1 * np.array([x, y, 1.5]) @ rotation for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+    corners = [
+        centre + 0.1 * np.array([x, y, 1.5]) @ rotation for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    ]
     strip = [corners[0]]
     for corner, following in zip(corners, [*corners[1:], corners[0]], strict=True):
         strip += [corner, centre, corner, following]
