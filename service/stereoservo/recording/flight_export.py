@@ -26,8 +26,8 @@ from stereoservo.ports.image_files import ImageReader
 from stereoservo.recording.flight_recorder import FORMAT
 from stereoservo.recording.foxglove_channels import (
     CellStatus,
+    MetricScene,
     Published,
-    Scene,
     joints,
     log,
     markers_seen,
@@ -40,7 +40,7 @@ from stereoservo.recording.replay import RecordingError, ReplayResult, recorded_
 from stereoservo.recording.step_records import decode_step
 
 STATE_EVERY_NS = 50_000_000
-SCENE_EVERY_NS = 100_000_000
+SCENE_EVERY_NS = 200_000_000
 JPEG_QUALITY = 80
 
 
@@ -55,7 +55,7 @@ class FlightChannels:
     shift_ns: int
     models: dict[int, CellModel]
     _targets: dict[str, Any] = field(default_factory=dict)
-    _scene: Scene | None = None
+    _scene: MetricScene | None = None
     _epoch: int = -1
     _codes: tuple[str, ...] = ()
     _state_ns: int = -STATE_EVERY_NS
@@ -105,7 +105,7 @@ class FlightChannels:
         if status.model_epoch != self._epoch:
             self._epoch = status.model_epoch
             model = self.models.get(status.model_epoch)
-            self._scene = Scene(model) if model is not None and model.stratum == "metric" else None
+            self._scene = MetricScene(model) if model is not None and model.stratum == "metric" else None
         if self._scene is None:
             return
         self._scene_ns = now_ns

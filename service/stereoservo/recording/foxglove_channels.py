@@ -169,7 +169,7 @@ def markers_seen(
         drawn.append(
             PointsAnnotation(
                 timestamp=stamp(t_ns), type=PointsAnnotationType.Points, points=points, outline_color=colour,
-                outline_colors=[colour] * len(points), thickness=size,
+                thickness=size,
             )
         )  # fmt: skip
     return Published(
@@ -180,7 +180,7 @@ def markers_seen(
 # -- in space -----------------------------------------------------------------------------------------------
 
 
-class Scene:
+class MetricScene:
     """Arm, cameras and markers of a ``model`` in space, in the Euclidean frame of its first camera.
 
     The unit of length is the distance between the first two cameras (the first camera's focal length where there is
