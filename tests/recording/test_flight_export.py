@@ -203,3 +203,9 @@ def test_rerun_decodes_at_least_eight_entities(exported: Exported, tmp_path: Pat
         if any("@Mcap" not in column for column in columns.split() if "@" in column):
             entities.add(entity)
     assert len(entities) >= 8, entities
+
+
+def test_the_layout_shows_topics_that_there_are(messages: dict[str, list[tuple[int, Any]]]) -> None:
+    layout = (Path(__file__).resolve().parents[2] / "deploy/foxglove/stereoservo.json").read_text()
+    named = {topic.partition(".")[0] for topic in re.findall(r'"(/[^"]+)"', layout)}
+    assert named - set(messages) == {"/camera/right/image"}  # the bench has pictures of one camera
