@@ -93,6 +93,7 @@ def test_verbs_that_need_an_extra_name_it(extra: str, tmp_path: Path) -> None:
         "replay x.mcap",
         "drivers",
         "warmup",
+        "export x.mcap",
         "demo",
         "simulate x",
     ]

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from stereoservo.client import Client
+from stereoservo.messages.wire import Reply, decode
 
 from .conftest import CELL, moved_away
 
@@ -68,6 +69,16 @@ def test_a_stream_is_followed_and_stop_stops(client: Client, style: str) -> None
     assert any(abs(client.status().joints[name] - q) > 1e-3 for name, q in start.items())
     assert run(style, "stop").startswith("stopped: ")
     assert "STOPPED" in {reason.code for reason in client.status().reasons}
+
+
+@pytest.mark.parametrize("wrong", ["command/dance/me", "command/hold", "command/hold/me/now"])
+def test_a_wrong_key_is_answered_with_the_right_ones(client: Client, wrong: str) -> None:
+    reply = decode(client.query(f"{client.keys.prefix}/{wrong}", b"{}"), Reply)
+    assert not reply.accepted
+    assert (
+        "command/<name>/<name> is valid" in reply.problems[0]
+        or "there are: stop, enable" in reply.problems[0]
+    )
 
 
 @pytest.mark.skipif(
