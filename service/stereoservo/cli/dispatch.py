@@ -31,7 +31,7 @@ COMMANDS: dict[str, str] = {
     "auxiliary": "auxiliary:auxiliary",
     "home": "home:home",
     "calibrate": "calibrate.command:calibrate",
-    "watch": "watch:watch",
+    "watch": "watch.command:watch",
     "enable": "operator_commands:enable",
     "disable": "operator_commands:disable",
     "hold": "operator_commands:hold",
@@ -40,6 +40,7 @@ COMMANDS: dict[str, str] = {
     "acknowledge": "operator_commands:acknowledge",
     "record": "record:record",
     "replay": "replay:replay",
+    "export": "export:export",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",
     "init": "init:init",
@@ -47,6 +48,9 @@ COMMANDS: dict[str, str] = {
     "warmup": "warmup:warmup",
 }
 """Commands of the service: name -> module:function below ``stereoservo.cli``."""
+
+ANYTHING = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Settings of a command that takes whatever it is given."""
 
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 """click's UsageError, wherever this version of typer keeps its click."""
@@ -67,8 +71,14 @@ class LazyGroup(TyperGroup):
         try:
             function = _load(cmd_name)
         except plugins.PluginError as error:
+            code = "plugin" if plugins.missing_extra(error.__cause__ or error) is None else "missing_extra"
+            return _command(cmd_name, _broken(code, str(error)), ANYTHING)
+        except ModuleNotFoundError as error:
+            lacking = plugins.missing_extra(error)
+            if lacking is None:
+                raise
             return _command(
-                cmd_name, _broken(error), {"allow_extra_args": True, "ignore_unknown_options": True}
+                cmd_name, _broken("missing_extra", f"`{cmd_name}` cannot run: {lacking}"), ANYTHING
             )
         return _command(cmd_name, function)
 
@@ -115,11 +125,13 @@ def _load(name: str) -> Any:
     return getattr(importlib.import_module(f"stereoservo.cli.{module}"), function)
 
 
-def _broken(error: plugins.PluginError) -> Any:
-    def broken(ctx: typer.Context, json: bool = typer.Option(False, "--json")) -> None:
-        raise CommandError("plugin", str(error), arguments=ctx.args)
+def _broken(code: str, message: str) -> Any:
+    """A command that says why it cannot run."""
 
-    broken.__doc__ = f"(broken) {error}"
+    def broken(ctx: typer.Context, json: bool = typer.Option(False, "--json")) -> None:
+        raise CommandError(code, message, arguments=ctx.args)
+
+    broken.__doc__ = f"(broken) {message}" if code == "plugin" else message
     return broken
 
 
@@ -179,6 +191,9 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
         fail(CommandError("usage", message), as_json)
         return EXIT_USAGE
     except Exception as error:
+        lacking = plugins.missing_extra(error)
+        if lacking is not None:
+            error = CommandError("missing_extra", lacking)
         if not known(error):
             traceback.print_exc()
         fail(error, as_json)

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 
 from stereoservo.cli.output import CommandError, JsonOption, emit
 from stereoservo.daemon.process_control import child_environment
@@ -13,6 +14,8 @@ from stereoservo.daemon.process_control import child_environment
 
 def warmup(json: JsonOption = False) -> None:
     """Compile the kernels of the loop, so that the first start is as fast as any other."""
+    if find_spec("numba") is None:
+        raise ModuleNotFoundError(name="numba")
     began = time.monotonic()
     command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]
     done = subprocess.run(command, env=child_environment(), stdout=sys.stderr, check=False)

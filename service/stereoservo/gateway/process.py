@@ -190,6 +190,7 @@ class Gateway:
         self._gateway_queries = [
             session.declare_queryable(keys.any_command(verb), RingChannel(32)) for verb in GATEWAY_VERBS
         ]
+        self._any_command_queries = session.declare_queryable(keys.any_command_at_all, RingChannel(32))
         self._event_queries = session.declare_queryable(keys.event, RingChannel(32))
         self._state_queries = session.declare_queryable(keys.state, RingChannel(32))
         self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
@@ -264,6 +265,7 @@ class Gateway:
                 partial(self._answer, work=lambda _: encode(self.info()), key=self.keys.info),
             ),
             (self._schema_queries, partial(self._answer, work=self._schema)),
+            (self._any_command_queries, self._answer_wrong_key),
         )
         for source, take in sources:
             for _ in range(DRAIN):
@@ -277,6 +279,14 @@ class Gateway:
         while self._stop.enables:
             self._intake.command_query(self._stop.enables.popleft())
         return busy
+
+    def _answer_wrong_key(self, query: Any) -> None:
+        """Refuse ``query``, naming the commands there are, where its key is of none; others answer the rest."""
+        asked = str(query.key_expr)
+        if "*" in asked or asked == self.keys.stop or self.keys.is_command(asked):
+            query.drop()
+        else:
+            self._answer(query, self._gateway_command)
 
     def _answer(self, query: Any, work: Callable[[Any], bytes], key: str = "") -> None:
         """Reply to ``query`` with the result of ``work``, on ``key`` (default: the query's own, where it is
@@ -477,6 +487,7 @@ class Gateway:
             self._goal_queries,
             *self._command_queries,
             *self._gateway_queries,
+            self._any_command_queries,
             self._event_queries,
             self._state_queries,
             self._info_queries,

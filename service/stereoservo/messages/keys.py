@@ -71,6 +71,11 @@ class KeySpace:
         _check_verb(verb)
         return f"{self.prefix}/command/{verb}/*"
 
+    @property
+    def any_command_at_all(self) -> str:
+        """Every key below that of commands, those of no command included."""
+        return f"{self.prefix}/command/**"
+
     def schema(self, name: str) -> str:
         """The JSON Schema of message ``name``."""
         return f"{self.prefix}/schema/{check_name('schema', name)}"
@@ -86,6 +91,14 @@ class KeySpace:
         verb, operator = self._rest(key, "command", 2)
         _check_verb(verb)
         return verb, check_name("operator", operator)
+
+    def is_command(self, key: str) -> bool:
+        """Whether ``key`` is that of a command, by whomever."""
+        try:
+            self.command_of(key)
+        except InvalidKeyError:
+            return False
+        return True
 
     def schema_of(self, key: str) -> str:
         """The message name of a concrete schema key. Raises InvalidKeyError."""

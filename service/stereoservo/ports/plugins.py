@@ -1,4 +1,6 @@
-"""Plug-ins by entry point (drivers, detectors, laws, commands): imported on demand; a broken one is listed as such."""
+"""Plug-ins by entry point (drivers, detectors, laws, commands): imported on demand; a broken one is listed as such,
+with the extra of the installation that it lacks.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,19 @@ LAWS = "stereoservo.laws"
 COMMANDS = "stereoservo.commands"
 GROUPS = (JOINT_DRIVERS, CAMERA_DRIVERS, DETECTORS, LAWS, COMMANDS)
 
+EXTRAS = {
+    "cell": ("numpy", "scipy", "cv2", "numba", "can", "canopen", "serial", "mcap", "foxglove", "matplotlib"),
+    "sim": ("pybullet", "pybullet_data"),
+    "web": ("nicegui",),
+    "watch": ("rerun",),
+}
+"""Top-level modules that each extra of the distribution installs, as in pyproject.toml."""
+BESIDE = {
+    "cell": ", or with the simulated cell: pip install 'stereoservo[demo]'",
+    "sim": " on Python 3.11, Linux x86_64; elsewhere pybullet has no wheel, and `pip install pybullet` compiles it",
+}
+"""What is to be said of an extra."""
+
 
 class PluginError(Exception):
     """A plug-in is unknown or does not import. ``known`` lists the names of its group."""
@@ -22,6 +37,18 @@ class PluginError(Exception):
         self.group = group
         self.name = name
         self.known = known
+
+
+def missing_extra(error: BaseException) -> str | None:
+    """What to install where ``error`` is the import of a module that an extra brings; None for any other error."""
+    if not isinstance(error, ModuleNotFoundError) or error.name is None:
+        return None
+    module = error.name.partition(".")[0]
+    for extra, modules in EXTRAS.items():
+        if module in modules:
+            beside = BESIDE.get(extra, "")
+            return f"{module} is not installed; it comes with: pip install 'stereoservo[{extra}]'{beside}"
+    return None
 
 
 @dataclass(frozen=True)
@@ -49,7 +76,7 @@ def list_plugins(group: str, *, check: bool = False) -> list[Plugin]:
             try:
                 entry.load()
             except Exception as caught:  # whatever a third party's module raises on import
-                error = f"{type(caught).__name__}: {caught}"
+                error = _cause(caught)
         found.append(Plugin(group, entry.name, entry.value, _distribution(entry), error))
     return found
 
@@ -70,9 +97,14 @@ def load(group: str, name: str) -> Any:
         raise PluginError(
             group,
             name,
-            f"{kind} {name!r} ({matching[0].value}) does not import: {type(error).__name__}: {error}",
+            f"{kind} {name!r} ({matching[0].value}) does not import: {_cause(error)}",
             known,
         ) from error
+
+
+def _cause(error: Exception) -> str:
+    """Why a plug-in does not import."""
+    return missing_extra(error) or f"{type(error).__name__}: {error}"
 
 
 def _distribution(entry: EntryPoint) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.plugins import missing_extra
 from stereoservo_sim.world.mechanics import GRAVITY
 from stereoservo_sim.world.robots import Robot, roll_pitch_yaw, urdf
 from stereoservo_sim.world.velocity_drives import RigidPlant
@@ -53,7 +54,7 @@ def import_pybullet() -> Any:
         with _quiet():
             import pybullet
     except ImportError as error:
-        raise PhysicsError(f"pybullet cannot be imported: {error}") from error
+        raise PhysicsError(missing_extra(error) or f"pybullet cannot be imported: {error}") from error
     return pybullet
 
 
