@@ -40,6 +40,7 @@ COMMANDS: dict[str, str] = {
     "acknowledge": "operator_commands:acknowledge",
     "record": "record:record",
     "replay": "replay:replay",
+    "export": "export:export",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",
     "init": "init:init",
