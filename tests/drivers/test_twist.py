@@ -94,7 +94,6 @@ def test_the_arm_goes_where_it_is_told_and_its_camera_sees_it_there(tmp_path: Pa
     driver, clock = driven(tmp_path, ELSEWHERE | {"frame": "tool"})
     rates = np.array([0.03, -0.02, 0.02, 0.1, -0.15, 0.2])
     for _ in range(500):
-        driver.read_state()
         driver.write_velocity(rates)
         clock.advance_to(clock.now_ns() + 4_000_000)
     moved = driver.read_state()
@@ -116,18 +115,18 @@ def test_the_controller_stops_by_itself_and_after_a_reset_the_way_back_is_free(t
     def drive(rates: list[float], steps: int) -> None:
         for _ in range(steps):
             driver.write_velocity(np.array(rates))
-            clock.advance_to(clock.now_ns() + 4_000_000)
+            clock.advance_to(clock.now_ns() + 20_000_000)
 
     with pytest.raises(
         DriverError, match="controller has stopped the arm: joint joint6 of the arm at its limit; reset"
     ):
-        drive([0.0, 0.0, 0.0, 0.0, 0.0, 0.5], 4000)
+        drive([0.0, 0.0, 0.0, 0.0, 0.0, 0.5], 800)
     driver.stop()
     driver.deactivate()
     driver.configure()
     driver.activate()
     at = driver.read_state().positions[5]
-    drive([0.0, 0.0, 0.0, 0.0, 0.0, -0.5], 200)
+    drive([0.0, 0.0, 0.0, 0.0, 0.0, -0.5], 40)
     assert driver.read_state().positions[5] < at - 0.1
     with pytest.raises(DriverError, match="near a singularity of the arm; reset"):
-        drive([0.15, 0.0, 0.15, 0.0, 0.0, 0.0], 4000)
+        drive([0.15, 0.0, 0.15, 0.0, 0.0, 0.0], 800)

@@ -26,7 +26,8 @@ def export(
             "--length",
             metavar="WHAT:OF=METRES",
             help="The known length: markers:10,11=0.05 (two ids), baseline:left,right=0.2 (two cameras), "
-            "a:JOINT=METRES or d:JOINT=METRES (of its Denavit-Hartenberg row), prismatic:JOINT=1 (the default where a joint slides).",
+            "a:JOINT=METRES or d:JOINT=METRES (of its Denavit-Hartenberg row), "
+            "prismatic:JOINT=1 (the default where a joint slides).",
         ),
     ] = "",
     cell: Annotated[
