@@ -1,4 +1,4 @@
-"""Command ``stereoservo export``: writes a flight recording that Foxglove and Rerun open, beside the bit-exact one."""
+"""Command ``stereoservo export``: writes a flight recording for Foxglove and Rerun, or a calibrated model as URDF."""
 
 from __future__ import annotations
 
@@ -8,24 +8,60 @@ from typing import Annotated
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit, note
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.denavit_hartenberg import KnownLength, ReadOutError
+from stereoservo.kinematics.model import CellModel, load_model
+from stereoservo.kinematics.urdf import metric_arm, urdf_text
+from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.recording.flight_export import export_flight
 
 SAME = 1e-9
 """Relative error up to which a replay on another processor tells the same."""
+WHATS = ("markers", "baseline", "prismatic", "a", "d")
 
 
 def export(
-    file: Annotated[Path, typer.Argument(metavar="FLIGHT", help="A flight recording (*.mcap).")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A flight recording (*.mcap), or a model (*.json) for --urdf.")
+    ],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write (default: FLIGHT.foxglove.mcap).")
+        Path | None,
+        typer.Option("--output", "-o", help="Of a recording: file to write (default: FILE.foxglove.mcap)."),
+    ] = None,
+    urdf: Annotated[
+        Path | None, typer.Option("--urdf", metavar="FILE", help="Of a metric model: the URDF file to write.")
+    ] = None,
+    length: Annotated[
+        str,
+        typer.Option(
+            "--length",
+            metavar="WHAT:OF=METRES",
+            help="The known length: markers:10,11=0.05 (two ids), baseline:left,right=0.2 (two cameras), "
+            "a:JOINT=METRES or d:JOINT=METRES (of its Denavit-Hartenberg row), "
+            "prismatic:JOINT=1 (the default where a joint slides).",
+        ),
+    ] = "",
+    cell: Annotated[
+        Path | None,
+        typer.Option("--cell", metavar="FILE", help="Cell file whose safety.limit are the joints' in the URDF."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a recording for Foxglove and Rerun, which still replays bit for bit.
+    """Write a recording for Foxglove and Rerun, which still replays bit for bit; or a fitted metric model as URDF.
 
-    Pictures in NAME.images beside the recording go with it.
+    Pictures in NAME.images beside a recording go with it. A URDF has the joints, and markers and cameras as links.
     """
-    target = output if output is not None else file.with_suffix(".foxglove.mcap")
+    if file.suffix == ".json":
+        if urdf is None:
+            raise CommandError("usage", f"{file} is a model: --urdf FILE says where to write it to")
+        _export_model(file, urdf, length, cell, json)
+    elif urdf is not None:
+        raise CommandError("usage", f"--urdf is for a model (*.json); {file} is none")
+    else:
+        _export_flight(file, output if output is not None else file.with_suffix(".foxglove.mcap"), json)
+
+
+def _export_flight(file: Path, target: Path, json: bool) -> None:
     result = export_flight(file, target)
     if result.replay.identical is False:
         raise CommandError(
@@ -55,3 +91,48 @@ def export(
         "incomplete": result.incomplete,
     }
     emit(figures, "\n".join(lines), json)
+
+
+def _export_model(model: Path, urdf: Path, length: str, cell: Path | None, json: bool) -> None:
+    found = load_model(model)
+    limits = (
+        {}
+        if cell is None
+        else {
+            limit.joint: (limit.min, limit.max, limit.velocity) for limit in load_cell_file(cell).safety.limit
+        }
+    )
+    known = _known_length(length, found)
+    try:
+        arm = metric_arm(found, known)
+    except (ReadOutError, GeometryError) as error:
+        raise CommandError(error.code, str(error)) from error
+    urdf.write_text(urdf_text(found, arm, urdf.stem, limits))
+    scales = dict(zip(found.joint_names, arm.scales.tolist(), strict=True))
+    emit(
+        {"urdf": str(urdf), "joints": list(found.joint_names), "position_scales": scales, "known": known},
+        f"{urdf}: {len(found.joint_names)} joints, {len(found.marker_ids)} markers, {len(found.cameras)} cameras; "
+        f"scaled by {known.what} of {', '.join(str(name) for name in known.of)}, {known.metres:g} m",
+        json,
+    )
+
+
+def _known_length(text: str, model: CellModel) -> KnownLength:
+    """The known length that ``text`` states; by default the unit of the first slide. Raises CommandError."""
+    slides = [n for n, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "prismatic"]
+    if not text and slides:
+        return KnownLength("prismatic", (slides[0],), 1.0)
+    what, _, rest = text.partition(":")
+    of, _, metres = rest.rpartition("=")
+    names = tuple(of.split(","))
+    try:
+        if what not in WHATS:
+            raise ValueError(what)
+        return KnownLength(what, tuple(int(n) for n in names) if what == "markers" else names, float(metres))  # type: ignore[arg-type]
+    except ValueError as error:
+        raise CommandError(
+            "length",
+            f"--length {text!r}: WHAT:OF=METRES is needed, one length of the model in metres, WHAT of "
+            f"{', '.join(WHATS)}, e.g. markers:10,11=0.05"
+            + ("" if text else "; turning joints alone leave the model's scale open"),
+        ) from error

@@ -140,6 +140,20 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
     )
 
 
+def metres_per_length(model: CellModel, known: KnownLength) -> float:
+    """Metres for one length of the Euclidean frame of a metric ``model``, by the ``known`` length.
+
+    Raises ReadOutError as `denavit_hartenberg`.
+    """
+    _check_known(model, known)
+    parts = framed(model)
+    axes = axes_at_origin(parts)
+    length = _length(parts, axes, dh_table(axes, conventions(parts)), known, model)
+    if not length > 0.0:
+        raise ReadOutError("length", f"the model's {_length_name(known)} is zero: it gives no scale")
+    return known.metres / length
+
+
 def _row(
     joint: str,
     kind: str,
@@ -315,7 +329,7 @@ def dh_table(axes: Axes, links: tuple[Convention, ...]) -> FloatArray:
     """Rows (n, 5) ``a, α, β, d, θ`` in the lengths of the frame, of `axes_at_origin`."""
     n = len(axes.kinds)
     table = np.zeros((n, 5))
-    origin = _base_origin(axes)
+    origin = base_origin(axes)
     x: FloatArray | None = None
     for j in range(n):
         z = axes.directions[j]
@@ -392,7 +406,7 @@ def base_leaves(axes: Axes) -> tuple[int, int]:
     return placed[0], n
 
 
-def _base_origin(axes: Axes) -> FloatArray:
+def base_origin(axes: Axes) -> FloatArray:
     """Origin (3,) of the base, a free choice: such that no row contains an arbitrary length.
 
     On the first revolute axis, at the height at which the first axis of another direction leaves those parallel to it.

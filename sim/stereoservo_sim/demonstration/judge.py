@@ -32,9 +32,10 @@ class Course:
 
 @dataclass
 class RecordedDemonstration(Course):
-    """Time series from a replayed recording, with the calibration's stops."""
+    """Time series from a replayed recording, with the joints' velocity limits (n,) and the calibration's stops."""
 
     result: ReplayResult
+    velocity_max: FloatArray
     trials: TrialData | None
 
 
@@ -90,6 +91,7 @@ def read_flight(recording: Path) -> RecordedDemonstration:
         goals,
         events,
         result,
+        settings[0].limits.velocity_max,
         job.trials() if job.stops else None,
     )
 

@@ -27,8 +27,6 @@ def write_pages(
     """Write the report. Raises OSError."""
     cell = demonstration.cell
     truth = demonstration.truth
-    limits = {joint.name: joint.velocity_max for joint in truth.robot.joints}
-    limits.update({limit.joint: limit.velocity for limit in cell.safety.limit})
     mode = "lockstep, virtual time" if demonstration.lockstep else "real processes over zenoh"
     facts = {
         "mode": mode,
@@ -48,7 +46,7 @@ def write_pages(
         calibration=None if flight.trials is None else _calibration(demonstration, flight.trials),
         goals=tuple(_goal(goal, cell.servo.gain, truth) for goal in goals),
         tolerance_px=cell.servo.tolerance_px,
-        velocity_limits=np.array([limits[name] for name in demonstration.joint_names]),
+        velocity_limits=flight.velocity_max,
         summary="An arm that nobody calibrated learnt itself through two cameras that nobody calibrated, and reached "
         "goals that were only shown to it. Errors are against the simulated truth.",
         facts=facts,

@@ -28,9 +28,8 @@ from stereoservo_sim.demonstration.emulated import (
 from stereoservo_sim.demonstration.live_demonstrator import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep_demonstrator import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import Calibrated, ShownGoal, perform, shown_goals
-from stereoservo_sim.demonstration.truth import TruthLog, true_cell
+from stereoservo_sim.demonstration.truth import TruthLog, shown_positions, true_cell
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
-from stereoservo_sim.world.arms.arm_goals import goals_of
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
@@ -91,7 +90,7 @@ def conduct_lockstep(
             calibrated, outcomes = perform(
                 LockstepDemonstrator(lockstep, seed, stage.progress),
                 names,
-                goals_of(truth),
+                shown_positions(cell, truth),
                 stage.tell,
                 goals,
             )
@@ -127,7 +126,7 @@ def conduct_live(
     cell = load_cell_file(cell_path)
     truth = true_cell(cell, cell_path.parent)
     goals = shown_goals(truth) if goals is None else goals
-    configurations = goals_of(truth)
+    configurations = shown_positions(cell, truth)
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
     with ExitStack() as ends:

@@ -14,9 +14,11 @@ import numpy as np
 
 from stereoservo.messages.cell_file import CameraSection, CellFile
 from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo_drivers.twist import TwistJointDriver, virtual_positions
 from stereoservo_sim.emulators.cameras.stream_settings import cameras_of_cell
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.world.arms.arm_cell import cell_of, place_of
+from stereoservo_sim.world.arms.arm_goals import goals_of
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell, workpiece_cell
 from stereoservo_sim.world.workpiece import Moved
@@ -46,6 +48,16 @@ def true_cell(cell: CellFile, folder: Path = Path()) -> SimulatedCell:
             raise ValueError(f"camera {section.name!r} is not simulated: {error.args[0]}") from error
         cameras.append(replace(camera, name=section.name))
     return replace(simulated, rig=replace(simulated.rig, cameras=tuple(cameras)))
+
+
+def shown_positions(cell: CellFile, truth: SimulatedCell) -> dict[str, FloatArray]:
+    """Positions of the cell's joints (n,) at the demonstration's goals, by name: of the virtual ones of an arm that
+    takes Cartesian velocities.
+    """
+    goals = goals_of(truth)
+    if cell.joints.driver != TwistJointDriver.driver:
+        return goals
+    return {name: virtual_positions(cell.joints.options, truth, q) for name, q in goals.items()}
 
 
 def _simulated_options(section: CameraSection, cell: CellFile) -> Mapping[str, Any]:

@@ -17,6 +17,7 @@ from rich.console import Console
 from stereoservo.kinematics.model import pinhole
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo_drivers.twist import TwistJointDriver, seen_as_joints
 from stereoservo_sim.cells import ARMS, shipped_cell_path
 from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.experiments.arms.random_rigs import judged_case
@@ -121,7 +122,11 @@ def twin(cell: SimulatedCell, home: FloatArray) -> SyntheticCell:
 
 def _cell(name: str) -> SimulatedCell:
     path = shipped_cell_path(name)
-    return true_cell(load_cell_file(path), path.parent)
+    file = load_cell_file(path)
+    cell = true_cell(file, path.parent)
+    return (
+        seen_as_joints(file.joints.options, cell) if file.joints.driver == TwistJointDriver.driver else cell
+    )
 
 
 def show_shipped_arms(answer: dict[str, Any], console: Console) -> None:

@@ -1,0 +1,265 @@
+"""Driver ``twist``: a simulated arm behind a Cartesian-velocity interface, with a controller of its own.
+
+The controller solves its inverse kinematics at each call, in velocities, keeps its own speed limits and time-out, and
+stops the arm by itself near a singularity and at a joint's limit, as such controllers do; the cell knows nothing of the
+arm's own joints. A driver of a real one: `kit.cartesian`, docs/extending.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import DriverContext, DriverError
+from stereoservo_drivers.fake import FakeJointDriver
+from stereoservo_drivers.kit.cartesian import (
+    CartesianJointDriver,
+    CartesianState,
+    Frame,
+    cartesian_description,
+)
+from stereoservo_drivers.kit.virtual_joints import VirtualLimits, positions_of, turn
+from stereoservo_drivers.options import decode_options
+from stereoservo_drivers.pybullet import PybulletJointDriver
+from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm, cell_of_context
+from stereoservo_sim.world.arms.arm_cell import LEVER, body_jacobian
+from stereoservo_sim.world.arms.virtual_arm import virtual_cell
+from stereoservo_sim.world.camera_rig import inverse_pose
+from stereoservo_sim.world.robots import Robot, flange_pose
+from stereoservo_sim.world.simulated_cell import SimulatedCell
+from stereoservo_sim.world.workpiece import Moved
+
+Positive = Annotated[float, Meta(gt=0)]
+Triple = tuple[float, float, float]
+
+SINGULAR = 0.01
+"""Smallest over largest singular value of the arm's motion: below it the controller stops."""
+LIMIT_MARGIN = 0.01
+"""From a joint's limit the controller stops [rad or m]."""
+LONGEST_CYCLE_S = 0.01
+"""Time that the ramp of a twist takes in at most, between two calls."""
+
+
+class TwistOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of the arm behind the interface (`ArmOptions`), and of the interface.
+
+    ``arm``: what moves it. ``tool``: the tool's frame in the flange's. ``frame``: whose axes twists are in.
+    ``attitude``: rotation vector [rad], base from tool, about which turns are counted (default: at the cell's base).
+    ``box``: how far the tool's point may go from there to either side [m]; ``turns`` [rad] about the tool's x, y, z
+    there; ``velocities``, ``accelerations`` of slides and turns. ``speeds``: [m/s], [rad/s] to which the controller
+    itself scales a twist down.
+    """
+
+    arm: Literal["pybullet", "fake"] = "pybullet"
+    tool: Moved = Moved()
+    frame: Frame = "base"
+    attitude: Triple | None = None
+    box: tuple[Positive, Positive, Positive] = (0.5, 0.5, 0.5)
+    turns: tuple[Positive, Positive, Positive] = (2.0, 1.2, 6.0)
+    velocities: tuple[Positive, Positive] = (0.15, 0.5)
+    accelerations: tuple[Positive, Positive] = (1.0, 4.0)
+    speeds: tuple[Positive, Positive] = (0.25, 1.0)
+
+
+class SimulatedController:
+    """A :class:`CartesianArm` over a simulated arm. What it tells is the kinematics of its encoders' readings."""
+
+    def __init__(
+        self, options: TwistOptions, inner: SimulatedArm, robot: Robot, context: DriverContext
+    ) -> None:
+        self._inner, self._robot, self._clock = inner, robot, context.clock
+        self._tool = options.tool.matrix
+        self._frame, self._speeds = options.frame, options.speeds
+        self._timeout_ns = round(options.command_timeout_s * 1e9)
+        self._accelerations = options.accelerations
+        self._twist, self._at = (
+            np.zeros(6),
+            np.zeros(6),
+        )  # commanded, and where its ramp is; turns times LEVER
+        self._deadline_ns = self._driven_ns = 0
+        self._stopped = ""
+        ends = [(j.position_min, j.position_max, j.velocity_max) for j in robot.joints]
+        self._low, self._high, self._fastest = np.array(ends).T
+
+    def connect(self) -> None:
+        """Set up the arm; a protective stop is over."""
+        self._inner.configure()
+        self._twist[:] = self._at[:] = 0.0
+        self._stopped = ""
+
+    def enable(self) -> None:
+        """Release the brakes."""
+        self._inner.activate()
+
+    def read(self) -> CartesianState:
+        """Pose and twist of the tool's point. Raises DriverError (``protective_stop``) where the controller stopped."""
+        state = self._inner.read_state()
+        if self._stopped:
+            raise DriverError("protective_stop", self._stopped)
+        pose = tool_pose(self._robot, self._tool, state.positions)
+        J = self._jacobian(state.positions)
+        self._drive(state.positions, J)
+        told = J @ state.velocities
+        R = self._robot.mounted[:3, :3].T  # the robot tells everything in its own base frame
+        return CartesianState(state.t_ns, pose, R @ told[:3], R @ told[3:] / LEVER)
+
+    def write(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Follow a twist until the time-out, scaled down to the controller's speeds."""
+        q = self._inner.read_state().positions
+        scale = min(1.0, *(
+            speed / max(float(np.linalg.norm(part)), 1e-12)
+            for speed, part in zip(self._speeds, (v, w), strict=True)
+        ))  # fmt: skip
+        v, w = scale * v, scale * w
+        R = self._robot.mounted[:3, :3]
+        if self._frame == "tool":
+            R = R @ tool_pose(self._robot, self._tool, q)[:3, :3]
+        self._twist = np.concatenate([R @ v, LEVER * (R @ w)])
+        self._deadline_ns = self._clock.now_ns() + self._timeout_ns
+        share = self._drive(q, self._jacobian(q))
+        return share * v, share * w
+
+    def stop(self) -> None:
+        """Brake."""
+        self._twist[:] = self._at[:] = 0.0
+        self._inner.stop()
+
+    def disable(self) -> None:
+        """Brake; hold."""
+        self._twist[:] = self._at[:] = 0.0
+        self._inner.deactivate()
+
+    def close(self) -> None:
+        """Release."""
+        self._inner.close()
+
+    def _jacobian(self, q: FloatArray) -> FloatArray:
+        point = (flange_pose(self._robot, q) @ self._tool)[:3, 3]
+        return body_jacobian(self._robot, q, point)
+
+    def _drive(self, q: FloatArray, J: FloatArray) -> float:
+        """One cycle: the arm's joint velocities for the twist in force, or a stop of its own. Returns the share of the
+        twist that the arm's joints are fast enough for.
+        """
+        now_ns = self._clock.now_ns()
+        if now_ns >= self._deadline_ns:
+            self._twist[:] = 0.0
+        moved = self._at.any()
+        self._ramp(min((now_ns - self._driven_ns) * 1e-9, LONGEST_CYCLE_S))
+        self._driven_ns = now_ns
+        if not self._at.any():
+            if moved:
+                self._inner.write_velocity(np.zeros(len(q)))
+            return 1.0
+        u, values, vt = np.linalg.svd(J, full_matrices=False)
+        if values[-1] < SINGULAR * values[0]:
+            self._protect("near a singularity of the arm")
+            return 0.0
+        rates = vt.T @ ((u.T @ self._at) / values)
+        beyond = ((q > self._high - LIMIT_MARGIN) & (rates > 0)) | (
+            (q < self._low + LIMIT_MARGIN) & (rates < 0)
+        )
+        if beyond.any():
+            self._protect(f"joint {self._robot.joint_names[int(np.argmax(beyond))]} of the arm at its limit")
+            return 0.0
+        share = min(1.0, 1.0 / float((np.abs(rates) / self._fastest).max()))
+        self._inner.write_velocity(share * rates)
+        return share
+
+    def _ramp(self, dt: float) -> None:
+        """Bring the twist in force nearer to the commanded one, slide and turn each at its acceleration."""
+        for part, acceleration in (
+            (slice(3), self._accelerations[0]),
+            (slice(3, 6), LEVER * self._accelerations[1]),
+        ):
+            gap = self._twist[part] - self._at[part]
+            size = float(np.linalg.norm(gap))
+            self._at[part] += gap * min(1.0, acceleration * dt / max(size, 1e-12))
+
+    def _protect(self, cause: str) -> None:
+        self.stop()
+        self._stopped = (
+            f"the robot's controller has stopped the arm: {cause}; reset, move it away with its own panel, and keep "
+            "the work farther from there (box, turns, calibration.range)"
+        )
+
+
+class TwistJointDriver(CartesianJointDriver):
+    """The simulated arm as its Cartesian interface shows it: six virtual joints."""
+
+    driver = "twist"
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        decoded = decode_options(TwistOptions, options, self.driver)
+        cell = cell_of_context(options, context, self.driver)
+        kind = PybulletJointDriver if decoded.arm == "pybullet" else FakeJointDriver
+        inner = kind({k: v for k, v in options.items() if k in ArmOptions.__struct_fields__}, context)
+        self._inner, self._cell = inner, cell
+        attitude = attitude_of(decoded, cell)
+        start = np.array(inner.describe().home)
+        home = positions_of(tool_pose(cell.robot, decoded.tool.matrix, start), attitude, np.zeros(6))
+        description = cartesian_description(
+            self.driver, limits_of(decoded, cell), rate_hz=decoded.rate_hz, timeout_s=decoded.command_timeout_s,
+            budget_us=inner.call_budget_us, home=tuple(home.tolist()), simulated=True,
+        )  # fmt: skip
+        description = msgspec.structs.replace(description, auxiliary=decoded.auxiliary)
+        super().__init__(
+            SimulatedController(decoded, inner, cell.robot, context), description, attitude, decoded.frame
+        )
+
+    def write_auxiliary(self, values: Mapping[str, float]) -> None:
+        """Order auxiliary joints and outputs, as `SimulatedArm`."""
+        self._inner.write_auxiliary(values)
+
+    def read_auxiliary(self) -> dict[str, float]:
+        """Auxiliary joints and outputs now."""
+        return self._inner.read_auxiliary()
+
+    def stop_auxiliary(self) -> None:
+        """Auxiliary joints stand where they are."""
+        self._inner.stop_auxiliary()
+
+
+def tool_pose(robot: Robot, tool: FloatArray, q: FloatArray) -> FloatArray:
+    """Pose (4, 4) of the tool in the robot's own base frame at the arm's joints ``q`` (n,); ``tool`` (4, 4): flange
+    from tool.
+    """
+    pose: FloatArray = inverse_pose(robot.mounted) @ flange_pose(robot, q) @ tool
+    return pose
+
+
+def attitude_of(options: TwistOptions, cell: SimulatedCell) -> FloatArray:
+    """The attitude (3, 3) about which turns are counted: the option's, else the tool's at the cell's base."""
+    if options.attitude is not None:
+        return turn(np.array(options.attitude))
+    return tool_pose(cell.robot, options.tool.matrix, cell.base)[:3, :3]
+
+
+def limits_of(options: TwistOptions, cell: SimulatedCell) -> VirtualLimits:
+    """Limits of the virtual joints around the tool's place at the cell's base."""
+    middle, box = tool_pose(cell.robot, options.tool.matrix, cell.base)[:3, 3], np.array(options.box)
+    return VirtualLimits(
+        tuple((middle - box).tolist()), tuple((middle + box).tolist()), options.turns, options.velocities,
+        options.accelerations,
+    )  # fmt: skip
+
+
+def seen_as_joints(options: Mapping[str, Any], cell: SimulatedCell) -> SimulatedCell:
+    """The truth of a cell of driver ``twist`` with the virtual joints in place of the arm's. Raises DriverError."""
+    decoded = decode_options(TwistOptions, options, TwistJointDriver.driver)
+    return virtual_cell(
+        cell, decoded.tool.matrix, attitude_of(decoded, cell), limits_of(decoded, cell).joints(),
+        virtual_positions(options, cell, cell.base),
+    )  # fmt: skip
+
+
+def virtual_positions(options: Mapping[str, Any], cell: SimulatedCell, q: FloatArray) -> FloatArray:
+    """Virtual joints (6,) of a cell of driver ``twist`` with the arm's own joints at ``q`` (n,). Raises DriverError."""
+    decoded = decode_options(TwistOptions, options, TwistJointDriver.driver)
+    pose = tool_pose(cell.robot, decoded.tool.matrix, q)
+    return positions_of(pose, attitude_of(decoded, cell), np.zeros(6))

@@ -1,0 +1,39 @@
+"""The six virtual joints of an arm that takes Cartesian velocities, as a serial arm of its own: the truth of what the
+cell sees, where the arm's controller does as it is told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import JointSpec
+from stereoservo_sim.world.camera_rig import inverse_pose
+from stereoservo_sim.world.robots import Robot
+from stereoservo_sim.world.simulated_cell import SimulatedCell
+
+
+def virtual_robot(
+    robot: Robot, tool: FloatArray, attitude: FloatArray, joints: tuple[JointSpec, ...]
+) -> Robot:
+    """``T = Tx Ty Tz A Rx Ry Rz`` of ``tool`` (4, 4) on the flange of ``robot``, as an arm; ``attitude`` (3, 3): A."""
+    to_next = np.eye(4)[:, [1, 2, 0, 3]]  # z along what was x: x, y, z in turn
+    turned = np.eye(4)
+    turned[:3, :3] = attitude
+    links = np.array([to_next, to_next, turned @ to_next, to_next, to_next, inverse_pose(tool)])
+    return Robot(
+        f"{robot.name} by twists", robot.mounted @ to_next, links, joints, np.zeros(6), np.zeros((6, 3)), ()
+    )
+
+
+def virtual_cell(
+    cell: SimulatedCell,
+    tool: FloatArray,
+    attitude: FloatArray,
+    joints: tuple[JointSpec, ...],
+    base: FloatArray,
+) -> SimulatedCell:
+    """``cell`` with its arm as six virtual ``joints``, laid out around ``base`` (6,)."""
+    return replace(cell, robot=virtual_robot(cell.robot, tool, attitude, joints), base=base)
