@@ -40,7 +40,7 @@ APPEARS_S = 2.0
 CALL_S = 10.0
 """For so long a call waits for its answer."""
 LOOK_S = 0.0005
-SILENT_NS = 50_000_000
+SILENT_NS = 20_000_000
 """Without a sample for so long it is looked whether the plant's process lives."""
 
 

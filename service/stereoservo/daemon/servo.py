@@ -28,7 +28,7 @@ from stereoservo.daemon.kernel_compilation import (
     warm_up_first,
 )
 from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
-from stereoservo.daemon.pacing import ClockPacing, prepare_realtime
+from stereoservo.daemon.pacing import clock_pacing, prepare_realtime
 from stereoservo.daemon.plant_driver import PlantDriver, make_driver
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError
@@ -344,7 +344,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
                 write_log("servo", warning)
             _configure(process, termination, clock)
             gc.freeze()
-            pacing = ClockPacing(round(1e9 / rate_hz))
+            pacing = clock_pacing(round(1e9 / rate_hz))
             while not termination.asked:
                 process.cycle(pacing)
             process.come_to_rest(pacing, lambda: termination.signals >= 2)
