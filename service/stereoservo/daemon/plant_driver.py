@@ -35,7 +35,9 @@ PLANT_CAPACITY = 1 << 14
 _ORDERS = struct.Struct("=7q")
 _STATE = struct.Struct("=6q??6x")
 
-APPEARS_S = 2.0
+ENDED = "plant_ended"
+"""Code of the error where the plant's process has ended."""
+APPEARS_S = 4.0
 """For so long a call waits for a plant that is being started; it may be tried again."""
 CALL_S = 10.0
 """For so long a call waits for its answer."""
@@ -156,7 +158,13 @@ class PlantDriver:
         while True:
             state = self._look()
             if state is not None and self._lives():
-                break
+                self._failures = state.failures
+                try:
+                    self._call(active=False, session=state.session)
+                    return
+                except DriverError as error:
+                    if error.code != ENDED:  # else what was found was the state of a plant before
+                        raise
             if self._clock.now_ns() > until_ns:
                 raise DriverError(
                     "plant_absent",
@@ -165,8 +173,6 @@ class PlantDriver:
                     retry=True,
                 )
             self._sleep(LOOK_S)
-        self._failures = state.failures
-        self._call(active=False, session=state.session)
 
     def activate(self) -> None:
         """Power on, at rest. Raises DriverError."""
@@ -282,7 +288,7 @@ class PlantDriver:
         state = self._look()
         if state is None or state.session != self._orders.session or not self._lives():
             raise DriverError(
-                "plant_ended",
+                ENDED,
                 "the process of the simulated drives ended, and they stopped; the supervisor starts it again: see what "
                 "it logged last, reset, then enable",
             )
