@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.daemon.plant import Plant
+from stereoservo.daemon.plant import PlantProcess
 from stereoservo.daemon.plant_driver import (
     PLANT_CAPACITY,
     PLANT_ORDERS_LAYOUT,
@@ -38,11 +38,11 @@ class Cell:
             self.plant.driver.describe(), self.directories, self.clock, sleep=lambda seconds: self.run(0.001)
         )
 
-    def started(self) -> Plant:
+    def started(self) -> PlantProcess:
         """A plant process's plant."""
         options = {"command_timeout_s": TIMEOUT_S, "auxiliary": [GRIPPER]}
         root = self.directories.runtime
-        return Plant(
+        return PlantProcess(
             FakeJointDriver(options, DriverContext(self.clock, "plant", root, root)),
             self.directories,
             self.clock,

@@ -1,8 +1,8 @@
 """The plant of a simulated cell: its drives and what they move, in a process of their own, at its own pace, as real
 drives stand outside the servo process.
 
-`Plant` serves any simulated joint driver to a `plant_driver.PlantDriver`; `main` runs it as a process of its own, found
-by the cell's entry point. Without orders the drives stop by their own command time-out.
+`PlantProcess` serves any simulated joint driver, found by the cell's entry point, to a `plant_driver.PlantDriver`;
+`main` runs it as a process of its own. Without orders the drives stop by their own command time-out.
 ``python -m stereoservo.daemon.plant RUNTIME_DIRECTORY PARENT_PID``.
 """
 
@@ -45,7 +45,7 @@ FAILED_READ_EVERY_NS = 100_000_000
 EXIT_SETUP = 3
 
 
-class Plant:
+class PlantProcess:
     """The drives of one cell behind two records: orders in, state out. Raises SlotError.
 
     It obeys orders that are addressed to its ``session``; there are none before a `PlantDriver` has found it. ``beat``:
@@ -172,7 +172,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
     at_rest_ns = round(1e9 / plan.joints.rate_hz)
     moving_ns = min(round(1e9 / MOVING_RATE_HZ), at_rest_ns)
     with closing(HeartbeatWriter(directories.heartbeat_slot("plant"))) as heartbeat:
-        plant = Plant(make_driver(plan, clock), directories, clock, beat=heartbeat.beat)
+        plant = PlantProcess(make_driver(plan, clock), directories, clock, beat=heartbeat.beat)
         with closing(plant):
             # Real drives keep their time whatever the computer does; below the servo loop, which they must not delay.
             for warning in prepare_realtime(max(plan.cell.servo.priority - 1, 0)):
