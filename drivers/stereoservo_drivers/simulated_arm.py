@@ -29,6 +29,8 @@ from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.velocity_drives import DriveBank, Plant
 
+RECORD_EVERY_NS = 3_000_000
+"""At least between two samples of the history, so that a plant of 1 kHz does not fill it sooner; cubic between them."""
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 
@@ -233,7 +235,7 @@ class SimulatedArm:
         return self._last_ns
 
     def _record(self, bank: DriveBank) -> None:
-        if self._history is not None:
+        if self._history is not None and bank.t_ns - self._history.newest_ns >= RECORD_EVERY_NS:
             self._history.append(bank.t_ns, bank.plant.positions, bank.plant.velocities)
 
     def _open_history(self, now_ns: int) -> TrueJointHistory:

@@ -13,7 +13,7 @@ from stereoservo.cli import main as cli
 from stereoservo.cli.doctor import command
 from stereoservo.cli.doctor import joints as examination_module
 from stereoservo.daemon.ipc_messages import RunPlan
-from stereoservo.daemon.servo import make_driver
+from stereoservo.daemon.plant_driver import make_driver
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock

@@ -165,7 +165,10 @@ class Watched:
         for name in names:
             create_slot(directories.heartbeat_slot(name), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT)
         plan = SimpleNamespace(
-            runtime=str(root), directories=directories, cameras=(SimpleNamespace(name="left"),)
+            runtime=str(root),
+            directories=directories,
+            cameras=(SimpleNamespace(name="left"),),
+            joints=SimpleNamespace(simulated=False),
         )
         self.now = 1000.0
         self.started: list[str] = []

@@ -89,6 +89,14 @@ def run(acme: Path, cache: Path, first: str = "", **environment: str) -> tuple[f
     return float(done.stdout), {line["kernel"] for line in lines if line.get("module", "").startswith("acme")}
 
 
+def test_a_kernel_that_is_compiled_is_linked_with_what_came_from_the_cache(
+    acme: Path, tmp_path: Path
+) -> None:
+    assert run(acme, tmp_path / "cache") == (20.0, {"caller", "twice"})
+    (acme / "caller.py").write_text(CALLER.replace("FACTOR * twice(x)", "twice(x) + twice(x)"))
+    assert run(acme, tmp_path / "cache") == (4.0, {"caller"})
+
+
 @pytest.mark.parametrize(("change", "result"), [({"count": 3}, 30.0), ({"factor": 7.0}, 14.0)])
 def test_a_kernel_is_renewed_with_what_it_calls(
     acme: Path, tmp_path: Path, change: dict[str, float], result: float

@@ -26,6 +26,8 @@ SERVO_HANG_S = 2.0
 second, the core recovers (LOOP_GAP): what stands for longer cannot be trusted any more."""
 DRIVER_CALL_S = 15.0
 """Drives that are connected, configured and enabled anew: the gateway waits 10 s for it."""
+PLANT_HANG_S = 2.0
+"""Without samples the core brakes and holds; from a stall of a shared machine it recovers."""
 GATEWAY_HANG_S = 5.0
 """The arm is held after 0.5 s of its silence, so nothing hurries; its files are on disks that may be slow."""
 SUPERVISOR_HANG_S = 0.8

@@ -7,10 +7,14 @@ cycle that ran over its slot's end skips the slots that have passed instead of c
 from __future__ import annotations
 
 import gc
+import mmap
 import os
+import struct
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from stereoservo.messages.servo_state import LoopStatistics
 
@@ -118,6 +122,40 @@ class ClockPacing:
             work_p99_us=self._work.quantile(0.99),
             work_max_us=float(self._work.maximum),
         )
+
+
+CYCLE_LOG_VARIABLE = "STEREOSERVO_CYCLE_LOG"
+"""Names a file of zeros in which the loop notes its cycles: their number, then four 64-bit words each."""
+_CYCLE = struct.Struct("=4q")
+CYCLE_BYTES = _CYCLE.size
+
+
+class LoggedPacing(ClockPacing):
+    """`ClockPacing` that notes every cycle in a mapped file: when it woke, how late [ns], the work of the cycle before
+    it [ns], the slots that this one skipped. What the file has no room for is not noted.
+    """
+
+    def __init__(self, period_ns: int, path: Path) -> None:
+        super().__init__(period_ns)
+        with path.open("r+b") as file:
+            self._log = mmap.mmap(file.fileno(), 0)
+        self._room = len(self._log) // CYCLE_BYTES - 1
+
+    def wait(self) -> int:
+        """Sleep until the next slot, and note it; returns the time of waking [ns]."""
+        work, skipped = self._now() - self._woke, self.skipped
+        woke = super().wait()
+        if self.cycles <= self._room:
+            row = (woke, woke - self._deadline, work, self.skipped - skipped)
+            _CYCLE.pack_into(self._log, self.cycles * CYCLE_BYTES, *row)
+            self._log[:8] = self.cycles.to_bytes(8, sys.byteorder)
+        return woke
+
+
+def clock_pacing(period_ns: int) -> ClockPacing:
+    """The pacing of a loop; a `LoggedPacing` where ``STEREOSERVO_CYCLE_LOG`` names its file."""
+    log = os.environ.get(CYCLE_LOG_VARIABLE)
+    return LoggedPacing(period_ns, Path(log)) if log else ClockPacing(period_ns)
 
 
 def prepare_realtime(priority: int) -> list[str]:

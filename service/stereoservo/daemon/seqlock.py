@@ -199,6 +199,11 @@ class SlotReader:
         """Number of writers this slot has had."""
         return int(self._mapping.words[_EPOCH_WORD])
 
+    @property
+    def writer_pid(self) -> int:
+        """The process of its newest writer; 0 before the first."""
+        return int(self._mapping.words[_PID_WORD])
+
     def poll(self) -> bytes | None:
         """The newest record unless it was read before, else None."""
         return self._read(skip=self._seen)

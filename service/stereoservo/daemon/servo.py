@@ -28,7 +28,8 @@ from stereoservo.daemon.kernel_compilation import (
     warm_up_first,
 )
 from stereoservo.daemon.links import GatewayMessages, Pacing, ServoLinks
-from stereoservo.daemon.pacing import ClockPacing, prepare_realtime
+from stereoservo.daemon.pacing import clock_pacing, prepare_realtime
+from stereoservo.daemon.plant_driver import PlantDriver, make_driver
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError
 from stereoservo.daemon.servo_links import ProcessLinks
@@ -287,13 +288,6 @@ class ServoProcess:
                 return
 
 
-def make_driver(plan: RunPlan, clock: Clock) -> JointDriver:
-    """The cell's joint driver, constructed and not connected. Raises PluginError, DriverError."""
-    kind = plugins.load(plugins.JOINT_DRIVERS, plan.cell.joints.driver)
-    driver: JointDriver = kind(plan.cell.joints.options, plan.driver_context(clock))
-    return driver
-
-
 def _configure(process: ServoProcess, termination: Termination, clock: MonotonicClock) -> None:
     """Connect, with retries where the driver's error allows it. Raises DriverError."""
     for attempt in range(CONFIGURE_TRIES):
@@ -327,7 +321,9 @@ def run(plan: RunPlan, termination: Termination) -> None:
     else:
         warm_up_first()
     core = ServoCore(plan.settings())
-    driver = make_driver(plan, clock)
+    driver = (
+        PlantDriver(plan.joints, directories, clock) if plan.joints.simulated else make_driver(plan, clock)
+    )
     rate_hz = plan.cell.servo.rate_hz
     links = ProcessLinks(directories, tuple(camera.name for camera in plan.cell.camera))
     heartbeat = HeartbeatWriter(directories.heartbeat_slot("servo"))
@@ -348,7 +344,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
                 write_log("servo", warning)
             _configure(process, termination, clock)
             gc.freeze()
-            pacing = ClockPacing(round(1e9 / rate_hz))
+            pacing = clock_pacing(round(1e9 / rate_hz))
             while not termination.asked:
                 process.cycle(pacing)
             process.come_to_rest(pacing, lambda: termination.signals >= 2)

@@ -96,16 +96,10 @@ class ProcessLinks:
         self._gateway: PacketChannel | None = None
         self._recorder: _RecorderPeer | None = None
         self._outbox = EventOutbox()
-        self._waiting = self._watched()
-
-    def _watched(self) -> select.poll:
-        """What tells in one call whether a peer or a message waits: calls that fail cost more, in every cycle."""
-        waiting = select.poll()
+        self._waiting = select.epoll()
+        """Tells in one call whether a peer or a message waits; what is closed leaves it by itself."""
         for server in (self._control, self._steps):
-            waiting.register(server.fileno(), select.POLLIN)
-        if self._gateway is not None and self._gateway.is_open:
-            waiting.register(self._gateway.fileno(), select.POLLIN)
-        return waiting
+            self._waiting.register(server.fileno(), select.EPOLLIN)
 
     def receive(self) -> GatewayMessages:
         """Requests and model of the newest gateway connection; a message that does not decode is left out."""
@@ -114,6 +108,7 @@ class ProcessLinks:
         heard = False
         for peer in self._control.accept():
             self._gateway = peer
+            self._waiting.register(peer.fileno(), select.EPOLLIN)
             heard = True
         for peer in self._steps.accept():
             self._recorder = _RecorderPeer(peer)
@@ -130,7 +125,6 @@ class ProcessLinks:
                 update = ModelUpdate(message.model, message.reanchored)
             elif isinstance(message, Hello):
                 self._outbox.rewind(message.last_event)
-        self._waiting = self._watched()
         return GatewayMessages(heard, tuple(requests), update)
 
     def observations(self) -> tuple[CameraObservation, ...]:
@@ -173,6 +167,7 @@ class ProcessLinks:
 
     def close(self) -> None:
         """Release all; idempotent."""
+        self._waiting.close()
         self._control.close()
         self._steps.close()
         self._state.close()

@@ -1,7 +1,7 @@
-"""The supervisor of a daemon: starts, monitors and restarts the processes of one cell (servo, vision, gateway), and
-owns its lock and runtime directory.
+"""The supervisor of a daemon: starts, monitors and restarts the processes of one cell (servo, vision, gateway, and of a
+simulated cell its plant), and owns its lock and runtime directory.
 
-A gateway or vision process that ends is started again after a growing pause. The servo process is never
+A gateway, vision or plant process that ends is started again after a growing pause. The servo process is never
 started again: when it ends, everything stops. A process that hangs (its heartbeat is late) is killed, and
 counts as one that ended. Children die with the supervisor, whatever kills it (the servo process in good
 order).
@@ -44,6 +44,7 @@ from stereoservo.daemon.ipc_messages import (
     load_plan,
     save_plan,
 )
+from stereoservo.daemon.plant_driver import PLANT_CAPACITY, PLANT_ORDERS_LAYOUT, PLANT_STATE_LAYOUT
 from stereoservo.daemon.process_control import Termination, child_environment, write_log
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
 from stereoservo.daemon.vision import Reporter
@@ -141,7 +142,8 @@ class Supervisor:
             self._child(f"vision-{camera.name}", "stereoservo.daemon.vision", camera.name)
             for camera in self.plan.cameras
         ]
-        self.children = [self.servo, self.gateway, *cameras]
+        self.plant = [self._child("plant", "stereoservo.daemon.plant")] if self.plan.joints.simulated else []
+        self.children = [*self.plant, self.servo, self.gateway, *cameras]
         self._reporter = Reporter(self.plan.directories.reports_socket, "supervisor", MonotonicClock())
         self._looked_s = 0.0
 
@@ -175,7 +177,7 @@ class Supervisor:
         while not (self.plan.directories.daemon.exists() and self.plan.directories.control_socket.exists()):
             if termination.asked:
                 return
-            for child in (self.servo, self.gateway):
+            for child in (*self.plant, self.servo, self.gateway):
                 if child.process is not None and (code := child.process.poll()) is not None:
                     raise StartError(
                         f"the {child.name} process ended at its start (exit code {code}); its message "
@@ -310,6 +312,10 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
     """Path, capacity and layout of all slots of a cell."""
     directories = plan.directories
     found = [(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)]
+    if plan.joints.simulated:
+        found.append((directories.plant_state_slot, PLANT_CAPACITY, PLANT_STATE_LAYOUT))
+        found.append((directories.plant_orders_slot, PLANT_CAPACITY, PLANT_ORDERS_LAYOUT))
+        found.append((directories.heartbeat_slot("plant"), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT))
     for name in ("servo", "gateway", "supervisor", *(f"vision-{camera.name}" for camera in plan.cameras)):
         found.append((directories.heartbeat_slot(name), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT))
     for camera in plan.cameras:

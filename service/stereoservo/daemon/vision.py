@@ -57,6 +57,8 @@ FIRST_PAUSE_S = 0.2
 LONGEST_PAUSE_S = 5.0
 SILENT_CAMERA_S = 2.0
 """A camera that delivers nothing for so long is closed and opened again."""
+QUIET_PERIODS = 0.6
+"""Of a camera, after a frame, in which nobody looks for the next one: one that is so early is taken a little later."""
 PRIOR_MAX_AGE_S = 0.5
 EXIT_SETUP = 3
 
@@ -209,9 +211,10 @@ def camera_loop(
     *,
     camera: str,
     poll_s: float,
+    quiet_s: float = 0.0,
 ) -> Generator[float]:
     """Generator that runs a camera for ever and yields the seconds to wait before it is resumed; closing it closes
-    the camera.
+    the camera. It is polled every ``poll_s``, and not for ``quiet_s`` after it has delivered.
 
     Every failure is reported once and answered by a reconnect after a growing pause.
     """
@@ -223,13 +226,14 @@ def camera_loop(
             heard_ns = now_ns()
             yield 0.0
             while True:
+                polled_ns = now_ns()
                 if pipeline.poll():
                     heard_ns = now_ns()
                     pause_s = FIRST_PAUSE_S
                     if down:
                         down = False
                         report("camera_back", f"camera {camera} delivers again")
-                    yield 0.0
+                    yield max(quiet_s - (heard_ns - polled_ns) * 1e-9, 0.0)
                 elif (now_ns() - heard_ns) * 1e-9 > SILENT_CAMERA_S:
                     raise DriverError("silent", f"no image for {SILENT_CAMERA_S:g} s", retry=True)
                 else:
@@ -302,6 +306,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
                 clock.now_ns,
                 camera=camera,
                 poll_s=poll_interval_s(description.rate_hz),
+                quiet_s=QUIET_PERIODS / description.rate_hz,
             )
             run_camera(loop, lambda: termination.asked, sleep=clock.sleep, between=between)
     finally:

@@ -117,8 +117,18 @@ class CellDirectories(NamedTuple):
         """The socket on which the gateway's router listens by default."""
         return self.runtime / "zenoh.sock"
 
+    @property
+    def plant_state_slot(self) -> Path:
+        """Newest state of the simulated drives."""
+        return self.runtime / "plant-state.slot"
+
+    @property
+    def plant_orders_slot(self) -> Path:
+        """Newest orders to the simulated drives."""
+        return self.runtime / "plant-orders.slot"
+
     def heartbeat_slot(self, process: str) -> Path:
-        """Heartbeat of ``process``: ``servo``, ``gateway``, or ``vision-`` and a camera's name."""
+        """Heartbeat of ``process``: ``servo``, ``plant``, ``gateway``, or ``vision-`` and a camera's name."""
         return self.runtime / f"heartbeat-{process}.slot"
 
     def observation_slot(self, camera: str) -> Path:

@@ -47,6 +47,12 @@ def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     return run_features(repetitions, seed, progress)
 
 
+def _loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.loop import run_loop
+
+    return run_loop(repetitions, seed, progress)
+
+
 def _soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.soak import run_soak
 
@@ -84,6 +90,7 @@ BENCHES: dict[str, Bench] = {
     "faults": _faults,
     "features": _features,
     "kills": _kills,
+    "loop": _loop,
     "soak": _soak,
     "soak-live": _soak_live,
     "startup": _startup,
@@ -99,7 +106,8 @@ def bench(
         typer.Option(
             min=1,
             help="Timed fits of `calibration`, trials of each of `faults`, ten of `kills`, two virtual minutes of "
-            "`soak`, two real ones of `soak-live`, commands of `startup`; the others take a multiple.",
+            "`soak`, two real ones of `soak-live`, commands of `startup`, pairs of segments of `loop`; the others "
+            "take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,

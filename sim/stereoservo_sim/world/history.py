@@ -118,6 +118,11 @@ class TrueJointHistory:
         """Samples ever written; the newest has index ``count - 1``."""
         return int(struct.unpack_from("<Q", self._buffer, _COUNT_AT)[0])
 
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest sample as its writer knows it; -1 before the first."""
+        return self._last_ns
+
     def append(self, t_ns: int, positions: FloatArray, velocities: FloatArray) -> None:
         """Write one sample (n,), (n,); a sample that is not newer than the last is ignored."""
         if t_ns <= self._last_ns:

@@ -118,6 +118,7 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "faults",
         "features",
         "kills",
+        "loop",
         "soak",
         "soak-live",
         "startup",

@@ -13,7 +13,7 @@ import typer
 from stereoservo.cli.output import CommandError
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.pacing import realtime_for_a_while
-from stereoservo.daemon.servo import make_driver
+from stereoservo.daemon.plant_driver import make_driver
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path, holder
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError, ExaminableJointDriver, ExaminationFinding

@@ -1,0 +1,202 @@
+"""The plant of a simulated cell: its drives and what they move, in a process of their own, at its own pace, as real
+drives stand outside the servo process.
+
+`PlantProcess` serves any simulated joint driver, found by the cell's entry point, to a `plant_driver.PlantDriver`;
+`main` runs it as a process of its own. Without orders the drives stop by their own command time-out.
+``python -m stereoservo.daemon.plant RUNTIME_DIRECTORY PARENT_PID``.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from stereoservo.daemon.heartbeat import DRIVER_CALL_S, PLANT_HANG_S, HeartbeatWriter
+from stereoservo.daemon.ipc_messages import PlanError, RunPlan, load_plan
+from stereoservo.daemon.pacing import prepare_realtime
+from stereoservo.daemon.plant_driver import (
+    PLANT_CAPACITY,
+    PLANT_ORDERS_LAYOUT,
+    PLANT_STATE_LAYOUT,
+    Orders,
+    PlantState,
+    Remarks,
+    make_driver,
+)
+from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
+from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports import plugins
+from stereoservo.ports.clock import MonotonicClock
+from stereoservo.ports.devices import AuxiliaryDriver, Clock, DriverError, JointDriver
+
+MOVING_RATE_HZ = 1000.0
+"""At least, while the arm moves: so old may an order or a sample be."""
+SETTLES_NS = 500_000_000
+"""For so long after the last motion the plant keeps this pace."""
+FAILED_READ_EVERY_NS = 100_000_000
+EXIT_SETUP = 3
+
+
+class PlantProcess:
+    """The drives of one cell behind two records: orders in, state out. Raises SlotError.
+
+    It obeys orders that are addressed to its ``session``; there are none before a `PlantDriver` has found it. ``beat``:
+    told before what may take longer, and in every step, within how many seconds it is told again.
+    """
+
+    def __init__(
+        self, driver: JointDriver, directories: CellDirectories, clock: Clock, *,
+        beat: Callable[[float], None] = lambda limit_s: None,
+    ) -> None:  # fmt: skip
+        self.driver = driver
+        self._auxiliary = driver if isinstance(driver, AuxiliaryDriver) else None
+        self._description = driver.describe()
+        self._names = [spec.name for spec in self._description.auxiliary]
+        self._clock = clock
+        self._beat = beat
+        self.session = clock.now_ns()
+        joints = len(self._description.joints)
+        self._done = Orders(
+            self.session, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan)
+        )
+        """The newest orders that were obeyed."""
+        self._state = PlantState(
+            self.session, 0, 0, 0, 0, joints, False, False, np.zeros((4, joints)), self._done.auxiliary, b""
+        )
+        self._remarks = Remarks()
+        self._configured = False
+        self._moved_ns = self._read_ns = 0
+        self._orders = SlotReader(directories.plant_orders_slot, PLANT_ORDERS_LAYOUT)
+        self._slot = SlotWriter(directories.plant_state_slot, PLANT_CAPACITY, PLANT_STATE_LAYOUT)
+
+    def step(self) -> None:
+        """Obey what was ordered since the last step, bring the drives up to now, and tell their state."""
+        record = self._orders.poll()
+        if record is not None:
+            orders = Orders.decoded(record, len(self._done.velocities))
+            if orders.session == self.session:
+                self._obey(orders)
+        if self._configured and self._clock.now_ns() >= self._read_ns:
+            with self._failing():
+                self._read()
+        self._slot.write(self._state._replace(remarks=msgspec.msgpack.encode(self._remarks)).encoded())
+        self._beat(PLANT_HANG_S)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the arm moves, or did a short while ago."""
+        return self._clock.now_ns() - self._moved_ns < SETTLES_NS
+
+    def _obey(self, orders: Orders) -> None:
+        """Do what is ordered and was not done yet: the stop first, then lifecycle calls, then motion."""
+        done, self._done = self._done, orders
+        if orders.stops != done.stops:
+            self.driver.stop()
+        if orders.auxiliary_stops != done.auxiliary_stops and self._auxiliary is not None:
+            self._auxiliary.stop_auxiliary()
+        with self._failing():
+            if orders.call != done.call:
+                self._state = self._state._replace(call=orders.call)
+                self._read_ns = 0
+                self._beat(DRIVER_CALL_S)
+                self._change(active=orders.active)
+            if orders.velocity_number != done.velocity_number and orders.active:
+                reasons = self.driver.write_velocity(orders.velocities).reasons
+                if reasons != self._remarks.reasons:
+                    self._remarks = Remarks(reasons=reasons)
+            if orders.auxiliary_number != done.auxiliary_number and self._auxiliary is not None:
+                values = dict(zip(self._names, orders.auxiliary.tolist(), strict=True))
+                self._auxiliary.write_auxiliary(
+                    {name: value for name, value in values.items() if value == value}
+                )
+
+    def _change(self, *, active: bool) -> None:
+        if active:
+            self.driver.activate()
+            return
+        if self._configured:
+            self.driver.deactivate()
+        self.driver.configure()
+        self._configured = True
+
+    def _read(self) -> None:
+        sample = self.driver.read_state()
+        state = self._state
+        values = np.zeros_like(state.values)
+        values[0], values[1] = sample.positions, sample.velocities
+        for row, given in ((2, sample.efforts), (3, sample.following_errors)):
+            if given is not None:
+                values[row] = given
+        if self._done.velocities.any() or values[1].any():
+            self._moved_ns = self._clock.now_ns()
+        self._state = state._replace(
+            seq=sample.seq, t_ns=sample.t_ns, values=values, auxiliary=self._auxiliary_values(),
+            has_efforts=sample.efforts is not None, has_following=sample.following_errors is not None,
+        )  # fmt: skip
+
+    def _auxiliary_values(self) -> FloatArray:
+        if self._auxiliary is None or not self._names:
+            return self._state.auxiliary
+        found = self._auxiliary.read_auxiliary()
+        return np.array([found.get(name, np.nan) for name in self._names])
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """What the driver raises stops it and is told; it is asked for a sample again after a pause."""
+        try:
+            yield
+        except DriverError as error:
+            self.driver.stop()
+            self._remarks = Remarks(error.code, str(error), error.retry, self._remarks.reasons)
+            self._state = self._state._replace(failures=self._state.failures + 1)
+            self._read_ns = self._clock.now_ns() + FAILED_READ_EVERY_NS
+
+    def close(self) -> None:
+        """Brake, release. Idempotent."""
+        self.driver.close()
+        self._orders.close()
+        self._slot.close()
+
+
+def run(plan: RunPlan, termination: Termination) -> None:
+    """Run until terminated: at the drives' rate at rest, at ``MOVING_RATE_HZ`` at least while the arm moves."""
+    directories, clock = plan.directories, MonotonicClock()
+    at_rest_ns = round(1e9 / plan.joints.rate_hz)
+    moving_ns = min(round(1e9 / MOVING_RATE_HZ), at_rest_ns)
+    with closing(HeartbeatWriter(directories.heartbeat_slot("plant"))) as heartbeat:
+        plant = PlantProcess(make_driver(plan, clock), directories, clock, beat=heartbeat.beat)
+        with closing(plant):
+            # Real drives keep their time whatever the computer does; below the servo loop, which they must not delay.
+            for warning in prepare_realtime(max(plan.cell.servo.priority - 1, 0)):
+                write_log("plant", warning)
+            due_ns = clock.now_ns()
+            while not termination.asked:
+                plant.step()
+                now_ns = clock.now_ns()
+                due_ns = max(due_ns + (moving_ns if plant.moves else at_rest_ns), now_ns)
+                clock.sleep((due_ns - now_ns) * 1e-9)
+
+
+def main() -> int:
+    """Entry of the process."""
+    runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
+    die_with_parent(parent, signal.SIGTERM)
+    termination = Termination()
+    try:
+        run(load_plan(runtime), termination)
+    except (DriverError, PlanError, SlotError, plugins.PluginError) as error:
+        write_log("plant", str(error))
+        return EXIT_SETUP
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,319 @@
+"""The joint driver of a simulated cell in the servo process: the drives themselves run in the process `plant`, as real
+ones stand outside this computer; and the records that pass between the two.
+
+Both records are the newest only. `Orders` say what is wanted rather than what is to be done, so that none that is
+missed is missing later; a plant obeys those that are addressed to its own session, and comes up without power.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Self
+
+import msgspec
+import numpy as np
+
+from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.seqlock import SlotReader, SlotWriter
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports import plugins
+from stereoservo.ports.devices import (
+    Clock,
+    CommandReport,
+    DriverError,
+    JointDriver,
+    JointDriverDescription,
+    JointState,
+)
+
+PLANT_STATE_LAYOUT, PLANT_ORDERS_LAYOUT = "PlantState.1", "PlantOrders.1"
+PLANT_CAPACITY = 1 << 14
+_ORDERS = struct.Struct("=7q")
+_STATE = struct.Struct("=6q??6x")
+
+ENDED = "plant_ended"
+"""Code of the error where the plant's process has ended."""
+APPEARS_S = 4.0
+"""For so long a call waits for a plant that is being started; it may be tried again."""
+CALL_S = 10.0
+"""For so long a call waits for its answer."""
+LOOK_S = 0.0005
+SILENT_NS = 20_000_000
+"""Without a sample for so long it is looked whether the plant's process lives."""
+
+
+class Orders(NamedTuple):
+    """What the servo process wants of the drives of plant ``session``: numbers of the newest lifecycle ``call``, of the
+    ``stops``, of the velocity and of the auxiliary order ``asked``, and of ``auxiliary_stops``; ``active``: drives on.
+    ``velocities`` (n,); ``auxiliary`` (m,), NaN where nothing is ordered.
+    """
+
+    session: int
+    call: int
+    active: bool
+    stops: int
+    velocity_number: int
+    auxiliary_number: int
+    auxiliary_stops: int
+    velocities: FloatArray
+    auxiliary: FloatArray
+
+    def encoded(self) -> bytes:
+        """As a record."""
+        return _ORDERS.pack(*self[:7]) + self.velocities.tobytes() + self.auxiliary.tobytes()
+
+    @classmethod
+    def decoded(cls, record: bytes, joints: int) -> Self:
+        """From a record for so many joints."""
+        session, call, active, *numbers = _ORDERS.unpack_from(record)
+        values = np.frombuffer(record, dtype=np.float64, offset=_ORDERS.size)
+        return cls._make((session, call, bool(active), *numbers, values[:joints], values[joints:]))
+
+
+class Remarks(msgspec.Struct, frozen=True, array_like=True):
+    """Texts of a plant's state: its last failure, and why the last velocities were not sent as they were ordered."""
+
+    code: str = ""
+    message: str = ""
+    retry: bool = False
+    reasons: tuple[str, ...] = ()
+
+
+class PlantState(NamedTuple):
+    """State of a plant's drives: its ``session``, the last ``call`` that it has answered, the number of ``failures``
+    so far, and the newest sample (``seq`` 0: there is none): ``values`` (4, n) of positions, velocities, efforts and
+    following errors, of which the last two may not be there; ``auxiliary`` (m,), NaN where unknown; `Remarks`, encoded.
+    """
+
+    session: int
+    call: int
+    failures: int
+    seq: int
+    t_ns: int
+    joints: int
+    has_efforts: bool
+    has_following: bool
+    values: FloatArray
+    auxiliary: FloatArray
+    remarks: bytes
+
+    def encoded(self) -> bytes:
+        """As a record."""
+        return _STATE.pack(*self[:8]) + self.values.tobytes() + self.auxiliary.tobytes() + self.remarks
+
+    @classmethod
+    def decoded(cls, record: bytes, auxiliaries: int) -> Self:
+        """From a record with so many auxiliary values."""
+        head = _STATE.unpack_from(record)
+        count = 4 * head[5]
+        values = np.frombuffer(record, np.float64, count + auxiliaries, _STATE.size).copy()
+        tail = record[_STATE.size + 8 * values.size :]
+        return cls._make((*head, values[:count].reshape(4, -1), values[count:], tail))
+
+    def sample(self) -> JointState:
+        """The newest joint sample."""
+        positions, velocities, efforts, following = self.values
+        return JointState(
+            self.seq, self.t_ns, positions, velocities, efforts if self.has_efforts else None,
+            following if self.has_following else None,
+        )  # fmt: skip
+
+
+class PlantDriver:
+    """A joint driver whose drives are in the cell's plant process. Raises SlotError.
+
+    Velocities are in the plant's drives within its period; its command time-out is its own. Where its process ends,
+    calls raise ``plant_ended`` until :meth:`configure` finds its successor. ``sleep``: how calls wait [s].
+    """
+
+    def __init__(
+        self, description: JointDriverDescription, directories: CellDirectories, clock: Clock,
+        *, sleep: Callable[[float], None] = time.sleep,
+    ) -> None:  # fmt: skip
+        self._description = description
+        self._clock = clock
+        self._sleep = sleep
+        self._names = [spec.name for spec in description.auxiliary]
+        self._reader = SlotReader(directories.plant_state_slot, PLANT_STATE_LAYOUT)
+        self._writer = SlotWriter(directories.plant_orders_slot, PLANT_CAPACITY, PLANT_ORDERS_LAYOUT)
+        joints = len(description.joints)
+        self._orders = Orders(0, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan))
+        self._state: PlantState | None = None
+        self._failures = 0
+        self._encoded_remarks, self._remarks = b"", Remarks()
+
+    def describe(self) -> JointDriverDescription:
+        """That of the plant's driver."""
+        return self._description
+
+    # -- lifecycle ------------------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Have the plant set up its drives, without power; finds a plant that was started anew. Raises DriverError."""
+        until_ns = self._clock.now_ns() + round(APPEARS_S * 1e9)
+        while True:
+            state = self._look()
+            if state is not None and self._lives():
+                self._failures = state.failures
+                try:
+                    self._call(active=False, session=state.session)
+                    return
+                except DriverError as error:
+                    if error.code != ENDED:  # else what was found was the state of a plant before
+                        raise
+            if self._clock.now_ns() > until_ns:
+                raise DriverError(
+                    "plant_absent",
+                    f"the process of the simulated drives is not up after {APPEARS_S:g} s; it is started by the "
+                    "supervisor: try again",
+                    retry=True,
+                )
+            self._sleep(LOOK_S)
+
+    def activate(self) -> None:
+        """Power on, at rest. Raises DriverError."""
+        self._call(active=True, session=self._orders.session)
+
+    def deactivate(self) -> None:
+        """Stop and power off. Idempotent; a plant that has ended has no power."""
+        if self._orders.active:
+            self.stop()
+            self._send(active=False, call=self._orders.call + 1)
+
+    def close(self) -> None:
+        """Stop, power off, release. Idempotent; never raises."""
+        self.deactivate()
+        self._reader.close()
+        self._writer.close()
+
+    def _call(self, *, active: bool, session: int) -> None:
+        """Order a lifecycle call and wait for its answer. Raises DriverError: what the drives say, or a plant that
+        ended or does not answer.
+        """
+        still = np.zeros_like(self._orders.velocities)
+        self._send(active=active, session=session, call=self._orders.call + 1, velocities=still)
+        until_ns = self._clock.now_ns() + round(CALL_S * 1e9)
+        while True:
+            state = self._state_of_session()
+            if state.call == self._orders.call:
+                break
+            if self._clock.now_ns() > until_ns:
+                raise DriverError(
+                    "plant_silent",
+                    f"the process of the simulated drives did not answer for {CALL_S:g} s; is the computer overloaded?",
+                    retry=True,
+                )
+            self._sleep(LOOK_S)
+        self._raise_failure(state)
+
+    # -- motion ---------------------------------------------------------------------------------------------
+
+    def read_state(self) -> JointState:
+        """The newest sample of the plant, which may have been read before. Raises DriverError."""
+        state = self._state_of_session()
+        self._raise_failure(state)
+        if state.seq == 0:
+            raise DriverError("no_sample", "the simulated drives have told no positions yet", retry=True)
+        return state.sample()
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        """Order velocities (n,); the report's reasons are those of the order before. Raises DriverError."""
+        orders = self._orders
+        asked = np.array(qd, dtype=np.float64)
+        if asked.shape != orders.velocities.shape or not np.all(np.isfinite(asked)):
+            raise DriverError(
+                "shape",
+                f"write_velocity() got {asked.tolist()}; {orders.velocities.size} finite velocities are valid",
+            )
+        self._raise_failure(self._state_of_session())
+        self._send(velocities=asked, velocity_number=orders.velocity_number + 1)
+        return CommandReport(
+            self._orders.velocity_number, self._clock.now_ns(), asked, asked, self._remarks.reasons
+        )
+
+    def stop(self) -> None:
+        """Order the drives to brake. Any state; never raises."""
+        self._orders.auxiliary[:] = np.nan
+        self._send(
+            stops=self._orders.stops + 1, auxiliary_stops=self._orders.auxiliary_stops + 1,
+            velocities=np.zeros_like(self._orders.velocities),
+        )  # fmt: skip
+
+    # -- auxiliary joints -----------------------------------------------------------------------------------
+
+    def write_auxiliary(self, values: Mapping[str, float]) -> None:
+        """Order auxiliary joints and outputs. Raises DriverError: there is no such name, or the plant ended."""
+        for name, value in values.items():
+            if name not in self._names:
+                known = ", ".join(self._names) or "none"
+                raise DriverError("auxiliary", f"no auxiliary joint or output {name!r}; there are: {known}")
+            self._orders.auxiliary[self._names.index(name)] = value
+        self._raise_failure(self._state_of_session())
+        self._send(auxiliary_number=self._orders.auxiliary_number + 1)
+
+    def read_auxiliary(self) -> dict[str, float]:
+        """The newest known values by name."""
+        if self._state is None:
+            return {}
+        found = zip(self._names, self._state.auxiliary.tolist(), strict=True)
+        return {name: value for name, value in found if value == value}
+
+    def stop_auxiliary(self) -> None:
+        """Order auxiliary joints to stand where they are. Never raises."""
+        self._orders.auxiliary[:] = np.nan
+        self._send(auxiliary_stops=self._orders.auxiliary_stops + 1)
+
+    # -- records --------------------------------------------------------------------------------------------
+
+    def _send(self, **changes: Any) -> None:
+        self._orders = self._orders._replace(**changes)
+        self._writer.write(self._orders.encoded())
+
+    def _look(self) -> PlantState | None:
+        """The newest state of any plant; None before the first."""
+        record = self._reader.poll()
+        if record is not None:
+            self._state = PlantState.decoded(record, len(self._names))
+            if self._state.remarks != self._encoded_remarks:
+                self._encoded_remarks = self._state.remarks
+                self._remarks = msgspec.msgpack.decode(self._encoded_remarks, type=Remarks)
+        return self._state
+
+    def _state_of_session(self) -> PlantState:
+        """The newest state of the plant that was configured. Raises DriverError: it has ended."""
+        state = self._look()
+        if state is None or state.session != self._orders.session or not self._lives():
+            raise DriverError(
+                ENDED,
+                "the process of the simulated drives ended, and they stopped; the supervisor starts it again: see what "
+                "it logged last, reset, then enable",
+            )
+        return state
+
+    def _lives(self) -> bool:
+        """Whether the process that wrote the newest state lives; looked at only where it says nothing."""
+        state = self._state
+        if state is not None and self._clock.now_ns() - state.t_ns < SILENT_NS:
+            return True
+        try:
+            os.kill(self._reader.writer_pid, 0)
+        except ProcessLookupError:
+            return False
+        return True
+
+    def _raise_failure(self, state: PlantState) -> None:
+        """Raise the drives' newest failure, once."""
+        if state.failures != self._failures:
+            self._failures = state.failures
+            raise DriverError(self._remarks.code, self._remarks.message, retry=self._remarks.retry)
+
+
+def make_driver(plan: RunPlan, clock: Clock) -> JointDriver:
+    """The cell's joint driver, constructed and not connected. Raises PluginError, DriverError."""
+    kind = plugins.load(plugins.JOINT_DRIVERS, plan.cell.joints.driver)
+    driver: JointDriver = kind(plan.cell.joints.options, plan.driver_context(clock))
+    return driver

@@ -1,0 +1,58 @@
+"""The simulated drives as a process of their own: what the servo process maps, and the death of the plant."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from stereoservo.client import Client
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.messages.discovery import DaemonProcess
+from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
+
+from .conftest import CELL, eventually, processes
+
+pytestmark = pytest.mark.process
+
+
+def test_a_killed_plant_is_a_fault_that_is_named_and_comes_back_where_it_was(
+    cell_file: Path, start: Callable[..., DaemonProcess], directories: CellDirectories
+) -> None:
+    path = cell_file.with_name("physical.toml")
+    path.write_text(
+        cell_file.read_text().replace('driver = "fake"\n[joints', 'driver = "pybullet"\n[joints', 1)
+    )
+    daemon = start(path)
+    found = processes(directories)
+    assert "pybullet" in Path(f"/proc/{found['plant']}/maps").read_text()
+    assert "pybullet" not in Path(f"/proc/{found['servo']}/maps").read_text()
+    with Client(CELL) as client:
+        client.enable()
+        at = client.status().joints["j1"]
+        client.goal({"j1": at + 0.5}, speed_scale=0.3).abandon()
+        eventually("the arm moves", lambda: client.status().joints["j1"] > at + 0.02)
+        os.kill(found["plant"], signal.SIGKILL)
+
+        def told(kind: str, text: str) -> bool:
+            return any(event.kind == kind and text in event.message for event in client.events(1).events)
+
+        eventually("the fault", lambda: told("fault", "the process of the simulated drives ended"))
+        eventually("the report", lambda: told("process_ended", "plant ended by signal SIGKILL"))
+        assert client.status().lifecycle == "fault"
+        eventually(
+            "a new plant", lambda: processes(directories).get("plant", found["plant"]) != found["plant"]
+        )
+        assert processes(directories)["servo"] == found["servo"]
+        stopped = TrueJointHistory.open(directories.runtime / FILE_NAME).newest()
+        assert stopped is not None
+        client.reset()
+        eventually("the reset", lambda: client.status().lifecycle == "inactive")
+        assert client.status().joints["j1"] == pytest.approx(stopped[1][0], abs=1e-3)
+        client.enable()
+        client.resume()
+        client.goal({"j1": at}).reached(60.0)
+    assert daemon.stop() == 0
