@@ -47,6 +47,18 @@ def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     return run_features(repetitions, seed, progress)
 
 
+def _recording(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.recording import run_recording
+
+    return run_recording(repetitions, seed, progress)
+
+
+def _scale(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.scale import run_scale
+
+    return run_scale(repetitions, seed, progress)
+
+
 def _soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.soak import run_soak
 
@@ -84,6 +96,8 @@ BENCHES: dict[str, Bench] = {
     "faults": _faults,
     "features": _features,
     "kills": _kills,
+    "recording": _recording,
+    "scale": _scale,
     "soak": _soak,
     "soak-live": _soak_live,
     "startup": _startup,
