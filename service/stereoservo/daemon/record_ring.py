@@ -52,7 +52,10 @@ class RingWriter:
         at = written % capacity
         skipped = capacity - at if at + size > capacity else 0
         used = written - self._words[_READ_WORD]
-        if used < 0 or used + skipped + size > capacity:
+        if not 0 <= used <= capacity:  # damaged: what waits is given up
+            self._words[_WRITTEN_WORD] = self._words[_READ_WORD] = written
+            return False
+        if used + skipped + size > capacity:
             return False
         if skipped:
             _RECORD.pack_into(self._bytes, _HEADER_BYTES + at, _SKIP, 0)
