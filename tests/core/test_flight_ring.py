@@ -12,12 +12,12 @@ from stereoservo.core.state import encode_state
 from stereoservo.recording import ring as ring_module
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.ring import FlightRing, RingLimits, RingThread
+from stereoservo.recording.step_layout import StepEncoder
 from stereoservo.recording.step_records import (
     RecordedCheckpoint,
     RecordedStep,
     RecordingStart,
     StepMessage,
-    encode_step,
     fingerprint,
 )
 
@@ -53,7 +53,7 @@ class Flight:
                 self.ring.take(RecordedCheckpoint(self.bench.now_ns, state.step, encode_state(state)))
             outputs = self.bench.step()
             inputs = self.bench.log[-1][0]
-            self.ring.take(RecordedStep(inputs.now_ns, encode_step(inputs, outputs)))
+            self.ring.take(RecordedStep(inputs.now_ns, StepEncoder().encode(inputs, outputs)))
             self.steps += 1
             if self.steps % CHECKPOINT_EVERY == 0:
                 self.stamp()
@@ -110,7 +110,7 @@ def test_the_oldest_segments_are_dropped_by_age(flight: Flight, monkeypatch: pyt
 def test_the_oldest_segments_are_dropped_by_bytes(flight: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ring_module, "CHUNK_BYTES", 0)
     monkeypatch.setattr("stereoservo.recording.flight_recorder.CHUNK_BYTES", 1024)
-    flight.limits = flight.limits._replace(bytes=250_000)
+    flight.limits = flight.limits._replace(bytes=120_000)
     flight.restart()
     for _ in range(6):
         flight.fly(0.5)

@@ -11,9 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from oracles.former_recording import FormerRecorder
+from oracles.former_recording import encode_step as former_step
 from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.cycle import ModelUpdate
+from stereoservo.core.cycle import DriverFault, ModelUpdate, encode
 from stereoservo.core.state import (
     OLDEST_VERSION,
     STATE_VERSION,
@@ -22,11 +24,15 @@ from stereoservo.core.state import (
     encode_state,
     is_recorded,
 )
-from stereoservo.messages.goals import DEFAULT_LAW, Enable, FeatureTarget, Goal, RunGoal
+from stereoservo.messages.goals import DEFAULT_LAW, Enable, FeatureTarget, Goal, Request, RunGoal
+from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.compilation import overloads
+from stereoservo.recording.compression import StepBlocks
 from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, replay
-from stereoservo.recording.step_records import Fingerprint, encode_step, fingerprint
+from stereoservo.recording.step_layout import StepEncoder, decode_step, outputs_crc
+from stereoservo.recording.step_records import Fingerprint, fingerprint
 
 
 def record(
@@ -65,7 +71,7 @@ def record(
                         inputs.joints, positions=inputs.joints.positions * (1 + 1e-12)
                     ),
                 )
-            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
+            recorder.step(StepEncoder().encode(inputs, outputs), inputs.now_ns)
         return recorder.steps
 
 
@@ -219,7 +225,7 @@ def test_a_recording_of_before_models_had_groups_replays(benches: Any, tmp_path:
     bench.run(0.1)
     path = tmp_path / "flight.mcap"
     goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(bench.q + 0.1)))
-    with FlightRecorder(path, bench.settings, fingerprint()) as recorder:
+    with FormerRecorder(path, bench.settings, fingerprint()) as recorder:
         for k in range(300):
             if k % 100 == 0:
                 state = without_groups(encode_state(bench.core.state))
@@ -228,7 +234,7 @@ def test_a_recording_of_before_models_had_groups_replays(benches: Any, tmp_path:
             commands = {10: [Enable()], 60: [RunGoal(goal)]}.get(k, [])
             outputs = bench.step(*commands, model_update=update)
             inputs = bench.log[-1][0]
-            recorder.step(without_groups(encode_step(inputs, outputs)), inputs.now_ns)
+            recorder.step(without_groups(former_step(inputs, outputs)), inputs.now_ns)
     result = replay(path)
     assert (result.identical, result.steps, result.checkpoints) == (True, 300, 3)
     assert bench.core.state.source.goal.id == goal.id
@@ -294,3 +300,86 @@ def test_settings_of_another_version_are_told_from_damage(bench: Any, tmp_path: 
             pass
         with pytest.raises(RecordingError, match=said):
             replay(path)
+
+
+def test_a_recording_of_format_1_is_read(tmp_path: Path) -> None:
+    """Made by the version before format 2: 60 steps of an arm with a goal, two cameras."""
+    path = Path(__file__).parents[1] / "recordings" / "flight-1.mcap"
+    result = replay(path)
+    assert (result.steps, result.checkpoints, result.gaps) == (60, 1, 0)
+    assert result.identical is not False
+    assert result.max_relative_error < 1e-9
+    motion = read_motion(path)
+    assert np.array_equal(np.diff(motion.now_ns), np.full(59, 10_000_000))
+    assert not motion.asked.all(), "the arm sets out in it"
+
+
+def test_a_step_record_holds_all_inputs_bit_for_bit(benches: Any) -> None:
+    """Usual ones in their places, all else beside them: compared with their encoding in msgpack."""
+    bench = benches(3, noise_px=0.1)
+    bench.ready()
+    bench.step(RunGoal(Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(bench.q + 0.1)))))
+    bench.run(0.2)
+    inputs, outputs = next(pair for pair in reversed(bench.log) if pair[0].observations)
+    joints, (sight, *_) = inputs.joints, inputs.observations
+    variants = [inputs, *(pair[0] for pair in bench.log[:60])]
+    for changed in (
+        msgspec.structs.replace(joints, positions=joints.positions.astype(np.float32)),
+        msgspec.structs.replace(joints, velocities=np.arange(12.0)[::2]),
+        msgspec.structs.replace(joints, positions=np.array([-0.0, np.nan]), velocities=np.zeros(3)),
+        msgspec.structs.replace(joints, t_ns=2**63 - 1, efforts=np.array([np.nan] * 6)),
+        msgspec.structs.replace(joints, efforts=-joints.positions, following_errors=joints.positions),
+        msgspec.structs.replace(joints, positions=np.zeros(0), velocities=np.zeros(0)),
+        None,
+    ):
+        variants.append(msgspec.structs.replace(inputs, joints=changed, now_ns=-(2**62)))
+    for seen in (
+        msgspec.structs.replace(sight, ids=sight.ids.astype(np.int32)),
+        msgspec.structs.replace(sight, pixels=np.asfortranarray(sight.pixels)),
+        msgspec.structs.replace(sight, camera="häuslich, long", seq=-1),
+        msgspec.structs.replace(sight, t_shutter_ns=-(2**63), covariances=np.zeros((1, 2))),
+    ):
+        variants.append(msgspec.structs.replace(inputs, observations=(seen, sight)))
+    variants.append(
+        msgspec.structs.replace(
+            inputs, stop=True, driver_active=False, driver_configured=False, compiling=True, parameter_epoch=9,
+            driver_fault=DriverFault("bus", "off"), requests=(Request(1, "me", Enable()),),
+            model_update=ModelUpdate(bench.truth.model, ("left",)),
+        )
+    )  # fmt: skip
+    records = [StepEncoder().encode(one, outputs) for one in variants]
+    for one, record in zip(variants, records, strict=True):
+        again = decode_step(record)
+        assert encode(again.inputs) == encode(one)
+        assert encode(again.command) == encode(outputs.command)
+        assert (again.step, again.outputs_crc) == (outputs.status.step, outputs_crc(outputs))
+    writer, reader = StepBlocks(), StepBlocks()
+    for k in range(0, len(records), 20):
+        assert reader.restore(writer.compress(records[k : k + 20])) == records[k : k + 20]
+
+
+def test_the_checksum_sees_every_bit_of_the_outputs(bench: Any) -> None:
+    bench.ready()
+    outputs = bench.step()
+    status = outputs.status
+    known = outputs_crc(outputs)
+    for name in status.__struct_fields__:
+        value = getattr(status, name)
+        if name in ("t_ns", "step"):  # compared by themselves, or the inputs'
+            continue
+        if isinstance(value, np.ndarray):
+            other: Any = np.concatenate([value.ravel(), [-0.0]])
+        elif isinstance(value, dict):
+            other = {key: number + 1 for key, number in value.items()} or {"left": 1}
+        elif isinstance(value, str | tuple):
+            other = value + ("x" if isinstance(value, str) else (Reason("CODE", "info"),))  # type: ignore[operator]
+        elif name == "health":
+            other = msgspec.structs.replace(value, size=value.size + 1e-9)
+        else:
+            other = 0.5 if value is None else value + 1
+            if name in ("efforts", "following_errors", "effort_limits", "following_limits"):
+                other = np.zeros(6)
+        changed = msgspec.structs.replace(outputs, status=msgspec.structs.replace(status, **{name: other}))
+        assert outputs_crc(changed) != known, name
+    assert outputs_crc(msgspec.structs.replace(outputs, driver_request="reset")) != known
+    assert outputs_crc(msgspec.structs.replace(outputs, command=None)) != known

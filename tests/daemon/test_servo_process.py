@@ -23,9 +23,10 @@ from stereoservo.daemon.ipc_messages import (
     ServoState,
     event_decoder,
     state_decoder,
-    steps_decoder,
+    unpack_step_message,
 )
 from stereoservo.daemon.pacing import ClockPacing
+from stereoservo.daemon.record_ring import RingReader
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot, create_slot, create_stop_slot
 from stereoservo.daemon.seqpacket import PacketChannel
 from stereoservo.daemon.servo import GATEWAY_SILENCE_S, ServoProcess
@@ -56,7 +57,8 @@ from stereoservo.ports.devices import (
     JointSpec,
     JointState,
 )
-from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, decode_step
+from stereoservo.recording.step_layout import decode_step
+from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart
 
 RATE_HZ = 250.0
 JOINTS = tuple(JointSpec(f"j{k}", "revolute", -2.0, 2.0, 1.0, 4.0) for k in (1, 2))
@@ -399,30 +401,39 @@ def test_a_restarted_gateway_gets_the_events_that_it_missed_and_no_other(bench: 
     assert [event.seq for event in bench.events] == list(range(1, known + 2))
 
 
-def test_records_begin_with_a_checkpoint_and_a_full_socket_makes_a_counted_gap(bench: Bench) -> None:
-    steps = PacketChannel.connect(bench.directories.steps_socket)
+def test_records_begin_with_a_checkpoint_and_a_full_ring_makes_a_counted_gap(bench: Bench) -> None:
+    ring = RingReader(bench.directories.steps_ring)
     bench.run(4)
-    start, checkpoint, *records = [steps_decoder.decode(data) for data in steps.receive()]
+    assert ring.read(100) == []  # nobody reads yet: nothing is written
+    ring.attach()
+    bench.run(4)
+    start, checkpoint, *records = [unpack_step_message(data) for data in ring.read(100)]
     assert isinstance(start, RecordingStart)
     assert start.settings.joint_names == ("j1", "j2")
     assert isinstance(checkpoint, RecordedCheckpoint)
     numbers = [decode_step(r.data).step for r in records if isinstance(r, RecordedStep)]
     assert numbers == list(range(checkpoint.step + 1, checkpoint.step + 5))
+    bench.process._stream.dropped = 0
+    filled = bytes(1 << 20)
+    writer = bench.links._steps
+    while writer.write(filled):
+        pass
     while bench.process._stream.dropped == 0:
         bench.run(50)
     dropped_first = bench.process._stream.dropped
-    drained = []
-    while some := steps.receive(1000):
-        drained += [steps_decoder.decode(data) for data in some]
+    drained = [unpack_step_message(data) for data in ring.read(100_000) if data != filled]
     assert not any(isinstance(r, RecordedCheckpoint) and r.lost for r in drained)
     last = max(decode_step(r.data).step for r in drained if isinstance(r, RecordedStep))
     bench.run(2)
-    gap, after, *_ = [steps_decoder.decode(data) for data in steps.receive()]
+    gap, after, *_ = [unpack_step_message(data) for data in ring.read(100)]
     assert isinstance(gap, RecordedCheckpoint)
     assert gap.lost == dropped_first
     assert isinstance(after, RecordedStep)
     assert decode_step(after.data).step == last + gap.lost + 1
-    steps.close()
+    ring.detach()
+    bench.run(2)
+    assert ring.read(100) == []
+    ring.close()
 
 
 def module_level_imports(name: str) -> set[str]:

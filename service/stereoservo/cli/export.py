@@ -22,7 +22,8 @@ WHATS = ("markers", "baseline", "prismatic", "a", "d")
 
 def export(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A flight recording (*.mcap), or a model (*.json) for --urdf.")
+        Path,
+        typer.Argument(metavar="FILE", help="A flight recording (*.mcap), or a model (*.json) for --urdf."),
     ],
     output: Annotated[
         Path | None,
@@ -43,7 +44,9 @@ def export(
     ] = "",
     cell: Annotated[
         Path | None,
-        typer.Option("--cell", metavar="FILE", help="Cell file whose safety.limit are the joints' in the URDF."),
+        typer.Option(
+            "--cell", metavar="FILE", help="Cell file whose safety.limit are the joints' in the URDF."
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -4,6 +4,7 @@ state, reports), and the capacities and layouts of their shared-memory slots.
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import msgspec
@@ -26,7 +27,7 @@ from stereoservo.ports.devices import (
     JointDriverDescription,
     Prior,
 )
-from stereoservo.recording.step_records import StepMessage
+from stereoservo.recording.step_records import RecordedStep, StepMessage
 
 OBSERVATION_LAYOUT = "CameraObservation.1"
 PRIOR_LAYOUT = "Prior.1"
@@ -138,6 +139,22 @@ def decode_observation(data: bytes) -> CameraObservation:
     return observation
 
 
+def pack_step_message(message: StepMessage) -> bytes:
+    """A message for the ring of step records; a step as it is, all else in msgpack."""
+    if isinstance(message, RecordedStep):
+        return _STEP.pack(_STEP_MARK, min(message.lost, 0xFFFFFFFF), message.t_ns) + message.data
+    return encode(message)
+
+
+def unpack_step_message(data: bytes) -> StepMessage:
+    """Inverse of :func:`pack_step_message`. Raises msgspec.MsgspecError, ValueError, struct.error."""
+    if data[:4] != b"\xc1" * 4:
+        message: StepMessage = _steps_decoder.decode(data)
+        return message
+    _, lost, t_ns = _STEP.unpack_from(data)
+    return RecordedStep(t_ns, data[_STEP.size :], lost)
+
+
 class PlanError(DamagedError):
     """The run plan of a cell cannot be read."""
 
@@ -147,7 +164,10 @@ event_decoder = msgspec.msgpack.Decoder(Event, dec_hook=decode_array)
 state_decoder = msgspec.msgpack.Decoder(ServoState, dec_hook=decode_array)
 observation_decoder = msgspec.msgpack.Decoder(CameraObservation, dec_hook=decode_array)
 prior_decoder = msgspec.msgpack.Decoder(Prior, dec_hook=decode_array)
-steps_decoder = msgspec.msgpack.Decoder(StepMessage, dec_hook=decode_array)
+_steps_decoder = msgspec.msgpack.Decoder(StepMessage, dec_hook=decode_array)
+_STEP = struct.Struct("<IIq")
+"""Before a step in the ring: mark, steps lost before it, time. What is rare is msgpack, which no mark begins."""
+_STEP_MARK = 0xC1C1C1C1  # a byte that msgpack never uses
 report_decoder = msgspec.msgpack.Decoder(Report)
 _plan_decoder = msgspec.msgpack.Decoder(RunPlan)
 

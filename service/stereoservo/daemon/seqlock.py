@@ -76,7 +76,7 @@ def create_slot(path: Path, capacity: int, layout: str) -> bool:
         os.close(fd)
 
 
-class _Mapping:
+class Mapping:
     """A file mapped as 64-bit words and bytes."""
 
     def __init__(self, path: Path, minimum: int) -> None:
@@ -110,8 +110,9 @@ class _Mapping:
             self._fd = -1
 
 
-def _open(path: Path, layout: str) -> tuple[_Mapping, int]:
-    mapping = _Mapping(path, _HEADER_BYTES)
+def map_slot(path: Path, layout: str) -> tuple[Mapping, int]:
+    """The file of a slot or ring, mapped, and its capacity. Raises SlotError."""
+    mapping = Mapping(path, _HEADER_BYTES)
     magic, found, capacity = (
         mapping.words[_MAGIC_WORD],
         mapping.words[_LAYOUT_WORD],
@@ -135,7 +136,7 @@ class SlotWriter:
 
     def __init__(self, path: Path, capacity: int, layout: str) -> None:
         create_slot(path, capacity, layout)
-        self._mapping, self._capacity = _open(path, layout)
+        self._mapping, self._capacity = map_slot(path, layout)
         self._path = path
         try:
             fcntl.flock(self._mapping.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -188,7 +189,7 @@ class SlotReader:
     """
 
     def __init__(self, path: Path, layout: str, *, retries: int = 8) -> None:
-        self._mapping, self._capacity = _open(path, layout)
+        self._mapping, self._capacity = map_slot(path, layout)
         self._retries = retries
         self._seen = 0
         self.torn = 0
@@ -275,7 +276,7 @@ class StopSlot:
     """
 
     def __init__(self, path: Path) -> None:
-        self._mapping = _Mapping(path, _STOP_BYTES)
+        self._mapping = Mapping(path, _STOP_BYTES)
         if self._mapping.words[_STOP_MAGIC_WORD] != _STOP_MAGIC:
             self._mapping.close()
             raise SlotError(path, "layout", "is not a stop slot")

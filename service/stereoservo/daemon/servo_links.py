@@ -21,11 +21,13 @@ from stereoservo.daemon.ipc_messages import (
     ServoState,
     ToServo,
     decode_observation,
+    pack_step_message,
     to_servo_decoder,
 )
 from stereoservo.daemon.links import GatewayMessages
+from stereoservo.daemon.record_ring import RingWriter
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot
-from stereoservo.daemon.seqpacket import ChannelError, ChannelServer, PacketChannel
+from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Request
@@ -65,16 +67,14 @@ class EventOutbox:
 
 
 class _RecorderPeer:
-    """The gateway's end of the step socket, as a `StepSink`; what is too large for a message is not taken."""
+    """A reader of the ring of step records, as a `StepSink`; what is too large for the ring is not taken."""
 
-    def __init__(self, channel: PacketChannel) -> None:
-        self.channel = channel
+    def __init__(self, ring: RingWriter, reader: int) -> None:
+        self._ring = ring
+        self.reader = reader
 
     def send(self, message: StepMessage) -> bool:
-        try:
-            return self.channel.send(encode(message))
-        except ChannelError:
-            return False
+        return self._ring.write(pack_step_message(message))
 
 
 class ProcessLinks:
@@ -92,14 +92,13 @@ class ProcessLinks:
         }
         self._state = SlotWriter(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)
         self._control = ChannelServer(directories.control_socket, single=True)
-        self._steps = ChannelServer(directories.steps_socket, single=True)
+        self._steps = RingWriter(directories.steps_ring)
         self._gateway: PacketChannel | None = None
         self._recorder: _RecorderPeer | None = None
         self._outbox = EventOutbox()
         self._waiting = select.epoll()
         """Tells in one call whether a peer or a message waits; what is closed leaves it by itself."""
-        for server in (self._control, self._steps):
-            self._waiting.register(server.fileno(), select.EPOLLIN)
+        self._waiting.register(self._control.fileno(), select.EPOLLIN)
 
     def receive(self) -> GatewayMessages:
         """Requests and model of the newest gateway connection; a message that does not decode is left out."""
@@ -110,8 +109,6 @@ class ProcessLinks:
             self._gateway = peer
             self._waiting.register(peer.fileno(), select.EPOLLIN)
             heard = True
-        for peer in self._steps.accept():
-            self._recorder = _RecorderPeer(peer)
         requests: list[Request] = []
         update: ModelUpdate | None = None
         for data in [] if self._gateway is None else self._gateway.receive():
@@ -142,9 +139,11 @@ class ProcessLinks:
         return self._stop.poll()
 
     def step_recorder(self) -> _RecorderPeer | None:
-        """The newest connection to the step socket that `receive` has found, while it is open."""
-        if self._recorder is not None and not self._recorder.channel.is_open:
-            self._recorder = None
+        """The reader of the ring of step records, while there is one."""
+        reader = self._steps.reader
+        known = 0 if self._recorder is None else self._recorder.reader
+        if reader != known:
+            self._recorder = _RecorderPeer(self._steps, reader) if reader else None
         return self._recorder
 
     def publish_prior(self, prior: Prior) -> None:

@@ -25,6 +25,7 @@ from typing import NoReturn
 
 import msgspec
 
+from stereoservo.daemon import record_ring
 from stereoservo.daemon.cell_preparation import PlanOptions
 from stereoservo.daemon.heartbeat import (
     HEARTBEAT_BYTES,
@@ -311,7 +312,10 @@ def prepare(
 def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
     """Path, capacity and layout of all slots of a cell."""
     directories = plan.directories
-    found = [(directories.state_slot, STATE_CAPACITY, STATE_LAYOUT)]
+    found = [
+        (directories.state_slot, STATE_CAPACITY, STATE_LAYOUT),
+        (directories.steps_ring, record_ring.CAPACITY, record_ring.LAYOUT),
+    ]
     if plan.joints.simulated:
         found.append((directories.plant_state_slot, PLANT_CAPACITY, PLANT_STATE_LAYOUT))
         found.append((directories.plant_orders_slot, PLANT_CAPACITY, PLANT_ORDERS_LAYOUT))

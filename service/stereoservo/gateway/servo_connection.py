@@ -5,6 +5,7 @@ records.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from functools import partial
 
 import msgspec
@@ -20,10 +21,11 @@ from stereoservo.daemon.ipc_messages import (
     ServoState,
     event_decoder,
     state_decoder,
-    steps_decoder,
+    unpack_step_message,
 )
 from stereoservo.daemon.process_control import write_log
-from stereoservo.daemon.seqlock import SlotReader
+from stereoservo.daemon.record_ring import RingReader
+from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import RecordBoundary
@@ -43,7 +45,7 @@ class ServoConnection:
         self._directories = directories
         self.records = False
         self._control: PacketChannel | None = None
-        self._steps: PacketChannel | None = None
+        self._steps: RingReader | None = None
         self._state = SlotReader(directories.state_slot, STATE_LAYOUT)
         self._boundary = RecordBoundary("messages of the servo process", partial(write_log, "gateway"))
         self._heartbeat = HeartbeatReader(directories.heartbeat_slot("servo"))
@@ -72,11 +74,11 @@ class ServoConnection:
                 self._control = _try(self._directories, "control_socket")
                 if self._control is not None:
                     self._control.send(encode(Hello(self._last_event)))
-            if self.records and (self._steps is None or not self._steps.is_open):
-                self._steps = _try(self._directories, "steps_socket")
-        if not self.records and self._steps is not None:
-            self._steps.close()
-            self._steps = None
+            if self._steps is None:
+                with suppress(SlotError):  # not there yet; tried again
+                    self._steps = RingReader(self._directories.steps_ring)
+        if self._steps is not None and self._steps.reading != self.records:
+            (self._steps.attach if self.records else self._steps.detach)()
         if self._control is not None and now - self._last_beat >= HEARTBEAT_EVERY_S:
             self._last_beat = now
             self._control.send(encode(Heartbeat()))
@@ -84,8 +86,7 @@ class ServoConnection:
     def restart_steps(self) -> None:
         """Begin the stream of step records anew, with a checkpoint, for a recording that begins now."""
         if self._steps is not None:
-            self._steps.close()
-            self._steps = None
+            self._steps.attach()
 
     def send_command(self, command: Command, operator: str) -> int | None:
         """Send a command; returns its request number, None where the servo process is not connected."""
@@ -120,9 +121,12 @@ class ServoConnection:
         if self._steps is None:
             return []
         found: list[StepMessage] = []
-        for data in self._steps.receive(limit):
+        records: list[bytes] = []
+        with self._boundary:
+            records = self._steps.read(limit)
+        for data in records:
             with self._boundary:
-                found.append(steps_decoder.decode(data))
+                found.append(unpack_step_message(data))
         return found
 
     def state(self) -> ServoState | None:
@@ -141,9 +145,10 @@ class ServoConnection:
     def close(self) -> None:
         """Release all; idempotent."""
         self._heartbeat.close()
-        for channel in (self._control, self._steps):
-            if channel is not None:
-                channel.close()
+        if self._control is not None:
+            self._control.close()
+        if self._steps is not None:
+            self._steps.close()
         self._state.close()
 
 

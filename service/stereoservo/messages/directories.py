@@ -103,9 +103,9 @@ class CellDirectories(NamedTuple):
         return self.runtime / "control.sock"
 
     @property
-    def steps_socket(self) -> Path:
+    def steps_ring(self) -> Path:
         """Step records from the servo process."""
-        return self.runtime / "steps.sock"
+        return self.runtime / "steps.ring"
 
     @property
     def reports_socket(self) -> Path:
@@ -194,7 +194,6 @@ def create_directories(directories: CellDirectories) -> None:
             ) from error
     for path in (
         directories.control_socket,
-        directories.steps_socket,
         directories.reports_socket,
         directories.zenoh_socket,
     ):

@@ -9,20 +9,24 @@ from pathlib import Path
 from types import TracebackType
 
 import msgspec
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from stereoservo.core.cycle import encode
 from stereoservo.core.settings import CoreSettings
+from stereoservo.recording.compression import Checkpoints, StepBlocks
 from stereoservo.recording.step_records import Fingerprint, RecordedCheckpoint, RecordedStep
 
-FORMAT = "stereoservo-flight-1"
+FORMAT = "stereoservo-flight-2"
+FORMATS = ("stereoservo-flight-1", FORMAT)
+"""That are read; in the first one each step is a message of its own, in msgpack, in chunks of LZ4."""
 CHUNK_BYTES = 256 * 1024
-"""At most in a chunk; what is not in a whole chunk yet is lost where the process is killed."""
-CHUNK_S = 0.25
+"""At most in a chunk, before compression; what is not in a whole chunk yet is lost where the process is killed."""
+CHUNK_S = 0.4
 """Of the loop's time in a chunk, at most."""
-LEAST_STEP_BYTES = 400
-"""Less than the record of any step."""
-LEAST_CHUNK_BYTES = 4 * 1024
+
+
+TOPICS = {"header": "msgpack", "steps": "step-blocks", "state": "zstd-msgpack", "gap": "msgpack"}
+"""Topics of a file, and how their messages are encoded (`step_layout`, `compression`)."""
 
 
 class _OutputFile:
@@ -70,7 +74,7 @@ class _OutputFile:
 
 
 class FlightRecorder:
-    """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process.
+    """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process (`step_layout`).
 
     The file grows chunk by chunk, so that a crash loses the last ``CHUNK_S`` at most; ``close`` adds the index, and,
     where it is ``durable``, waits until the disk has it all. A file that cannot be written any more ends with its last
@@ -91,11 +95,15 @@ class FlightRecorder:
         self._pending = 0
         self._closed = False
         self._stream = _OutputFile(path, durable)
-        due = int(settings.rate_hz * CHUNK_S) * LEAST_STEP_BYTES
-        chunk = min(CHUNK_BYTES, max(LEAST_CHUNK_BYTES, due))
+        self._block: list[bytes] = []
+        self._block_bytes = 0
+        self._block_ns = 0
+        self._blocks, self._checkpoints = StepBlocks(), Checkpoints()
+        # A message is a chunk: what is in it is compressed already, by what it is.
         self._writer = Writer(
-            self._stream, chunk_size=chunk, compression=CompressionType.LZ4, enable_data_crcs=True
-        )
+            self._stream, chunk_size=1, compression=CompressionType.NONE, enable_data_crcs=True,
+            index_types=IndexType.CHUNK,
+        )  # fmt: skip
         try:
             self._writer.start(profile=FORMAT, library="stereoservo")
         except OSError:
@@ -103,8 +111,8 @@ class FlightRecorder:
             raise
         encoded = encode(settings)
         self._channels = {
-            topic: self._writer.register_channel(topic=topic, message_encoding="msgpack", schema_id=0)
-            for topic in ("header", "step", "checkpoint", "gap")
+            topic: self._writer.register_channel(topic=topic, message_encoding=encoding, schema_id=0)
+            for topic, encoding in TOPICS.items()
         }
         self._sequence = 0
         header = msgspec.msgpack.encode(
@@ -131,17 +139,31 @@ class FlightRecorder:
         if self.failure:
             self.dropped += 1
             return
+        if not self._block:
+            self._block_ns = t_ns
+        self._block.append(data)
+        self._block_bytes += len(data)
         self.steps += 1
         self._pending += 1
-        self._add("step", data, t_ns)
+        if self._block_bytes >= CHUNK_BYTES or not 0 <= t_ns - self._block_ns < CHUNK_S * 1e9:
+            self._flush()
 
     def checkpoint(self, step: int, state: bytes, t_ns: int) -> None:
         """Append the state as it was before step ``step``."""
-        self._add("checkpoint", msgspec.msgpack.encode((step, state)), t_ns)
+        self._flush()
+        self._blocks.begin()
+        self._add("state", self._checkpoints.compress(msgspec.msgpack.encode((step, state))), t_ns)
 
     def gap(self, lost: int, t_ns: int) -> None:
         """Record that ``lost`` steps are missing here."""
+        self._flush()
         self._add("gap", msgspec.msgpack.encode(lost), t_ns)
+
+    def _flush(self) -> None:
+        """Write the steps of the block at hand."""
+        if self._block:
+            block, self._block, self._block_bytes = self._block, [], 0
+            self._add("steps", self._blocks.compress(block), self._block_ns)
 
     def _add(self, topic: str, data: bytes, t_ns: int) -> None:
         if self.failure:
@@ -158,8 +180,8 @@ class FlightRecorder:
             )
         except OSError as error:
             self._fail(error, size)
-        if self._stream.size > size:
-            self._pending = 0
+            return
+        self._pending = len(self._block)
 
     def _fail(self, error: OSError, size: int) -> None:
         """End the recording; the chunk at hand is in the file where it has grown beyond ``size``."""
@@ -178,6 +200,7 @@ class FlightRecorder:
         size = self._stream.size
         try:
             try:
+                self._flush()
                 if not self.failure:
                     self._writer.finish()
             finally:

@@ -15,7 +15,7 @@ from stereoservo.messages.decoding import cause_of
 from stereoservo.messages.goals import Calibrate
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.recording.replay import RecordingError, recorded_messages
-from stereoservo.recording.step_records import StepRecord, decode_step
+from stereoservo.recording.step_layout import StepRecord, decode_step
 
 SPEED_OVER_NS = 50_000_000
 """Joint speeds are differences over so long: encoders resolve no shorter ones."""

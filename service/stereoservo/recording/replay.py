@@ -26,17 +26,12 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import StateVersionError, decode_state, is_recorded
 from stereoservo.messages.decoding import DamagedError, cause_of, decoding
 from stereoservo.messages.goals import IncidenceTarget, JointTarget, RunGoal
-from stereoservo.recording.flight_recorder import FORMAT
-from stereoservo.recording.step_records import (
-    Fingerprint,
-    StepRecord,
-    comparable,
-    decode_step,
-    encode_step,
-    fingerprint,
-)
+from stereoservo.recording.compression import LARGEST, Checkpoints, StepBlocks
+from stereoservo.recording.flight_recorder import FORMATS
+from stereoservo.recording.step_layout import StepRecord, decode_step, outputs_crc
+from stereoservo.recording.step_records import Fingerprint, comparable, fingerprint
 
-LARGEST_RECORD = 64 << 20
+LARGEST_RECORD = LARGEST
 """More than a recorder puts into one record: a stated size beyond it is damage, and is not allocated."""
 LZ4_STATES_SIZE = 0x08
 """Flag of an LZ4 frame: its header has the size of the content."""
@@ -217,11 +212,28 @@ def _of_another_version(cause: str, recorded: Fingerprint | None) -> str:
 
 def _compare(record: StepRecord, outputs: StepOutputs) -> tuple[bool, float]:
     """Whether all outputs agree bit for bit, and the largest relative difference of the raw joint velocity."""
-    again = decode_step(encode_step(record.inputs, outputs))
-    difference = float(np.abs(again.raw - record.raw).max(initial=0.0))
+    status = outputs.status
+    difference = float(np.abs(status.command_raw - record.raw).max(initial=0.0))
     scale = float(np.abs(record.raw).max(initial=0.0))
     error = difference / scale if scale > 0.0 else difference
-    return again.outputs_crc == record.outputs_crc and again.step == record.step, error
+    same = outputs_crc(outputs, record.layout) == record.outputs_crc and status.step == record.step
+    return same, error
+
+
+class _Contents:
+    """Steps and checkpoints out of a file's messages, as they were before they were compressed."""
+
+    def __init__(self) -> None:
+        self._blocks, self._checkpoints = StepBlocks(), Checkpoints()
+
+    def of(self, topic: str, data: bytes) -> list[tuple[str, bytes]]:
+        """Topic and content of what a message holds. Raises anything on damaged bytes."""
+        if topic == "steps":
+            return [("step", step) for step in self._blocks.restore(data)]
+        if topic == "state":
+            self._blocks.begin()
+            return [("checkpoint", self._checkpoints.restore(data))]
+        return [(topic, data)]
 
 
 class _BoundedFile:
@@ -248,6 +260,7 @@ def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
     stated: int | None = None
     topics: dict[int, str] = {}
     source: _BoundedFile | None = None
+    contents = _Contents()
 
     def refused(cause: str) -> RecordingError:
         if cause.startswith("cannot be read"):
@@ -261,17 +274,16 @@ def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
     with decoding(refused), path.open("rb") as stream:
         source = _BoundedFile(stream)
         for record in _records(source):
-            if isinstance(record, Header) and record.profile != FORMAT:
-                raise RecordingError(
-                    path, 0, f"is of profile {record.profile!r}; this program reads {FORMAT!r}"
-                )
+            if isinstance(record, Header) and record.profile not in FORMATS:
+                known = " and ".join(map(repr, FORMATS))
+                raise RecordingError(path, 0, f"is of profile {record.profile!r}; this program reads {known}")
             if isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Message):
-                topic = topics[record.channel_id]
                 messages += 1
-                steps += topic == "step"
-                yield topic, record.data
+                for topic, data in contents.of(topics[record.channel_id], record.data):
+                    steps += topic == "step"
+                    yield topic, data
             elif isinstance(record, Statistics):
                 stated = record.message_count
         if stated != messages:  # a reader skips records of kinds that it does not know: a damaged kind is one

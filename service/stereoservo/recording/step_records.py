@@ -1,5 +1,5 @@
-"""Step records (inputs, velocity and output checksum of one control step) and state checkpoints: their encoding, the
-software versions on which replay depends, and their stream from the servo loop to a recorder.
+"""The stream of step records and state checkpoints from the servo loop to a recorder, and the software versions on
+which replay depends.
 """
 
 from __future__ import annotations
@@ -16,21 +16,11 @@ import numpy as np
 
 import stereoservo
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array, encode
+from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import encode_state
-from stereoservo.numerics.arrays import FloatArray
-
-
-class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
-    """Inputs of step ``step``, the resulting velocity, and a CRC of all outputs."""
-
-    step: int
-    inputs: StepInputs
-    command: FloatArray | None
-    raw: FloatArray
-    outputs_crc: int
+from stereoservo.recording.step_layout import StepEncoder
 
 
 class Fingerprint(msgspec.Struct, frozen=True):
@@ -44,26 +34,6 @@ class Fingerprint(msgspec.Struct, frozen=True):
     libc: str
     laws: dict[str, str] = {}
     """Version and source hash of every law that was installed; empty in recordings made before it was kept."""
-
-
-_decoder = msgspec.msgpack.Decoder(StepRecord, dec_hook=decode_array)
-
-
-def encode_step(inputs: StepInputs, outputs: StepOutputs) -> bytes:
-    """A step record as bytes; the CRC covers every output."""
-    record = StepRecord(
-        outputs.status.step,
-        inputs,
-        outputs.command,
-        outputs.status.command_raw,
-        zlib.crc32(encode(outputs)),
-    )
-    return encode(record)
-
-
-def decode_step(data: bytes) -> StepRecord:
-    """Inverse of :func:`encode_step`. Raises msgspec.MsgspecError."""
-    return _decoder.decode(data)
 
 
 @cache
@@ -153,6 +123,7 @@ class StepStream:
         self._sink: StepSink | None = None
         self._since_checkpoint = 0
         self._lost = 0
+        self._encoder = StepEncoder()
         self.dropped = 0
 
     def before(self, sink: StepSink | None, core: ServoCore, now_ns: int) -> None:
@@ -173,6 +144,8 @@ class StepStream:
         if self._sink is None:
             return
         self._since_checkpoint += 1
-        if self._lost or not self._sink.send(RecordedStep(inputs.now_ns, encode_step(inputs, outputs))):
+        if self._lost or not self._sink.send(
+            RecordedStep(inputs.now_ns, self._encoder.encode(inputs, outputs))
+        ):
             self._lost += 1
             self.dropped += 1

@@ -22,7 +22,7 @@ from stereoservo.client import Client, RefusedError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.recording.replay import RecordingError, ReplayResult, recorded_messages, replay
-from stereoservo.recording.step_records import decode_step
+from stereoservo.recording.step_layout import decode_step
 from stereoservo_sim.benchmarks.service_bench import (
     CELL,
     END,

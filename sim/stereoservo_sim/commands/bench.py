@@ -53,6 +53,18 @@ def _loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]
     return run_loop(repetitions, seed, progress)
 
 
+def _recording(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.recording import run_recording
+
+    return run_recording(repetitions, seed, progress)
+
+
+def _scale(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.scale import run_scale
+
+    return run_scale(repetitions, seed, progress)
+
+
 def _soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.soak import run_soak
 
@@ -91,6 +103,8 @@ BENCHES: dict[str, Bench] = {
     "features": _features,
     "kills": _kills,
     "loop": _loop,
+    "recording": _recording,
+    "scale": _scale,
     "soak": _soak,
     "soak-live": _soak_live,
     "startup": _startup,

@@ -1,0 +1,148 @@
+"""Lossless compression of what a recording holds: step records by what differs from the one before of the same form,
+checkpoints by what differs from the checkpoint before.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import zstandard
+
+from stereoservo.numerics.arrays import IntArray
+from stereoservo.recording.step_layout import form_of
+
+LARGEST = 64 << 20
+"""Bytes of a block or checkpoint, at most: a stated size beyond it is damage, and is not allocated."""
+LEVEL = 3
+COUNT = struct.Struct("<II")
+"""Of a block: records, and forms of them."""
+ZERO, REPEATED = 64, 65
+"""Of a column: it is zero; it is the column before. Else its numbers follow, less so many trailing zeros (0 to 63)."""
+
+
+class StepBlocks:
+    """Compresses and restores blocks of step records (`step_layout`).
+
+    Records of a form (`step_layout.form_of`) are rows of 64-bit numbers; of these the differences from row to row are
+    kept, byte by byte of all of them. The first row is compared with the last one of its form since `begin`, which is
+    called where reading may begin: at a checkpoint.
+    """
+
+    def __init__(self) -> None:
+        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._decompressor = zstandard.ZstdDecompressor()
+        self._last: dict[tuple[int, int], IntArray] = {}
+
+    def begin(self) -> None:
+        """Forget the records before."""
+        self._last = {}
+
+    def compress(self, records: list[bytes]) -> bytes:
+        """A block of records."""
+        groups: dict[tuple[int, int], list[int]] = {}
+        for i, record in enumerate(records):
+            groups.setdefault((len(record), form_of(record)), []).append(i)
+        kinds = np.empty(len(records), "<u2")
+        for k, places in enumerate(groups.values()):
+            kinds[places] = k
+        parts = [
+            COUNT.pack(len(records), len(groups)),
+            np.array(list(groups), "<u4").tobytes(),
+            kinds.tobytes(),
+        ]
+        for form, places in groups.items():
+            data = b"".join([records[i] + bytes(-form[0] % 8) for i in places])
+            rows = np.frombuffer(data, "<i8").reshape(len(places), -1)
+            parts += self._columns(rows, form)
+        return self._compressor.compress(b"".join(parts))
+
+    def _columns(self, rows: IntArray, form: tuple[int, int]) -> list[bytes]:
+        """What differs from row to row: kinds of columns, then the bytes of those that are stored."""
+        count, width = rows.shape
+        before = self._last.get(form, np.zeros(width, np.int64))
+        self._last[form] = rows[-1]
+        difference = np.ascontiguousarray(np.diff(rows, axis=0, prepend=before[None]).T)
+        bits = np.bitwise_or.reduce(difference, axis=1).view(np.uint64)
+        kinds = (np.frexp((bits & (~bits + np.uint64(1))).astype(np.float64))[1] - 1).astype(np.uint8)
+        kinds[1:][(difference[1:] == difference[:-1]).all(axis=1)] = REPEATED
+        kinds[bits == 0] = ZERO
+        stored = kinds < ZERO
+        numbers = difference[stored] >> kinds[stored, None].astype(np.int64)
+        folded = ((numbers << 1) ^ (numbers >> 63)).astype("<i8")  # both signs by their size
+        return [kinds.tobytes(), folded.view(np.uint8).reshape(-1, count, 8).transpose(2, 0, 1).tobytes()]
+
+    def restore(self, block: bytes) -> list[bytes]:
+        """The records of a block, in their order. Raises anything on damaged bytes, before more than ``LARGEST`` bytes
+        are allocated.
+        """
+        data = _decompressed(self._decompressor, block)
+        count, groups = COUNT.unpack_from(data)
+        forms = np.frombuffer(data, "<u4", 2 * groups, COUNT.size).reshape(-1, 2).tolist()
+        at = COUNT.size + 8 * groups
+        kinds = np.frombuffer(data, "<u2", count, at)
+        at += 2 * count
+        places = [np.flatnonzero(kinds == k) for k in range(groups)]
+        if sum(len(found) * length for found, (length, _) in zip(places, forms, strict=True)) > LARGEST:
+            raise ValueError("a block of more records than there may be")
+        records = [b""] * count
+        for found, (length, form) in zip(places, forms, strict=True):
+            rows, at = self._rows(data, at, len(found), (length, form))
+            for i, row in zip(found, rows, strict=True):
+                records[i] = row.tobytes()[:length]
+        if at != len(data):
+            raise ValueError(f"a block with {len(data) - at} bytes too many")
+        return records
+
+    def _rows(self, data: bytes, at: int, count: int, form: tuple[int, int]) -> tuple[IntArray, int]:
+        """Inverse of `_columns`, and where the rest begins."""
+        width = -(-form[0] // 8)
+        kinds = np.frombuffer(data, np.uint8, width, at)
+        at += width
+        if kinds.max(initial=0) > REPEATED:
+            raise ValueError("a column of a kind that is not known")
+        stored = kinds < ZERO
+        planes = np.frombuffer(data, np.uint8, 8 * count * int(np.count_nonzero(stored)), at)
+        at += len(planes)
+        folded = np.ascontiguousarray(planes.reshape(8, -1, count).transpose(1, 2, 0)).view("<u8")[..., 0]
+        numbers = (folded >> np.uint64(1)).view(np.int64) ^ -(folded & np.uint64(1)).view(np.int64)
+        numbers = numbers << kinds[stored, None].astype(np.int64)
+        difference = np.zeros((width, count), np.int64)
+        used = kinds != ZERO
+        difference[used] = numbers[
+            (np.cumsum(stored) - 1)[used]
+        ]  # one that is repeated is the newest stored one
+        before = self._last.get(form, np.zeros(width, np.int64))
+        rows: IntArray = np.cumsum(np.vstack([before[None], difference.T]), axis=0)[1:]
+        self._last[form] = rows[-1]
+        return np.ascontiguousarray(rows, dtype="<i8"), at
+
+
+class Checkpoints:
+    """Compresses and restores checkpoints, each with the one before as its dictionary: at rest little differs."""
+
+    def __init__(self) -> None:
+        self._before = b""
+
+    def compress(self, data: bytes) -> bytes:
+        """A checkpoint that follows those before."""
+        compressor = zstandard.ZstdCompressor(level=LEVEL, dict_data=self._dictionary())
+        self._before = data
+        return compressor.compress(data)
+
+    def restore(self, data: bytes) -> bytes:
+        """Inverse of `compress`, in the same order. Raises anything on damaged bytes."""
+        self._before = _decompressed(zstandard.ZstdDecompressor(dict_data=self._dictionary()), data)
+        return self._before
+
+    def _dictionary(self) -> zstandard.ZstdCompressionDict | None:
+        if not self._before:
+            return None
+        return zstandard.ZstdCompressionDict(self._before, dict_type=zstandard.DICT_TYPE_RAWCONTENT)
+
+
+def _decompressed(decompressor: zstandard.ZstdDecompressor, data: bytes) -> bytes:
+    stated = zstandard.frame_content_size(data)
+    if not 0 <= stated <= LARGEST:
+        raise ValueError(f"compressed data that state a size of {stated} bytes")
+    return decompressor.decompress(data)

@@ -1,0 +1,286 @@
+"""Layout of a step record: what the loop writes of each step, as bytes of fixed places for all that is usual, so that
+nothing is encoded and records of a kind can be compared word by word.
+
+A record is a multiple of 8 bytes, little-endian: the head (``HEAD``); the velocity before and after the safety stage;
+of joints stamps, positions, velocities, efforts, following errors; of each observation a head, the camera's name, ids,
+pixels, covariances. What is rare (requests, a model, a fault of the driver, samples of other types) follows in msgpack.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from operator import attrgetter
+from typing import Any, get_type_hints
+
+import msgspec
+import numpy as np
+
+from stereoservo.core.cycle import Status, StepInputs, StepOutputs, decode_array, encode
+from stereoservo.messages.status import Health
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, JointState
+
+LAYOUT = 2
+"""First byte of a record; msgpack's records of before begin with another."""
+HEAD = struct.Struct("<BBBBIqqqqIHH")
+"""Layout, flags, joints of a velocity, observations, CRC of the outputs; step, now, period, parameter epoch; bytes of
+the rest, joints of a sample, a mark of the cameras whose observations follow."""
+SAMPLE = struct.Struct("<qq")
+"""Sequence number, and time less that of the step."""
+SIGHT = struct.Struct("<IIqqq")
+"""Bytes of the camera's name, markers; sequence number, times of shutter and receipt less that of the step."""
+STOP, CONFIGURED, ACTIVE, COMPILING, COMMAND, JOINTS, EFFORTS, FOLLOWING = (1 << k for k in range(8))
+LARGEST_COUNT = 255
+_NONE = b"\0"
+ABSENT = -1e300
+"""Stands for a number that is not there."""
+
+
+class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
+    """Inputs of step ``step``, the resulting velocity, and a CRC of all outputs; see `outputs_crc` for ``layout``."""
+
+    step: int
+    inputs: StepInputs
+    command: FloatArray | None
+    raw: FloatArray
+    outputs_crc: int
+    layout: int = 1
+
+
+_FLOAT, _INTEGER = np.dtype(np.float64), np.dtype(np.int64)
+_head, _sample, _sight = HEAD.pack, SAMPLE.pack, SIGHT.pack
+_old_decoder = msgspec.msgpack.Decoder(StepRecord, dec_hook=decode_array)
+_rest_decoder = msgspec.msgpack.Decoder(StepInputs, dec_hook=decode_array)
+
+
+def _fields(*wanted: Any) -> tuple[str, ...]:
+    """Names of the status's fields of these types."""
+    kinds = {str(kind) for kind in wanted}
+    return tuple(name for name, hint in get_type_hints(Status).items() if str(hint) in kinds)
+
+
+_ARRAYS, _NUMBERS = _fields(FloatArray, FloatArray | None), _fields(float | None)
+_APART = (*_ARRAYS, *_NUMBERS, "t_ns", "step", "reasons", "innovation_px", "health")
+_WORDS = tuple(name for name in Status.__struct_fields__ if name not in _APART)
+_arrays, _numbers, _words = attrgetter(*_ARRAYS), attrgetter(*_NUMBERS), attrgetter(*_WORDS)
+
+
+class OutputsChecksum:
+    """CRC-32 of all outputs of a step but their time and number, bit for bit; what seldom changes is encoded when it
+    does.
+    """
+
+    def __init__(self) -> None:
+        self._known: tuple[Any, ...] | None = None
+        self._health: Health | None = None
+        self._crc = 0
+
+    def of(self, outputs: StepOutputs) -> int:
+        """The checksum."""
+        status = outputs.status
+        words, health = _words(status), status.health
+        # Words compare as they are encoded. Numbers do not (0.0 == -0.0), but the health is one object till it changes.
+        if words != self._known or health is not self._health:
+            self._known, self._health, self._crc = words, health, zlib.crc32(encode((words, health)))
+        numbers = [*_numbers(status), *status.innovation_px.values()]
+        if None in numbers:
+            numbers = [ABSENT if value is None else value for value in numbers]
+        parts: list[Any] = [outputs.command, *_arrays(status), struct.pack(f"<{len(numbers)}d", *numbers)]
+        if outputs.command is None or status.efforts is None or status.effort_limits is None:
+            parts = [_NONE if part is None else part for part in parts]
+        for prior in outputs.priors:
+            parts += (prior.camera.encode(), prior.ids, prior.pixels, prior.velocities, prior.covariances)
+        if status.reasons or outputs.events or outputs.driver_request:
+            parts.append(encode((status.reasons, outputs.events, outputs.driver_request)))
+        return zlib.crc32(_joined(parts), self._crc)
+
+
+def outputs_crc(outputs: StepOutputs, layout: int = LAYOUT) -> int:
+    """CRC-32 of all outputs, as a record of this ``layout`` has it (1: of their encoding in msgpack)."""
+    return zlib.crc32(encode(outputs)) if layout == 1 else OutputsChecksum().of(outputs)
+
+
+class StepEncoder:
+    """Writes records. One thread at a time."""
+
+    def __init__(self) -> None:
+        self._checksum = OutputsChecksum()
+
+    def encode(self, inputs: StepInputs, outputs: StepOutputs) -> bytes:
+        """The record of a step, as bytes."""
+        status, command, joints, seen = outputs.status, outputs.command, inputs.joints, inputs.observations
+        raw = status.command_raw
+        flags = (
+            inputs.stop | inputs.driver_configured << 1 | inputs.driver_active << 2 | inputs.compiling << 3
+        )
+        parts: list[Any] = [b"", raw]
+        if command is not None:
+            flags |= COMMAND
+            parts.append(command)
+        n = 0 if joints is None else _add_sample(parts, joints, inputs.now_ns)
+        if n:
+            flags |= JOINTS
+            if joints.efforts is not None:  # type: ignore[union-attr]
+                flags |= EFFORTS
+            if joints.following_errors is not None:  # type: ignore[union-attr]
+                flags |= FOLLOWING
+        usual = not seen or _add_sights(parts, seen, inputs.now_ns)
+        mark = zlib.crc32("\0".join([one.camera for one in seen]).encode()) & 0xFFFF if seen else 0
+        rest = b""
+        rare = inputs.requests or inputs.model_update or inputs.driver_fault
+        if rare or not usual or (joints is not None and not n):
+            rest = _rest(inputs, joints=n == 0, observations=not usual)
+            parts.append(rest)
+        parts[0] = _head(
+            LAYOUT, flags, len(raw), len(seen) if usual else 0, self._checksum.of(outputs), status.step,
+            inputs.now_ns, inputs.period_ns, inputs.parameter_epoch, len(rest), n, mark,
+        )  # fmt: skip
+        return _joined(parts)
+
+
+def _joined(parts: list[Any]) -> bytes:
+    """Bytes and arrays, one after the other."""
+    try:
+        return b"".join(parts)
+    except (BufferError, TypeError):  # an array that is not contiguous
+        return b"".join([part if isinstance(part, bytes) else part.tobytes() for part in parts])
+
+
+def _add_sample(parts: list[Any], joints: JointState, now_ns: int) -> int:
+    """Add a sample whose arrays are what the layout takes; returns the number of joints, 0 where they are not."""
+    positions, velocities = joints.positions, joints.velocities
+    efforts, following = joints.efforts, joints.following_errors
+    shape = positions.shape
+    if len(shape) != 1 or not 0 < shape[0] <= LARGEST_COUNT or velocities.shape != shape:
+        return 0
+    if not positions.dtype == velocities.dtype == _FLOAT:
+        return 0
+    try:
+        added: list[Any] = [_sample(joints.seq, joints.t_ns - now_ns), positions, velocities]
+    except struct.error:  # a stamp beyond all bounds
+        return 0
+    if efforts is not None:
+        if efforts.shape != shape or efforts.dtype != _FLOAT:
+            return 0
+        added.append(efforts)
+    if following is not None:
+        if following.shape != shape or following.dtype != _FLOAT:
+            return 0
+        added.append(following)
+    parts += added
+    return len(positions)
+
+
+def _add_sights(parts: list[Any], seen: tuple[CameraObservation, ...], now_ns: int) -> bool:
+    """Add observations whose arrays are what the layout takes; False where they are not, and nothing is added."""
+    added: list[Any] = []
+    for observation in seen:
+        ids, pixels, covariances = observation.ids, observation.pixels, observation.covariances
+        k, name = len(ids), observation.camera.encode()
+        if not (
+            ids.dtype == _INTEGER
+            and pixels.dtype == covariances.dtype == _FLOAT
+            and ids.shape == (k,)
+            and pixels.shape == (k, 2)
+            and covariances.shape == (k, 2, 2)
+        ):
+            return False
+        times = observation.t_shutter_ns - now_ns, observation.t_received_ns - now_ns
+        try:
+            added.append(_sight(len(name), k, observation.seq, *times))
+        except struct.error:  # a stamp beyond all bounds
+            return False
+        added += (_padded(name), ids, pixels, covariances)
+    if len(seen) > LARGEST_COUNT:
+        return False
+    parts += added
+    return True
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % 8)
+
+
+def _rest(inputs: StepInputs, *, joints: bool, observations: bool) -> bytes:
+    """What the fixed places do not hold, with its length before it."""
+    bare = msgspec.structs.replace(
+        inputs,
+        joints=inputs.joints if joints else None,
+        observations=inputs.observations if observations else (),
+    )
+    data = encode(bare)
+    return _padded(struct.pack("<Q", len(data)) + data)
+
+
+class _Reader:
+    """Takes parts of a record, one after the other. Raises ValueError where there are not so many bytes."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._at = data, 0
+
+    def take(self, count: int) -> bytes:
+        end = self._at + count
+        if end > len(self._data):
+            raise ValueError(f"a record of {len(self._data)} bytes, which says that it has {end}")
+        found, self._at = self._data[self._at : end], end
+        return found
+
+    def unpack(self, kind: struct.Struct) -> tuple[Any, ...]:
+        return kind.unpack(self.take(kind.size))
+
+    def array(self, kind: type, *shape: int) -> Any:
+        count = int(np.prod(shape))
+        return np.frombuffer(self.take(8 * count), kind).reshape(shape).copy()
+
+    @property
+    def left(self) -> int:
+        return len(self._data) - self._at
+
+
+def form_of(record: bytes) -> int:
+    """A number that records which hold the same in the same places have in common, beside their length."""
+    return zlib.crc32(record[1:4] + record[HEAD.size - 2 : HEAD.size])
+
+
+def decode_step(data: bytes) -> StepRecord:
+    """A record of this layout or the one before. Raises msgspec.MsgspecError, ValueError."""
+    if data[:1] != bytes((LAYOUT,)):
+        return _old_decoder.decode(data)
+    reader = _Reader(data)
+    _, flags, m, cameras, crc, step, now_ns, period_ns, epoch, rest, n, _ = reader.unpack(HEAD)
+    raw = reader.array(np.float64, m)
+    command = reader.array(np.float64, m) if flags & COMMAND else None
+    joints = _read_joints(reader, flags, n, now_ns) if flags & JOINTS else None
+    observations = tuple(_read_sight(reader, now_ns) for _ in range(cameras))
+    if reader.left != rest:
+        raise ValueError(f"a record with {reader.left} bytes left, which says {rest}")
+    inputs = StepInputs(
+        now_ns, period_ns, joints, observations, stop=bool(flags & STOP),
+        driver_configured=bool(flags & CONFIGURED), driver_active=bool(flags & ACTIVE),
+        parameter_epoch=epoch, compiling=bool(flags & COMPILING),
+    )  # fmt: skip
+    if rest:
+        (length,) = struct.unpack("<Q", reader.take(8))
+        rare = _rest_decoder.decode(reader.take(length))
+        inputs = msgspec.structs.replace(
+            rare, joints=joints or rare.joints, observations=observations or rare.observations
+        )
+    return StepRecord(step, inputs, command, raw, crc, LAYOUT)
+
+
+def _read_joints(reader: _Reader, flags: int, n: int, now_ns: int) -> JointState:
+    seq, before_ns = reader.unpack(SAMPLE)
+    positions, velocities = reader.array(np.float64, n), reader.array(np.float64, n)
+    efforts = reader.array(np.float64, n) if flags & EFFORTS else None
+    following = reader.array(np.float64, n) if flags & FOLLOWING else None
+    return JointState(seq, now_ns + before_ns, positions, velocities, efforts, following)
+
+
+def _read_sight(reader: _Reader, now_ns: int) -> CameraObservation:
+    length, k, seq, shutter_ns, received_ns = reader.unpack(SIGHT)
+    name = reader.take(length + -length % 8)[:length].decode()
+    return CameraObservation(
+        name, seq, now_ns + shutter_ns, now_ns + received_ns, reader.array(np.int64, k),
+        reader.array(np.float64, k, 2), reader.array(np.float64, k, 2, 2),
+    )  # fmt: skip
