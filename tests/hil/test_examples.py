@@ -1,7 +1,6 @@
 """The programs of `examples/`, and `watch` into viewers, each against a live fake cell."""
 
 import importlib.util
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -93,36 +92,3 @@ def test_watch_writes_a_live_cell_for_rerun(client: Client, tmp_path: Path) -> N
     ).stdout
     for entity in ("/joints/j1", "/command/j1", "/camera/left/markers", "/camera/right/markers", "/reasons"):
         assert f" - {entity} " in listed
-
-
-@pytest.mark.skipif(
-    importlib.util.find_spec("foxglove") is None, reason="foxglove-sdk (extra `cell`) is not installed"
-)
-def test_watch_serves_a_live_cell_to_foxglove(client: Client) -> None:
-    """A client of Foxglove's protocol that is not ours subscribes and gets joints and markers."""
-    from websockets.sync.client import connect
-
-    program = [sys.executable, "-m", "stereoservo.cli.main", "watch", CELL, "--foxglove", "--port", "0"]
-    watching = subprocess.Popen(
-        [*program, "--json"], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    try:
-        assert watching.stderr is not None
-        address = next(line for line in watching.stderr if "ws://" in line).rpartition(" ")[2].strip()
-        channels: dict[int, str] = {}
-        seen: set[str] = set()
-        with connect(address, subprotocols=["foxglove.sdk.v1"]) as socket:  # type: ignore[list-item]
-            while not {"/joints", "/status", "/camera/left/annotations"} <= seen:
-                message = socket.recv(timeout=20)
-                if isinstance(message, bytes):
-                    seen.add(channels[int.from_bytes(message[1:5], "little")])
-                    continue
-                told = json.loads(message)
-                if told["op"] == "advertise":
-                    new = {channel["id"]: channel["topic"] for channel in told["channels"]}
-                    channels |= new
-                    wanted = [{"id": number, "channelId": number} for number in new]
-                    socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-    finally:
-        watching.terminate()
-        watching.wait(10)

@@ -1,0 +1,66 @@
+"""What `watch --foxglove` serves, read by a client of the protocol that is not ours."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from stereoservo.messages.reasons import Reason
+from stereoservo.messages.wire import EventMessage, FeaturesMessage, LoopInfo, StateMessage
+
+pytest.importorskip("foxglove", reason="foxglove-sdk is of the extra `cell`")
+
+STATE = StateMessage(
+    "c", "b", 0, 1e9, "active", "valid", 7, "law", "g", "stereo", "slow", (Reason("JOINT_LIMIT", "slow", "j1"),),
+    {"j1": 0.5}, {"j1": 0.1}, {"j1": 0.2}, 3.5, (), {"left": 0.1}, {"left": 4}, LoopInfo(250.0, 1, 0, 0, {}, {}),
+)  # fmt: skip
+FEATURES = FeaturesMessage("left", 1, 0, 0, 1e9, (7,), ((1.0, 2.0),), (0.1,))
+EVENT = EventMessage(1, "b", 0, 1e9, "goal_started", "off we go")
+
+
+def advertised(socket: Any) -> Iterator[dict[str, Any]]:
+    """The channels that the server tells of, until it is silent."""
+    while True:
+        try:
+            message = socket.recv(timeout=0.5)
+        except TimeoutError:
+            return
+        if isinstance(message, str):
+            yield from json.loads(message).get("channels", [])
+
+
+def test_a_cell_is_served_with_foxgloves_schemas() -> None:
+    from websockets.sync.client import connect
+
+    from stereoservo.cli.watch.foxglove_server import FoxgloveServer
+
+    with FoxgloveServer("c", 0) as server:
+        address = f"ws://127.0.0.1:{server.port}"
+        with connect(address, subprotocols=["foxglove.sdk.v1"]) as socket:  # type: ignore[list-item]
+            for message in (STATE, FEATURES, EVENT):
+                server.show(message)
+            channels = {channel["id"]: channel for channel in advertised(socket)}
+            assert {channel["topic"]: channel["schemaName"] for channel in channels.values()} == {
+                "/joints": "foxglove.JointStates",
+                "/command": "foxglove.JointStates",
+                "/status": "stereoservo.CellStatus",
+                "/reasons": "foxglove.Log",
+                "/log": "foxglove.Log",
+                "/camera/left/annotations": "foxglove.ImageAnnotations",
+            }
+            wanted = [{"id": number, "channelId": number} for number in channels]
+            socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            status = None
+            for _ in range(50):  # until the subscription has arrived there
+                server.show(STATE)
+                try:
+                    data = socket.recv(timeout=0.2)
+                except TimeoutError:
+                    continue
+                number = int.from_bytes(data[1:5], "little")
+                if isinstance(data, bytes) and channels[number]["topic"] == "/status":
+                    status = json.loads(data[13:])
+                    break
+            assert status is not None
+            assert (status["error_px"], status["reasons"]) == (3.5, ["JOINT_LIMIT"])
