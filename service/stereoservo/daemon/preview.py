@@ -8,7 +8,6 @@ import os
 import struct
 import threading
 import time
-from typing import Any
 
 import msgspec
 
@@ -144,10 +143,14 @@ class PreviewRequest:
         self._wanted.write(struct.pack("=q", time.monotonic_ns() + int(WANTED_S * 1e9)))
 
     def poll(self) -> PreviewPicture | None:
-        """The newest picture unless it was returned before. Raises what the decoder raises."""
+        """The newest picture, unless it was returned before or is older than a request holds. Raises what the decoder
+        raises.
+        """
         data = self._slot.poll()
-        picture: Any = None if data is None else picture_decoder.decode(data)
-        return picture
+        if data is None:
+            return None
+        picture = picture_decoder.decode(data)
+        return picture if time.monotonic_ns() - picture.t_shutter_ns < int(WANTED_S * 1e9) else None
 
     def close(self) -> None:
         """Release both slots. Idempotent."""

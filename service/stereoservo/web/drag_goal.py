@@ -1,7 +1,7 @@
-"""A goal by dragging the marker body in one picture: the other pictures follow along the epipolar lines, and the
-kinematics of the learnt model make of it a posture that the arm can take.
+"""A goal by dragging the marker body in one picture: in the others its markers follow along their epipolar lines, and
+the kinematics of the learnt model make of it a posture that the arm can take.
 
-Nothing here needs a metric model: joints, pixels and epipolar lines are what a projective one knows.
+Nothing here needs a metric model: only a plane at infinity, by which the depth in the dragged picture stays.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
-FOLLOWING_WEIGHT = 0.3
-"""Weight of the pixels in the pictures that follow, beside 1 in the one in which the body is dragged."""
 ITERATIONS = 40
-DAMPING = 1e-3
-"""First damping, relative to the largest diagonal entry of the normal equations."""
+DAMPING, LEAST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-12, 1e6
+"""First, least and largest damping, relative to the largest diagonal entry of the normal equations."""
 CONVERGED_PX = 1e-6
 LINE_STEPS = 24
 
@@ -55,37 +53,54 @@ class DragModel:
         return self._raw(self._ideal(joints))
 
     def dragged(
-        self, start: FloatArray, camera: str, shift: tuple[float, float], turn: float = 0.0
+        self,
+        start: FloatArray,
+        camera: str,
+        shift: tuple[float, float],
+        turn: float = 0.0,
+        nearer: float = 1.0,
     ) -> DraggedGoal:
-        """The posture near ``start`` (n,) whose picture in ``camera`` is that of ``start``, moved by ``shift`` [px] and
-        turned by ``turn`` [rad] about the middle of its markers.
+        """The posture near ``start`` (n,) at which the middle of the markers is moved by ``shift`` [px] in ``camera``.
 
-        In every other camera each marker goes to the point of its epipolar line nearest to where it is. The posture is
-        the least-squares one (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
+        One picture leaves the depth open: it stays, in the sense of the model's plane at infinity, so that the body moves
+        parallel to the picture without turning; ``nearer`` multiplies it. ``turn`` [rad] turns the body about the ray
+        through its middle. In the other cameras every marker thereby moves along its epipolar line. The posture is
+        the least-squares one in all pictures (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
         """
         c = self._index(camera)
-        now = self._ideal(start)
-        raw = self._raw(now)[c]
-        middle = raw.mean(axis=0)
-        cosine, sine = np.cos(turn), np.sin(turn)
-        asked = undistort(
-            self.model.cameras[c].lens,
-            middle + (raw - middle) @ np.array([[cosine, sine], [-sine, cosine]]) + np.array(shift),
-        )
+        wanted = project_many(self._Ps, self._wanted(c, self._points(start), np.array(shift), turn, nearer))
+        if not np.isfinite(wanted).all():
+            raise GeometryError("outside", f"the body is dragged into the focal plane of {camera}", camera=camera)
+        joints = self._fitted(start, wanted)
+        reached = self._ideal(joints)
+        left = float(np.sqrt(((reached[c] - wanted[c]) ** 2).sum(axis=-1).mean()))
+        return DraggedGoal(joints, self._raw(reached), left)
+
+    def _wanted(
+        self, c: int, points: FloatArray, shift: FloatArray, turn: float, nearer: float
+    ) -> FloatArray:
+        """Markers (m, 4) as `dragged` asks for them; they may be no displacement that the arm can make."""
+        lens, P = self.model.cameras[c].lens, self._Ps[c, None]
+        middle = points.mean(axis=0)
+        centre = project_many(P, middle[None])[0]
+        asked = undistort(lens, distort(lens, centre) + shift)
         if not np.isfinite(asked).all():
             raise GeometryError(
-                "outside", f"the body is dragged out of what the lens of {camera} shows", camera=camera
+                "outside",
+                f"the body is dragged out of what the lens of {self.cameras[c]} shows",
+                camera=self.cameras[c],
             )
-        wanted = now.copy()
-        wanted[c] = asked
-        for k in range(len(self.cameras)):
-            if k != c:
-                wanted[k] = _feet(self._lines(c, k, asked), now[k])
-        weights = np.where(np.arange(len(self.cameras)) == c, 1.0, FOLLOWING_WEIGHT)
-        joints = self._fitted(start, wanted, weights)
-        reached = self._ideal(joints)
-        left = float(np.sqrt(((reached[c] - asked) ** 2).sum(axis=-1).mean()))
-        return DraggedGoal(joints, self._raw(reached), left)
+        cosine, sine = np.cos(turn), np.sin(turn)
+        turned = centre + (project_many(P, points)[0] - centre) @ np.array([[cosine, sine], [-sine, cosine]])
+        goal = self._on_rays(c, asked, nearer * middle[None] @ self._Ps[c, 2])[0]
+        return self._on_rays(c, turned, points @ self._Ps[c, 2]) + (goal - middle)
+
+    def _on_rays(self, c: int, ideal: FloatArray, depths: FloatArray) -> FloatArray:
+        """Points (m, 4) of height 1 that camera ``c`` sees at ideal pixels (m, 2) with ``depths`` (m,)."""
+        rows = np.vstack([self._Ps[c], self.model.plane_at_infinity])
+        sides = np.column_stack([depths[:, None] * ideal, depths, np.ones(len(ideal))])
+        found: FloatArray = np.linalg.solve(rows, sides.T).T
+        return found
 
     def epipolar_lines(self, camera: str, pixel: tuple[float, float]) -> dict[str, FloatArray]:
         """The epipolar line of a raw ``pixel`` in every other camera: raw points (k, 2) along it, across the picture.
@@ -109,8 +124,12 @@ class DragModel:
             )
         return self.cameras.index(camera)
 
+    def _points(self, joints: FloatArray) -> FloatArray:
+        points: FloatArray = self.model.marker_points @ self._chain.displacement(joints).T
+        return points
+
     def _ideal(self, joints: FloatArray) -> FloatArray:
-        return project_many(self._Ps, self.model.marker_points @ self._chain.displacement(joints).T)
+        return project_many(self._Ps, self._points(joints))
 
     def _raw(self, ideal: FloatArray) -> FloatArray:
         return np.array(
@@ -124,33 +143,31 @@ class DragModel:
         lines: FloatArray = np.cross(epipole, (self._Ps[k] @ ray).T)
         return lines
 
-    def _fitted(self, start: FloatArray, wanted: FloatArray, weights: FloatArray) -> FloatArray:
+    def _fitted(self, start: FloatArray, wanted: FloatArray) -> FloatArray:
         """Joints (n,) within the limits whose ideal pixels are nearest to ``wanted`` (c, m, 2)."""
         low, high = self.limits.T
         q = np.clip(start, low, high)
-        scale = np.sqrt(weights)[:, None, None]
-        residual = (scale * (wanted - self._ideal(q))).ravel()
+        residual = (wanted - self._ideal(q)).ravel()
         damping = DAMPING
         for _ in range(ITERATIONS):
-            points = self.model.marker_points @ self._chain.displacement(q).T
-            J = (scale[..., None] * self._chain.image_jacobian(self._Ps, q, points)).reshape(len(residual), -1)
-            free = ~(((q <= low) & (J.T @ residual < 0.0)) | ((q >= high) & (J.T @ residual > 0.0)))
+            J = self._chain.image_jacobian(self._Ps, q, self._points(q)).reshape(len(residual), -1)
+            downhill = J.T @ residual
+            free = ~(((q <= low) & (downhill < 0.0)) | ((q >= high) & (downhill > 0.0)))
             if not free.any():
                 break
             A = J[:, free].T @ J[:, free]
             A += damping * A.diagonal().max() * np.eye(len(A))
-            step = np.zeros(len(q))
-            step[free] = np.linalg.solve(A, J[:, free].T @ residual)
-            tried = np.clip(q + step, low, high)
-            with np.errstate(invalid="ignore"):
-                left = (scale * (wanted - self._ideal(tried))).ravel()
-            if not left @ left < residual @ residual:
+            tried = q.copy()
+            tried[free] += np.linalg.solve(A, downhill[free])
+            tried = np.clip(tried, low, high)
+            left = (wanted - self._ideal(tried)).ravel()
+            if not left @ left < residual @ residual:  # NaN in a focal plane is no progress
                 damping *= 10.0
-                if damping > 1e6:
+                if damping > LARGEST_DAMPING:
                     break
                 continue
             gain = float(np.sqrt(residual @ residual) - np.sqrt(left @ left))
-            q, residual, damping = tried, left, max(damping / 10.0, 1e-12)
+            q, residual, damping = tried, left, max(damping / 10.0, LEAST_DAMPING)
             if gain < CONVERGED_PX:
                 break
         return q

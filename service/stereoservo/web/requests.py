@@ -80,7 +80,8 @@ class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="do", fo
 
 
 class Drag(msgspec.Struct, frozen=True, tag="drag", tag_field="do", forbid_unknown_fields=True):
-    """Move the outline of the marker body in the picture of ``camera`` by ``shift`` [px] and ``turn`` [rad].
+    """Move the outline of the marker body in the picture of ``camera`` by ``shift`` [px] and ``turn`` [rad]; ``nearer``
+    multiplies its depth.
 
     From where the last drag ended (``draft``) or from where the arm is. ``done``: the next drag goes on from here.
     Nothing moves.
@@ -89,6 +90,7 @@ class Drag(msgspec.Struct, frozen=True, tag="drag", tag_field="do", forbid_unkno
     camera: Name
     shift: tuple[Offset, Offset]
     turn: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
+    nearer: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0
     draft: bool = False
     done: bool = False
     n: Number = 0

@@ -273,7 +273,7 @@ class PageServer:
             page.base = self.link.joints() if page.base is None else page.base
         base = page.base if page.draft is None else page.draft
         assert base is not None
-        found = model.dragged(base, request.camera, request.shift, request.turn)
+        found = model.dragged(base, request.camera, request.shift, request.turn, request.nearer)
         page.checked = None
         if request.done:
             page.draft, page.base = found.joints, None

@@ -251,7 +251,8 @@ async function dragged(tree) {
   redraw();
 }
 
-const turned = (angle) => lastCamera && dragged({ camera: lastCamera, shift: [0, 0], turn: angle, draft: true, done: true });
+// By buttons: of the dragged outline, in the picture in which it was dragged last, or of the body in the first one.
+const changed = (change) => dragged({ camera: lastCamera ?? views.keys().next().value, shift: [0, 0], draft: hasDraft, done: true, ...change });
 
 async function go() {
   const answer = await command({ do: "go" });
@@ -273,8 +274,10 @@ for (const button of document.querySelectorAll("[data-do]")) {
 }
 $("check").onclick = () => check();
 $("go").onclick = go;
-$("turn-left").onclick = () => turned(-Math.PI / 36);
-$("turn-right").onclick = () => turned(Math.PI / 36);
+$("turn-left").onclick = () => changed({ turn: -Math.PI / 36 });
+$("turn-right").onclick = () => changed({ turn: Math.PI / 36 });
+$("nearer").onclick = () => changed({ nearer: 0.98 });
+$("farther").onclick = () => changed({ nearer: 1 / 0.98 });
 $("take").onsubmit = (event) => { event.preventDefault(); command({ do: "take", token: $("token").value.trim() }); $("token").value = ""; };
 $("teach").onsubmit = (event) => { event.preventDefault(); command({ do: "teach", name: $("teach-name").value }); };
 let orbit = null;
