@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import ssl
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,6 +48,7 @@ def web(
         except InvalidKeyError as error:
             raise CommandError("usage", str(error)) from error
     try:
+        from stereoservo.web.cell_link import CellLink
         from stereoservo.web.server import PageServer
     except ModuleNotFoundError as error:
         if error.name != "websockets":
@@ -61,7 +63,7 @@ def web(
         if len(tokens) > 1 or not json:
             note(f"token to command the arm as {operate}, good for one use: {token}")
 
-    server = PageServer(cell, endpoint, operate, announce)
+    server = PageServer(partial(CellLink, cell, endpoint, operate or "page"), operate, announce)
     with suppress(KeyboardInterrupt):
         asyncio.run(_serve(server, address, port, context, tokens, json))
 

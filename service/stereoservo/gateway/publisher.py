@@ -21,8 +21,8 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.ipc_messages import RunPlan
-from stereoservo.daemon.taught_goals import TaughtGoal
 from stereoservo.daemon.preview import PreviewPicture, PreviewRequest
+from stereoservo.daemon.taught_goals import TaughtGoal
 from stereoservo.gateway.boundary import LimitedLog
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.directories import CellDirectories

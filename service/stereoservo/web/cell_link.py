@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -49,7 +50,7 @@ class CellLink:
     """
 
     def __init__(self, cell: str, endpoint: str | None, operator: str, publish: Publish) -> None:
-        self._connect = lambda: Client(cell, endpoint=endpoint, operator=operator)
+        self._connect: Callable[[], Client] = partial(Client, cell, endpoint=endpoint, operator=operator)
         self._publish = publish
         self._client: Client | None = self._connect()
         self.cell = self._client.cell

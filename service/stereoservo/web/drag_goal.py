@@ -62,15 +62,17 @@ class DragModel:
     ) -> DraggedGoal:
         """The posture near ``start`` (n,) at which the middle of the markers is moved by ``shift`` [px] in ``camera``.
 
-        One picture leaves the depth open: it stays, in the sense of the model's plane at infinity, so that the body moves
-        parallel to the picture without turning; ``nearer`` multiplies it. ``turn`` [rad] turns the body about the ray
-        through its middle. In the other cameras every marker thereby moves along its epipolar line. The posture is
-        the least-squares one in all pictures (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
+        One picture leaves the depth open: it stays, in the sense of the model's plane at infinity, so that the body
+        moves parallel to the picture without turning; ``nearer`` multiplies it. ``turn`` [rad] turns the body about the
+        ray through its middle. In the other cameras every marker thereby moves along its epipolar line. The posture
+        is the least-squares one in all pictures (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
         """
         c = self._index(camera)
         wanted = project_many(self._Ps, self._wanted(c, self._points(start), np.array(shift), turn, nearer))
         if not np.isfinite(wanted).all():
-            raise GeometryError("outside", f"the body is dragged into the focal plane of {camera}", camera=camera)
+            raise GeometryError(
+                "outside", f"the body is dragged into the focal plane of {camera}", camera=camera
+            )
         joints = self._fitted(start, wanted)
         reached = self._ideal(joints)
         left = float(np.sqrt(((reached[c] - wanted[c]) ** 2).sum(axis=-1).mean()))
@@ -93,7 +95,8 @@ class DragModel:
         cosine, sine = np.cos(turn), np.sin(turn)
         turned = centre + (project_many(P, points)[0] - centre) @ np.array([[cosine, sine], [-sine, cosine]])
         goal = self._on_rays(c, asked, nearer * middle[None] @ self._Ps[c, 2])[0]
-        return self._on_rays(c, turned, points @ self._Ps[c, 2]) + (goal - middle)
+        placed: FloatArray = self._on_rays(c, turned, points @ self._Ps[c, 2]) + (goal - middle)
+        return placed
 
     def _on_rays(self, c: int, ideal: FloatArray, depths: FloatArray) -> FloatArray:
         """Points (m, 4) of height 1 that camera ``c`` sees at ideal pixels (m, 2) with ``depths`` (m,)."""
@@ -137,7 +140,7 @@ class DragModel:
         )
 
     def _lines(self, c: int, k: int, ideal: FloatArray) -> FloatArray:
-        """Epipolar lines (m, 3) in camera ``k`` of ideal pixels (m, 2) in camera ``c``: epipole and image of the ray."""
+        """Epipolar lines (m, 3) in camera ``k`` of ideal pixels (m, 2) in camera ``c``: through the epipole."""
         epipole = self._Ps[k] @ camera_centre(self._Ps[c])
         ray = np.linalg.pinv(self._Ps[c]) @ np.column_stack([ideal, np.ones(len(ideal))]).T
         lines: FloatArray = np.cross(epipole, (self._Ps[k] @ ray).T)
@@ -177,7 +180,8 @@ def _feet(lines: FloatArray, pixels: FloatArray) -> FloatArray:
     """The points (m, 2) of lines (m, 3) nearest to ``pixels`` (m, 2)."""
     normals = lines[:, :2]
     away = (normals * pixels).sum(axis=1) + lines[:, 2]
-    return pixels - normals * (away / (normals**2).sum(axis=1))[:, None]
+    feet: FloatArray = pixels - normals * (away / (normals**2).sum(axis=1))[:, None]
+    return feet
 
 
 def _across(line: FloatArray, width: int, height: int) -> FloatArray:

@@ -139,4 +139,3 @@ def decode_request(data: bytes) -> PageRequest:
     """A page's request. Raises MessageError, whatever the bytes."""
     kind: type[PageRequest] = PageRequest  # type: ignore[assignment]
     return decode(data, kind)
-

@@ -66,14 +66,18 @@ class ArmHolder:
         """Let ``page`` hold the arm. Raises RightsError: read-only, a wrong or used token, or another page holds it."""
         with self._lock:
             if self.operator is None:
-                raise RightsError("this page is read-only; `stereoservo web CELL --operate NAME` lets one command")
+                raise RightsError(
+                    "this page is read-only; `stereoservo web CELL --operate NAME` lets one command"
+                )
             if self._holder is page:
                 return
             if self._holder is not None:
-                raise RightsError(f"another page holds the arm as {self.operator}; close it, or release it there")
+                raise RightsError(
+                    f"another page holds the arm as {self.operator}; close it, or release it there"
+                )
             if not hmac.compare_digest(self._token.encode(), token.encode()):
                 raise RightsError(
-                    "this token is not valid, or was used before; the newest stands in the terminal of `stereoservo web`"
+                    "this token is wrong, or was used before; the newest stands in the terminal of `stereoservo web`"
                 )
             self._holder = page
             self._renew()

@@ -9,6 +9,7 @@ import ssl
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from stereoservo.messages.goals import Goal
 from stereoservo.messages.wire import MessageError, Reply
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web import requests as ask
-from stereoservo.web.cell_link import CellLink, LinkDownError, drag_answer, refusal
+from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, drag_answer, refusal
 from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
 
 FILES = {
@@ -44,6 +45,7 @@ MAX_PAGES = 16
 MAX_REQUEST_BYTES = 1 << 14
 MAX_WAITING = 512
 EVENTS_KEPT = 100
+CLOSING_S = 2.0
 EXPECTED = (ClientError, GeometryError, LinkDownError, MessageError, RightsError)
 
 
@@ -72,13 +74,17 @@ class Page:
 
 
 class PageServer:
-    """Serves pages of one cell. ``announce``: called with each new token of an operator.
+    """Serves pages of one cell. ``make_link``: makes the link to it, given what publishes to the pages.
 
-    Raises NotRunningError, SessionError, ClientError where the cell cannot be reached.
+    ``operator``: the name under which one page may command the arm; None: none may. ``announce``: called with each new
+    token of that operator. Raises what ``make_link`` does.
     """
 
     def __init__(
-        self, cell: str, endpoint: str | None, operator: str | None, announce: Callable[[str], None]
+        self,
+        make_link: Callable[[Publish], CellLink],
+        operator: str | None,
+        announce: Callable[[str], None],
     ) -> None:
         self.holder = ArmHolder(operator, announce)
         self._pages: set[Page] = set()
@@ -89,7 +95,7 @@ class PageServer:
         self._stops = ThreadPoolExecutor(4, thread_name_prefix="page-stop")
         self._hosts: frozenset[str] = frozenset()
         self._secure = False
-        self.link = CellLink(cell, endpoint, operator or "page", self._publish)
+        self.link = make_link(self._publish)
 
     async def start(self, address: str, port: int, tls: ssl.SSLContext | None = None) -> int:
         """Listen; returns the port (given as 0: a free one). Raises OSError."""
@@ -102,6 +108,8 @@ class PageServer:
             ssl=tls,
             process_request=self._static,
             max_size=MAX_REQUEST_BYTES,
+            open_timeout=5.0,
+            close_timeout=1.0,
             compression=None,
             server_header=None,
         )
@@ -113,7 +121,8 @@ class PageServer:
     async def close(self) -> None:
         """Close all pages, end their goals' leases, leave the daemon. Idempotent."""
         self._server.close()
-        await self._server.wait_closed()
+        with suppress(TimeoutError):  # whoever keeps a connection open must not keep the server
+            await asyncio.wait_for(self._server.wait_closed(), CLOSING_S)
         await asyncio.to_thread(self.link.close)
         self._work.shutdown(wait=False, cancel_futures=True)
         self._stops.shutdown(wait=False)
