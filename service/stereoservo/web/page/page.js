@@ -8,6 +8,10 @@ const views = new Map();
 const history = { error: [], velocity: [], loop: [] };
 const answers = new Map();
 const stats = (window.stats = { pictures: 0, latencies: [], answers: [], events: [] });
+stats.middle = (camera) => {
+  const pixels = views.get(camera)?.predicted ?? [];
+  return pixels.length ? [0, 1].map((i) => pixels.reduce((sum, p) => sum + p[i], 0) / pixels.length) : null;
+};
 let socket, number = 0, rights = {}, state, scene, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null;
 let drawDue = false;
 
