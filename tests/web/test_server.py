@@ -169,7 +169,7 @@ def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
                 if answer(other, {"do": "take", "token": tokens[1]}, n)["ok"]:
                     break
             assert answer(other, {"do": "hold"}, 500)["ok"]
-            assert link.ended == 1
+            assert link.ended >= 1
 
 
 def test_other_hosts_origins_and_paths_get_nothing() -> None:

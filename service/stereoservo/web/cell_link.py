@@ -7,8 +7,8 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from zenoh.handlers import RingChannel
 
 from stereoservo.client import Client, ClientError, EventWatch, RefusedError, SessionError
+from stereoservo.client.client import GOAL_TIMEOUT_S
 from stereoservo.client.connection import read_message
 from stereoservo.client.goal_handle import TERMINAL, Lease
 from stereoservo.geometry.homogeneous import GeometryError
@@ -235,17 +236,39 @@ class CellLink:
     def send(self, goal: Goal) -> Reply:
         """Send a goal, and renew its lease until it ends or `end_leases`. Raises ClientError, LinkDownError."""
         client = self.client
-        reply = client.request("goal", client.goal_key, encode(goal), 7.0)
-        self._leases[goal.id] = Lease(client, goal.id, goal.lease_s)
-        return reply
+        with self._leased(client, goal.id):
+            return client.request("goal", client.goal_key, encode(goal), GOAL_TIMEOUT_S)
 
     def calibrate(self, check: bool) -> Reply:
         """Begin a calibration, or a check motion; its events tell the rest. Raises ClientError, LinkDownError."""
         client = self.client
         command = Calibrate(Client.make_goal(TaughtTarget("x")).id, check=check, lease_s=LEASE_S)
-        reply = client.command("calibrate", command)
-        self._leases[command.id] = Lease(client, command.id, command.lease_s)
-        return reply
+        with self._leased(client, command.id):
+            return client.command("calibrate", command)
+
+    @contextmanager
+    def _leased(self, client: Client, motion: str) -> Iterator[None]:
+        """Renew the lease of ``motion`` from now on, unless what is done within raises.
+
+        From before it is asked for: its end may be told before its acceptance is.
+        """
+        lease = self._leases[motion] = Lease(client, motion, LEASE_S)
+        try:
+            yield
+        except BaseException:
+            self._leases.pop(motion, None)
+            lease.end()
+            raise
+
+    def stop(self) -> Reply:
+        """Stop the arm, over a session of its own where the link is down. Raises ClientError, NotRunningError,
+        SessionError.
+        """
+        client = self._client
+        if client is not None:
+            return client.stop()
+        with self._connect() as fresh:
+            return fresh.stop()
 
     def cancel(self) -> Reply:
         """Cancel the active goal. Raises ClientError, LinkDownError."""

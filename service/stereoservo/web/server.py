@@ -21,8 +21,9 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from stereoservo.client import ClientError
+from stereoservo.client import ClientError, SessionError
 from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.messages.discovery import NotRunningError
 from stereoservo.messages.goals import Goal
 from stereoservo.messages.wire import MessageError, Reply
 from stereoservo.numerics.arrays import FloatArray
@@ -46,7 +47,17 @@ MAX_REQUEST_BYTES = 1 << 14
 MAX_WAITING = 512
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
-EXPECTED = (ClientError, GeometryError, LinkDownError, MessageError, RightsError)
+PING_S = 5.0
+"""A page that does not answer for so long is closed; one that holds the arm then lets it stop."""
+EXPECTED = (
+    ClientError,
+    GeometryError,
+    LinkDownError,
+    MessageError,
+    NotRunningError,
+    RightsError,
+    SessionError,
+)
 
 
 class Page:
@@ -110,6 +121,8 @@ class PageServer:
             max_size=MAX_REQUEST_BYTES,
             open_timeout=5.0,
             close_timeout=1.0,
+            ping_interval=PING_S,
+            ping_timeout=PING_S,
             compression=None,
             server_header=None,
         )
@@ -227,14 +240,22 @@ class PageServer:
             answer = refusal(error)
         except Exception as error:  # told to the page; the next request is answered as usual
             answer = {"ok": False, "message": f"the page's server failed: {type(error).__name__}: {error}"}
+        self._let_go_if_closed(page)
         page.tell({"answer": {"n": n, **answer}})
+
+    def _let_go_if_closed(self, page: Page) -> None:
+        """What a page was still doing when it was closed must not outlive it."""
+        if page not in self._pages:
+            self.holder.release(page)
+            if not self.holder.taken:  # else its leases are another page's by now
+                self.link.end_leases()
 
     def _do(self, page: Page, request: ask.PageRequest) -> dict[str, Any]:
         """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
         link = self.link
         match request:
             case ask.Stop():
-                return _told(link.client.stop())
+                return _told(link.stop())
             case ask.Take():
                 self.holder.take(page, request.token)
                 self._rights_changed()
