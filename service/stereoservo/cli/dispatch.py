@@ -32,6 +32,7 @@ COMMANDS: dict[str, str] = {
     "home": "home:home",
     "calibrate": "calibrate.command:calibrate",
     "watch": "watch.command:watch",
+    "web": "web:web",
     "enable": "operator_commands:enable",
     "disable": "operator_commands:disable",
     "hold": "operator_commands:hold",

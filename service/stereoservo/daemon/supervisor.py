@@ -46,6 +46,7 @@ from stereoservo.daemon.ipc_messages import (
     save_plan,
 )
 from stereoservo.daemon.plant_driver import PLANT_CAPACITY, PLANT_ORDERS_LAYOUT, PLANT_STATE_LAYOUT
+from stereoservo.daemon.preview import PICTURE_CAPACITY, PICTURE_LAYOUT, WANTED_BYTES, WANTED_LAYOUT
 from stereoservo.daemon.process_control import Termination, child_environment, write_log
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
 from stereoservo.daemon.vision import Reporter
@@ -325,6 +326,8 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
     for camera in plan.cameras:
         found.append((directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT))
         found.append((directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT))
+        found.append((directories.preview_slot(camera.name), PICTURE_CAPACITY, PICTURE_LAYOUT))
+        found.append((directories.preview_wanted_slot(camera.name), WANTED_BYTES, WANTED_LAYOUT))
     return found
 
 

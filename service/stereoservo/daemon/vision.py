@@ -53,6 +53,7 @@ from stereoservo.ports.devices import (
 )
 
 if TYPE_CHECKING:
+    from stereoservo.daemon.preview import PreviewEncoder
     from stereoservo.recording.image_recording import ImageRecorder
 
 
@@ -131,7 +132,7 @@ class VisionSlots:
 
 class CameraPipeline:
     """Driver and detector of one camera: publishes the observation of the newest frame; ``images`` records all
-    frames. ``beat``: told at every call within how many seconds it is told again.
+    frames; ``preview`` is offered the newest. ``beat``: told at every call within how many seconds it is told again.
     """
 
     def __init__(
@@ -142,10 +143,12 @@ class CameraPipeline:
         clock: Clock,
         images: ImageRecorder | None = None,
         beat: Callable[[float], None] = lambda limit_s: None,
+        preview: PreviewEncoder | None = None,
     ) -> None:
         self._driver = driver
         self._beat = beat
         self._images = images
+        self._preview = preview
         self._detector = detector
         self._links = links
         self._clock = clock
@@ -190,6 +193,9 @@ class CameraPipeline:
         self.written += 1
         if self._images is not None:
             self._images.take(arrived)
+        newest = arrived[-1]
+        if self._preview is not None and isinstance(newest, Frame):
+            self._preview.offer(newest, self._clock.now_ns())
         return True
 
     def _observed(self, newest: Frame | CameraObservation) -> CameraObservation:
@@ -305,13 +311,15 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     driver, detector = make_camera(section, plan.driver_context(clock, section))
     reporter = Reporter(directories.reports_socket, f"vision-{camera}", clock)
     images: ImageRecorder | None = None
+    preview: PreviewEncoder | None = None
     if description.delivers == "frames":
-        from stereoservo.recording.image_recording import (
-            ImageRecorder,
-        )  # OpenCV: not for cameras without pictures
+        # OpenCV: not for cameras without pictures
+        from stereoservo.daemon.preview import PreviewEncoder
+        from stereoservo.recording.image_recording import ImageRecorder
 
         order = request_path(directories)
         images = ImageRecorder(order, camera, section.driver, description.rate_hz, reporter.report)
+        preview = PreviewEncoder(directories, camera)
 
     def between() -> None:
         if images is not None:
@@ -323,7 +331,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
             closing(VisionSlots(directories, camera)) as links,
             closing(HeartbeatWriter(directories.heartbeat_slot(f"vision-{camera}"))) as heartbeat,
         ):
-            pipeline = CameraPipeline(driver, detector, links, clock, images, heartbeat.beat)
+            pipeline = CameraPipeline(driver, detector, links, clock, images, heartbeat.beat, preview)
             loop = camera_loop(
                 pipeline,
                 reporter.report,
@@ -336,6 +344,8 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     finally:
         if images is not None:
             images.close()
+        if preview is not None:
+            preview.close()
         if lock is not None:
             lock.release()
 

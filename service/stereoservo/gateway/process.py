@@ -51,6 +51,7 @@ from stereoservo.gateway.publisher import (
     SILENT,
     EventLog,
     KeeperNotes,
+    Previews,
     Publishers,
     ReplyThread,
     cell_info,
@@ -69,7 +70,7 @@ from stereoservo.gateway.zenoh_config import (
     split_listeners,
     stop_config,
 )
-from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.model import CellModel, encode_model
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import DirectoryError
 from stereoservo.messages.discovery import DaemonInfo
@@ -158,6 +159,8 @@ class Gateway:
         self._observations = [
             (SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name, log)) for slot in slots
         ]
+        self._previews = Previews(self._publishers.previews, directories)
+        self._preview_boundary = RecordBoundary("preview pictures", log)
         self._report_boundary = RecordBoundary("reports of vision processes and supervisor", log)
         self._declare()
         self._stop = StopThread(
@@ -195,6 +198,7 @@ class Gateway:
         self._state_queries = session.declare_queryable(keys.state, RingChannel(32))
         self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
         self._schema_queries = session.declare_queryable(keys.any_schema, RingChannel(32))
+        self._model_queries = session.declare_queryable(keys.model, RingChannel(32))
         self._alive = session.liveliness().declare_token(keys.alive)
 
     def _publish_event(self, payload: bytes) -> None:
@@ -229,6 +233,8 @@ class Gateway:
         busy = self._queries() or bool(events)
         self._intake.expire()
         self._publish_features()
+        with self._preview_boundary:
+            self._previews.poll()
         self._publish_state()
         self._read_reports()
         self._take_steps()
@@ -266,6 +272,7 @@ class Gateway:
             ),
             (self._schema_queries, partial(self._answer, work=self._schema)),
             (self._any_command_queries, self._answer_wrong_key),
+            (self._model_queries, partial(self._answer, work=self._model, key=self.keys.model)),
         )
         for source, take in sources:
             for _ in range(DRAIN):
@@ -340,6 +347,12 @@ class Gateway:
 
     def _schema(self, query: Any) -> bytes:
         return schema(self.keys.schema_of(str(query.key_expr)), tuple(LAWS))
+
+    def _model(self, query: Any) -> bytes:
+        model = self._calibration.model
+        if model is None:
+            return encode(Reply(False, "there is no model; `calibrate` makes one", boot=self.boot))
+        return encode_model(msgspec.structs.replace(model, covariance=None, loads=None))
 
     def info(self) -> CellInfo:
         """Description of the cell, as served on ``info``."""
@@ -492,12 +505,14 @@ class Gateway:
             self._state_queries,
             self._info_queries,
             self._schema_queries,
+            self._model_queries,
             *self._publishers.all,
         ]
         if self._network is not None:
             close_session(self._network, [])
         close_session(self._session, declared)
         self._servo.close()
+        self._previews.close()
         self._reports.close()
         self._journal.close()
         self._handled.close()

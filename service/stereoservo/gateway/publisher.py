@@ -21,9 +21,11 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.preview import PreviewPicture, PreviewRequest
 from stereoservo.daemon.taught_goals import TaughtGoal
 from stereoservo.gateway.boundary import LimitedLog
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.keys import KeySpace
 from stereoservo.messages.wire import (
     ENCODING,
@@ -35,6 +37,7 @@ from stereoservo.messages.wire import (
     JointInfo,
     MessageError,
     ModelInfo,
+    PreviewInfo,
     TaughtInfo,
     encode,
 )
@@ -43,6 +46,7 @@ from stereoservo.ports.devices import CameraObservation
 KEPT_EVENTS = 2_000
 """Asked for by a client that was away. Each as its bytes: a tenth of what its objects take."""
 EVENTS_A_REPLY = 300
+PREVIEW_ASK_S = 0.25
 SILENT = frozenset({"reply"})
 """Core events that are answers, not news."""
 
@@ -180,6 +184,44 @@ def features_message(observation: CameraObservation) -> FeaturesMessage:
     )
 
 
+class Previews:
+    """Publishes pictures of the cameras, and asks for them only while somebody subscribes."""
+
+    def __init__(self, publishers: dict[str, Any], directories: CellDirectories) -> None:
+        self._publishers = publishers
+        self._requests = {name: PreviewRequest(directories, name) for name in publishers}
+        self._wanted: frozenset[str] = frozenset()
+        self._asked = 0.0
+
+    def poll(self) -> None:
+        """Publish the pictures that are there. Raises what a decoder raises."""
+        now = time.monotonic()
+        if now - self._asked > PREVIEW_ASK_S:
+            self._asked = now
+            self._wanted = frozenset(
+                name for name, publisher in self._publishers.items() if publisher.matching_status.matching
+            )
+            for name in self._wanted:
+                self._requests[name].ask()
+        for name in self._wanted:
+            picture = self._requests[name].poll()
+            if picture is not None:
+                self._publishers[name].put(picture.jpeg, attachment=encode(preview_info(picture)))
+
+    def close(self) -> None:
+        """Release the slots. Idempotent."""
+        for request in self._requests.values():
+            request.close()
+
+
+def preview_info(picture: PreviewPicture) -> PreviewInfo:
+    """What a picture shows, in the clients' format."""
+    age_s = (time.monotonic_ns() - picture.t_shutter_ns) * 1e-9
+    return PreviewInfo(
+        picture.camera, picture.seq, picture.t_shutter_ns, time.time() - age_s, picture.width, picture.height
+    )
+
+
 class Publishers:
     """The zenoh publishers, one a key."""
 
@@ -191,11 +233,20 @@ class Publishers:
             name: session.declare_publisher(keys.features(name), encoding=ENCODING, congestion_control=drop)
             for name in cameras
         }
+        self.previews = {
+            name: session.declare_publisher(
+                keys.preview(name),
+                encoding="image/jpeg",
+                congestion_control=drop,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+            for name in cameras
+        }
 
     @property
     def all(self) -> list[Any]:
         """All publishers, for undeclaring."""
-        return [self.state, self.event, *self.features.values()]
+        return [self.state, self.event, *self.features.values(), *self.previews.values()]
 
 
 def cell_info(

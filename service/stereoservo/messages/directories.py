@@ -139,6 +139,14 @@ class CellDirectories(NamedTuple):
         """Newest prior for ``camera``."""
         return self.runtime / f"prior-{camera}.slot"
 
+    def preview_slot(self, camera: str) -> Path:
+        """Newest preview picture of ``camera``."""
+        return self.runtime / f"preview-{camera}.slot"
+
+    def preview_wanted_slot(self, camera: str) -> Path:
+        """Until when preview pictures of ``camera`` are wanted."""
+        return self.runtime / f"preview-wanted-{camera}.slot"
+
 
 def runtime_root() -> Path:
     """``$STEREOSERVO_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/stereoservo``, else

@@ -48,6 +48,7 @@ class KeySpace:
         self.state = f"{self.prefix}/state"
         self.event = f"{self.prefix}/event"
         self.info = f"{self.prefix}/info"
+        self.model = f"{self.prefix}/model"
         self.alive = f"{self.prefix}/alive"
         self.stop = f"{self.prefix}/command/stop"
         self.any_goal = f"{self.prefix}/goal/*"
@@ -56,6 +57,10 @@ class KeySpace:
     def features(self, camera: str) -> str:
         """The key on which the features of ``camera`` are published."""
         return f"{self.prefix}/features/{check_name('camera', camera)}"
+
+    def preview(self, camera: str) -> str:
+        """The key on which pictures of ``camera`` are published while somebody subscribes."""
+        return f"{self.prefix}/preview/{check_name('camera', camera)}"
 
     def goal(self, operator: str) -> str:
         """The key of ``operator``'s goals, for puts and queries."""

@@ -237,6 +237,20 @@ class FeaturesMessage(msgspec.Struct, frozen=True):
     sigmas: tuple[float, ...]
 
 
+class PreviewInfo(msgspec.Struct, frozen=True):
+    """Attachment of a picture on ``preview/<camera>``, whose payload is a JPEG of one frame, smaller perhaps.
+
+    ``width``, ``height``: of the frame [px], in which all pixels of the other messages are.
+    """
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    t_wall: float
+    width: int
+    height: int
+
+
 class CalibrationResult(msgspec.Struct, frozen=True):
     """Result of a calibration. ``covariance_ok``: the residuals are what the measurement noise explains
     (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
@@ -322,6 +336,7 @@ SCHEMAS: dict[str, Any] = {
     "event": EventMessage,
     "events": EventList,
     "features": FeaturesMessage,
+    "preview": PreviewInfo,
     "info": CellInfo,
     "reply": Reply,
     "command-record": Record,

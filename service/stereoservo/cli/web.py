@@ -1,0 +1,112 @@
+"""Command ``stereoservo web``: serves the operators' page of a cell until Ctrl-C."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.messages.keys import InvalidKeyError, check_name
+
+if TYPE_CHECKING:
+    from stereoservo.web.server import PageServer
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+def web(
+    cell: CellArgument,
+    port: Annotated[int, typer.Option(help="TCP port; 0: a free one.", min=0, max=65535)] = 8080,
+    address: Annotated[
+        str, typer.Option(help="Address to listen on; any but loopback needs --tls.")
+    ] = "127.0.0.1",
+    tls: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address."),
+    ] = None,
+    operate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Let one page command the arm under this name, with the one-time token that is printed.",
+        ),
+    ] = None,
+    endpoint: EndpointOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Serve the operators' page, until Ctrl-C. Without --operate it shows the cell and may stop the arm."""
+    context = _tls_context(address, tls)
+    if operate is not None:
+        try:
+            check_name("operator", operate)
+        except InvalidKeyError as error:
+            raise CommandError("usage", str(error)) from error
+    try:
+        from stereoservo.web.cell_link import CellLink
+        from stereoservo.web.server import PageServer
+    except ModuleNotFoundError as error:
+        if error.name != "websockets":
+            raise
+        raise CommandError(
+            "missing", "the page needs the package websockets: pip install 'stereoservo[web]'"
+        ) from error
+    tokens: list[str] = []
+
+    def announce(token: str) -> None:
+        tokens.append(token)
+        if len(tokens) > 1 or not json:
+            note(f"token to command the arm as {operate}, good for one use: {token}")
+
+    server = PageServer(partial(CellLink, cell, endpoint, operate or "page"), operate, announce)
+    with suppress(KeyboardInterrupt):
+        asyncio.run(_serve(server, address, port, context, tokens, json))
+
+
+async def _serve(
+    server: PageServer,
+    address: str,
+    port: int,
+    context: ssl.SSLContext | None,
+    tokens: list[str],
+    as_json: bool,
+) -> None:
+    try:
+        found = await server.start(address, port, context)
+    except OSError as error:
+        await asyncio.to_thread(server.link.close)
+        raise CommandError(
+            "listen", f"{address}:{port}: {error.strerror or error}; choose another --port"
+        ) from error
+    shown = f"[{address}]" if ":" in address else address
+    url = f"{'http' if context is None else 'https'}://{shown}:{found}/"
+    emit({"url": url, "token": tokens[-1] if tokens else None}, f"{url}  (Ctrl-C ends it)", as_json)
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await server.close()
+
+
+def _tls_context(address: str, directory: Path | None) -> ssl.SSLContext | None:
+    """The server's TLS settings; None without. Raises CommandError: not loopback and no TLS, or files missing."""
+    if directory is None:
+        if address not in LOOPBACK:
+            raise CommandError(
+                "usage",
+                f"--address {address} without --tls: whoever is on the way could command the arm; loopback alone "
+                f"({', '.join(LOOPBACK)}) is served without TLS",
+            )
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(directory / "cert.pem", directory / "key.pem")
+    except (OSError, ssl.SSLError) as error:
+        raise CommandError(
+            "tls", f"{directory}: cert.pem and key.pem, in PEM, are needed: {error}"
+        ) from error
+    return context

@@ -1,0 +1,158 @@
+"""Pictures of a camera for people to look at: encoded as JPEG by a niced thread of the vision process, only while the
+gateway asks for them, and passed to it through a slot.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+
+import msgspec
+
+from stereoservo.daemon.process_control import write_log
+from stereoservo.daemon.seqlock import SlotReader, SlotWriter
+from stereoservo.messages.decoding import cause_of
+from stereoservo.messages.directories import CellDirectories
+from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports.devices import Frame
+
+PICTURE_LAYOUT = "PreviewPicture.1"
+PICTURE_CAPACITY = 192 << 10
+"""Below the largest message of a zenoh session (`client.session.MAX_MESSAGE_BYTES`)."""
+WANTED_LAYOUT = "PreviewWanted.1"
+WANTED_BYTES = 8
+WANTED_S = 1.0
+"""A request holds so long; the gateway renews it while somebody subscribes."""
+WIDEST_PX = 640
+EVERY_NS = 60_000_000
+"""At most 16 pictures a second: every frame of a camera of 15 Hz."""
+QUALITIES = (75, 50, 25)
+NICENESS = 10
+
+
+class PreviewPicture(msgspec.Struct, frozen=True):
+    """A JPEG of one frame. ``width``, ``height``: of the frame [px], which the JPEG may show smaller."""
+
+    camera: str
+    seq: int
+    t_shutter_ns: int
+    width: int
+    height: int
+    jpeg: bytes
+
+
+picture_decoder = msgspec.msgpack.Decoder(PreviewPicture)
+_encoder = msgspec.msgpack.Encoder()
+
+
+def encode_jpeg(image: ImageArray) -> bytes:
+    """A picture (height, width) as JPEG, at most `WIDEST_PX` wide, at the best quality that the slot holds."""
+    import cv2  # not for the gateway and the supervisor, which know the slots
+
+    step = -(-image.shape[1] // WIDEST_PX)
+    if step > 1:
+        size = (image.shape[1] // step, image.shape[0] // step)
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    data = b""
+    for quality in QUALITIES:
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(data) < PICTURE_CAPACITY - 1024:
+            break
+    return data
+
+
+class PreviewEncoder:
+    """Of one camera, in its vision process: `offer` takes each newest frame; a thread encodes while it is wanted.
+
+    The thread starts with the first picture that is wanted. Raises SlotError where another process writes.
+    """
+
+    def __init__(self, directories: CellDirectories, camera: str) -> None:
+        self._wanted = SlotReader(directories.preview_wanted_slot(camera), WANTED_LAYOUT)
+        self._slot = SlotWriter(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
+        self._camera = camera
+        self._until_ns = 0
+        self._last_ns = 0
+        self._ready = threading.Condition()
+        self._waiting: Frame | None = None
+        self._ended = False
+        self._thread: threading.Thread | None = None
+
+    def offer(self, frame: Frame, now_ns: int) -> None:
+        """Hand over a copy of ``frame`` where one is wanted and the last one is old enough; never waits."""
+        request = self._wanted.poll()
+        if request is not None and len(request) == WANTED_BYTES:
+            (self._until_ns,) = struct.unpack("=q", request)
+        if now_ns > self._until_ns or now_ns - self._last_ns < EVERY_NS:
+            return
+        self._last_ns = now_ns
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name=f"preview-{self._camera}", daemon=True)
+            self._thread.start()
+        kept = msgspec.structs.replace(frame, image=frame.image.copy())
+        with self._ready:
+            self._waiting = kept
+            self._ready.notify()
+
+    def _work(self) -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # Linux: of this thread alone
+        told = False
+        while True:
+            with self._ready:
+                while self._waiting is None and not self._ended:
+                    self._ready.wait()
+                if self._ended:
+                    return
+                frame, self._waiting = self._waiting, None
+            assert frame is not None
+            try:
+                height, width = frame.image.shape
+                picture = PreviewPicture(
+                    frame.camera, frame.seq, frame.t_shutter_ns, width, height, encode_jpeg(frame.image)
+                )
+                self._slot.write(_encoder.encode(picture))
+            except Exception as error:  # a picture that cannot be shown must not cost the camera
+                if not told:
+                    write_log(f"vision-{self._camera}", f"no preview of a picture: {cause_of(error)}")
+                told = True
+
+    def close(self) -> None:
+        """End the thread and release the slots. Idempotent."""
+        with self._ready:
+            self._ended = True
+            self._ready.notify()
+        if self._thread is not None:
+            self._thread.join(1.0)
+            if self._thread.is_alive():
+                return  # it still writes: the process ends and takes both slots with it
+        self._wanted.close()
+        self._slot.close()
+
+
+class PreviewRequest:
+    """The gateway's side of one camera's preview: asks for pictures, and reads the newest."""
+
+    def __init__(self, directories: CellDirectories, camera: str) -> None:
+        self._wanted = SlotWriter(directories.preview_wanted_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
+        self._slot = SlotReader(directories.preview_slot(camera), PICTURE_LAYOUT)
+
+    def ask(self) -> None:
+        """Ask for pictures for `WANTED_S` from now."""
+        self._wanted.write(struct.pack("=q", time.monotonic_ns() + int(WANTED_S * 1e9)))
+
+    def poll(self) -> PreviewPicture | None:
+        """The newest picture, unless it was returned before or is older than a request holds. Raises what the decoder
+        raises.
+        """
+        data = self._slot.poll()
+        if data is None:
+            return None
+        picture = picture_decoder.decode(data)
+        return picture if time.monotonic_ns() - picture.t_shutter_ns < int(WANTED_S * 1e9) else None
+
+    def close(self) -> None:
+        """Release both slots. Idempotent."""
+        self._wanted.close()
+        self._slot.close()

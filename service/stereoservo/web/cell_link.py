@@ -1,0 +1,318 @@
+"""The page server's link to the daemon, a goal client: a thread that reads what the cell publishes, and the commands
+that pages give.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from typing import Any
+
+import msgspec
+import numpy as np
+from zenoh.handlers import RingChannel
+
+from stereoservo.client import Client, ClientError, EventWatch, RefusedError, SessionError
+from stereoservo.client.client import GOAL_TIMEOUT_S
+from stereoservo.client.connection import read_message
+from stereoservo.client.goal_handle import TERMINAL, Lease
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.model import ModelFileError, decode_model
+from stereoservo.messages.discovery import NotRunningError
+from stereoservo.messages.goals import Calibrate, FeatureTarget, Goal, TaughtTarget
+from stereoservo.messages.wire import CellInfo, EventMessage, FeaturesMessage, Reply, StateMessage, encode
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.web.drag_goal import DragModel
+from stereoservo.web.scene import Scene
+
+POLL_S = 0.004
+AGAIN_S = 1.0
+SILENT_S = 2.0
+INFO_EVERY_S = 0.5
+LEASE_S = 2.0
+"""Of a page's goals, renewed while the page is there: one that is closed, or loses its server, stops the arm."""
+ENDS = (*TERMINAL, "calibration_finished", "check_finished", "calibration_aborted", "calibration_failed")
+Publish = Callable[[str, bytes, bool], None]
+
+
+class LinkDownError(Exception):
+    """There is no daemon to command now; the text says why."""
+
+
+class CellLink:
+    """Reads a cell and commands it. ``publish(slot, message, keep)``: a message for all pages, as JSON text or, of
+    pictures, bytes; of one slot only the newest counts, unless the slot is empty; ``keep``: new pages get it, too.
+
+    Raises NotRunningError, SessionError, ClientError where the cell cannot be reached at the start.
+    """
+
+    def __init__(self, cell: str, endpoint: str | None, operator: str, publish: Publish) -> None:
+        self._connect: Callable[[], Client] = partial(Client, cell, endpoint=endpoint, operator=operator)
+        self._publish = publish
+        self._client: Client | None = self._connect()
+        self.cell = self._client.cell
+        self.info: CellInfo = self._client.info()
+        self.drag_model: DragModel | None = None
+        self._scene: Scene | None = None
+        self._epoch = -1
+        self._seen: dict[str, FeaturesMessage] = {}
+        self._state: StateMessage | None = None
+        self._leases: dict[str, Lease] = {}
+        self._why = ""
+        self.watched = threading.Event()
+        """Set while a page is open: pictures are subscribed to only then."""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="cell-link", daemon=True)
+
+    def start(self) -> None:
+        """Begin to publish."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and the session. Idempotent."""
+        self.end_leases()
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join(3.0)
+
+    # -- reading ----------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while not self._ended.is_set():
+            try:
+                if self._client is None:
+                    self._client = self._connect()
+                self._read(self._client)
+            except (ClientError, NotRunningError, SessionError, OSError) as error:
+                self._why = str(error)
+            self._tell("link", {"up": False, "why": self._why})
+            client, self._client = self._client, None
+            if client is not None:
+                client.close()
+            self._ended.wait(AGAIN_S)
+
+    def _read(self, client: Client) -> None:
+        """Publish what ``client`` receives, until the daemon goes away. Raises ClientError."""
+        self._epoch = -1
+        self._tell_info(client)
+        self._tell("link", {"up": True, "why": ""})
+        prefix = client.keys.prefix
+        states = client.session.declare_subscriber(client.keys.state, RingChannel(4))
+        features = client.session.declare_subscriber(f"{prefix}/features/*", RingChannel(32))
+        pictures: Any = None
+        heard = info_due = time.monotonic()
+        stale = False
+        with EventWatch(client) as watch:
+            while not self._ended.wait(POLL_S):
+                now = time.monotonic()
+                while (sample := states.try_recv()) is not None:
+                    heard = now
+                    self._take_state(client, sample.payload.to_bytes())
+                while (sample := features.try_recv()) is not None:
+                    self._take_features(sample.payload.to_bytes())
+                for event in watch.poll():
+                    self._take_event(event)
+                    stale = True
+                if stale and now > info_due:
+                    stale, info_due = False, now + INFO_EVERY_S
+                    self._tell_info(client)
+                if self.watched.is_set() != (pictures is not None):
+                    if pictures is None:
+                        pictures = client.session.declare_subscriber(f"{prefix}/preview/*", RingChannel(8))
+                    else:
+                        pictures.undeclare()
+                        pictures = None
+                while pictures is not None and (sample := pictures.try_recv()) is not None:
+                    self._take_picture(sample)
+                if now - heard > SILENT_S:
+                    raise ClientError(f"cell {self.cell!r} has been silent for {SILENT_S:g} s")
+
+    def _take_state(self, client: Client, data: bytes) -> None:
+        state = read_message("state", data, StateMessage)
+        self._state = state
+        if state.model_epoch != self._epoch:
+            self._load_model(client, state.model_epoch)
+        predicted: dict[str, Any] = {}
+        scene = None
+        joints = np.array(list(state.joints.values()))
+        model = self.drag_model
+        if model is not None and joints.shape == model.model.zero.shape and np.isfinite(joints).all():
+            predicted = _by_camera(model, model.pixels(joints))
+            scene = None if self._scene is None else self._scene.at(joints)
+        self._tell("state", {"state": msgspec.Raw(data), "predicted": predicted, "scene": scene}, keep=True)
+
+    def _load_model(self, client: Client, epoch: int) -> None:
+        self._epoch = epoch
+        self.drag_model = self._scene = None
+        if epoch == 0:
+            return
+        try:
+            model = decode_model(client.query(client.keys.model))
+        except (ClientError, ModelFileError) as error:
+            self._tell("", {"notice": f"the model cannot be shown: {error}"})
+            return
+        limits = np.array([[joint.position_min, joint.position_max] for joint in self.info.joints])
+        self.drag_model = DragModel(model, limits)
+        self._scene = Scene.of(model)
+
+    def _take_features(self, data: bytes) -> None:
+        found = read_message("features", data, FeaturesMessage)
+        self._seen[found.camera] = found
+        self._tell(f"features {found.camera}", {"features": msgspec.Raw(data)})
+
+    def _take_event(self, event: EventMessage) -> None:
+        if event.kind in ENDS and (lease := self._leases.pop(event.id, None)) is not None:
+            lease.end()
+        self._tell("", {"event": event})
+
+    def _take_picture(self, sample: Any) -> None:
+        header = bytes(sample.attachment.to_bytes())
+        camera = str(sample.key_expr).rpartition("/")[2]
+        data = struct.pack("<I", len(header)) + header + sample.payload.to_bytes()
+        self._publish(f"picture {camera}", data, False)
+
+    def _tell_info(self, client: Client) -> None:
+        self.info = client.info()
+        self._tell("info", {"info": self.info}, keep=True)
+
+    def _tell(self, slot: str, tree: dict[str, Any], keep: bool = False) -> None:
+        self._publish(slot, msgspec.json.encode(tree), keep or slot == "link")
+
+    # -- commands ---------------------------------------------------------------------------------------------
+
+    @property
+    def client(self) -> Client:
+        """The live client. Raises LinkDownError."""
+        client = self._client
+        if client is None:
+            raise LinkDownError(self._why or "the daemon is not there")
+        return client
+
+    def joints(self) -> FloatArray:
+        """Joint positions (n,) of the newest state. Raises LinkDownError."""
+        if self._state is None:
+            raise LinkDownError("the cell has shown no state yet")
+        return np.array(list(self._state.joints.values()))
+
+    def dragged_goal(self, joints: FloatArray) -> Goal:
+        """The goal with the set-points of the posture ``joints`` (n,), of the markers that are seen now.
+
+        Raises LinkDownError, GeometryError.
+        """
+        model = self.drag_model
+        if model is None:
+            raise LinkDownError("there is no model; calibrate first")
+        set_points: dict[str, dict[int, tuple[float, float]]] = {}
+        for camera, pixels in zip(model.model.cameras, model.pixels(joints), strict=True):
+            seen = self._seen[camera.name].ids if camera.name in self._seen else ()
+            inside = (
+                np.isfinite(pixels).all(axis=1)
+                & (pixels > 0).all(axis=1)
+                & (pixels < [camera.width - 1, camera.height - 1]).all(axis=1)
+            )
+            found = {
+                marker: (float(u), float(v))
+                for marker, (u, v), there in zip(model.model.marker_ids, pixels, inside, strict=True)
+                if there and marker in seen
+            }
+            if len(found) < 3:
+                raise GeometryError(
+                    "too_few",
+                    f"camera {camera.name} would show {len(found)} of the markers that it sees now; three are needed: "
+                    "drag less far",
+                )
+            set_points[camera.name] = found
+        target = FeatureTarget(set_points, model.model.epoch)
+        return Client.make_goal(target, lease_s=LEASE_S)
+
+    def taught_goal(self, name: str) -> Goal:
+        """The goal that was taught as ``name``."""
+        return Client.make_goal(TaughtTarget(name), lease_s=LEASE_S)
+
+    def send(self, goal: Goal) -> Reply:
+        """Send a goal, and renew its lease until it ends or `end_leases`. Raises ClientError, LinkDownError."""
+        client = self.client
+        with self._leased(client, goal.id):
+            return client.request("goal", client.goal_key, encode(goal), GOAL_TIMEOUT_S)
+
+    def calibrate(self, check: bool) -> Reply:
+        """Begin a calibration, or a check motion; its events tell the rest. Raises ClientError, LinkDownError."""
+        client = self.client
+        command = Calibrate(Client.make_goal(TaughtTarget("x")).id, check=check, lease_s=LEASE_S)
+        with self._leased(client, command.id):
+            return client.command("calibrate", command)
+
+    @contextmanager
+    def _leased(self, client: Client, motion: str) -> Iterator[None]:
+        """Renew the lease of ``motion`` from now on, unless what is done within raises.
+
+        From before it is asked for: its end may be told before its acceptance is.
+        """
+        lease = self._leases[motion] = Lease(client, motion, LEASE_S)
+        try:
+            yield
+        except BaseException:
+            self._leases.pop(motion, None)
+            lease.end()
+            raise
+
+    def stop(self) -> Reply:
+        """Stop the arm, over a session of its own where the link is down. Raises ClientError, NotRunningError,
+        SessionError.
+        """
+        client = self._client
+        if client is not None:
+            return client.stop()
+        with self._connect() as fresh:
+            return fresh.stop()
+
+    def cancel(self) -> Reply:
+        """Cancel the active goal. Raises ClientError, LinkDownError."""
+        goal = "" if self._state is None else self._state.goal
+        if not goal:
+            raise LinkDownError("no goal is active")
+        return self.client.cancel(goal)
+
+    def end_leases(self) -> None:
+        """Renew no lease any more: what the page has started ends within `LEASE_S`."""
+        while self._leases:
+            with suppress(KeyError):
+                self._leases.popitem()[1].end()
+
+
+def _by_camera(model: DragModel, pixels: FloatArray) -> dict[str, dict[int, list[float]]]:
+    """Pixels (c, m, 2) by camera and marker; those that are not there are left out."""
+    return {
+        camera: {
+            marker: pixel.tolist()
+            for marker, pixel in zip(model.model.marker_ids, shown, strict=True)
+            if np.isfinite(pixel).all()
+        }
+        for camera, shown in zip(model.cameras, pixels, strict=True)
+    }
+
+
+def drag_answer(model: DragModel, joints: FloatArray, camera: str, left_px: float) -> dict[str, Any]:
+    """What a page draws of a dragged posture: pixels, and the epipolar lines of the body's middle."""
+    pixels = model.pixels(joints)
+    c = model.cameras.index(camera)
+    u, v = pixels[c].mean(axis=0).tolist()
+    lines = model.epipolar_lines(camera, (u, v))
+    return {
+        "pixels": _by_camera(model, pixels),
+        "lines": {name: line.tolist() for name, line in lines.items()},
+        "left_px": left_px,
+        "camera": camera,
+    }
+
+
+def refusal(error: Exception) -> dict[str, Any]:
+    """A failure as a page shows it, whole: text, problems and reasons."""
+    found: dict[str, Any] = {"ok": False, "message": str(error)}
+    if isinstance(error, RefusedError):
+        found["reply"] = error.reply
+    return found

@@ -1,0 +1,302 @@
+// The operators' page: what the cell publishes comes over one WebSocket, and what the page asks goes back over it. What
+// a page may do is decided on the server; the buttons only show it.
+
+import { drawPicture, drawPlot, drawScene, hull, inside } from "/drawing.js";
+
+const $ = (id) => document.getElementById(id);
+const views = new Map();
+const history = { error: [], velocity: [], loop: [] };
+const answers = new Map();
+const stats = (window.stats = { pictures: 0, latencies: [], answers: [], events: [] });
+stats.middle = (camera) => {
+  const pixels = views.get(camera)?.predicted ?? [];
+  return pixels.length ? [0, 1].map((i) => pixels.reduce((sum, p) => sum + p[i], 0) / pixels.length) : null;
+};
+let socket, number = 0, rights = {}, state, scene, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null;
+let drawDue = false;
+
+function view(camera) {
+  if (views.has(camera)) return views.get(camera);
+  const figure = document.createElement("figure"), canvas = document.createElement("canvas");
+  const caption = document.createElement("figcaption"), name = document.createElement("span"), note = document.createElement("span");
+  name.textContent = camera;
+  caption.append(name, note);
+  figure.append(canvas, caption);
+  canvas.dataset.camera = camera;
+  $("pictures").append(figure);
+  const made = { camera, canvas, note, width: 640, height: 480, image: null, features: [], ids: new Set(), predicted: [],
+    byMarker: {}, setPoints: [], path: [], draft: null, lines: null, drawn: 0 };
+  views.set(camera, made);
+  listen(made);
+  return made;
+}
+
+function redraw() {
+  if (drawDue) return;
+  drawDue = true;
+  requestAnimationFrame(() => {
+    drawDue = false;
+    for (const v of views.values()) drawPicture(v.canvas, v);
+  });
+}
+
+// -- the link ------------------------------------------------------------------------------------------------------
+
+function connect() {
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = ({ data }) => (typeof data === "string" ? take(JSON.parse(data)) : picture(data));
+  socket.onclose = () => {
+    banner("link", "The page's server does not answer. What it shows is old; stop the arm with `stereoservo stop` or the emergency stop.", true);
+    rights = {};
+    showRights();
+    for (const settle of answers.values()) settle({ ok: false, message: "the page's server does not answer" });
+    answers.clear();
+    setTimeout(connect, 1000);
+  };
+}
+
+function request(tree) {
+  return new Promise((settle) => {
+    if (socket.readyState !== WebSocket.OPEN) return settle({ ok: false, message: "the page's server does not answer" });
+    const n = ++number;
+    answers.set(n, settle);
+    socket.send(JSON.stringify({ ...tree, n }));
+  });
+}
+
+async function command(tree) {
+  const answer = await request(tree);
+  const lines = [answer.message || ""];
+  for (const problem of answer.reply?.problems ?? []) if (!answer.message.includes(problem)) lines.push(problem);
+  for (const reason of answer.reply?.reasons ?? []) if (reason.hint && !answer.message.includes(reason.hint)) lines.push(`${reason.code}: ${reason.hint}`);
+  banner("answer", `${tree.do}: ${lines.join("\n")}`, !answer.ok);
+  stats.answers.push([tree.do, answer.ok, lines.join("\n")]);
+  return answer;
+}
+
+function banner(id, text, bad) {
+  $(id).textContent = text;
+  $(id).hidden = !text;
+  $(id).className = `banner ${bad ? "bad" : "good"}`;
+}
+
+async function picture(buffer) {
+  const size = new DataView(buffer).getUint32(0, true);
+  const info = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+  const image = await createImageBitmap(new Blob([new Uint8Array(buffer, 4 + size)], { type: "image/jpeg" }));
+  const v = view(info.camera);
+  if (info.seq < v.seq && info.seq > v.seq - 100) return image.close();
+  v.image?.close();
+  Object.assign(v, { image, seq: info.seq, width: info.width, height: info.height });
+  const late = Date.now() - 1000 * info.t_wall;
+  stats.pictures += 1;
+  stats.latencies.push(late);
+  if (stats.latencies.length > 600) stats.latencies.shift();
+  v.note.textContent = `frame ${info.seq}, ${late.toFixed(0)} ms old, ${v.features.length} markers`;
+  redraw();
+}
+
+// -- what the cell says --------------------------------------------------------------------------------------------
+
+function take(message) {
+  if (message.answer) { answers.get(message.answer.n)?.(message.answer); answers.delete(message.answer.n); }
+  else if (message.rights) { rights = message.rights; showRights(); }
+  else if (message.state) showState(message);
+  else if (message.features) {
+    const { camera, ids, pixels } = message.features;
+    const v = view(camera);
+    v.features = ids.map((id, i) => [id, ...pixels[i]]);
+    v.ids = new Set(ids);
+    redraw();
+  } else if (message.info) showInfo(message.info);
+  else if (message.event) showEvent(message.event);
+  else if (message.goal) showPlan(message.goal.plan, `goal ${message.goal.id.slice(0, 8)}`);
+  else if ("up" in message) banner("link", message.up ? "" : `The daemon does not answer: ${message.why}`, true);
+  else if (message.notice) banner("answer", message.notice, true);
+}
+
+function showRights() {
+  $("cell").textContent = rights.cell ?? "stereoservo";
+  document.title = `${rights.cell ?? ""} stereoservo`;
+  $("commands").disabled = !rights.holds;
+  $("take").hidden = !rights.operator || rights.holds;
+  $("rights-text").textContent = rights.holds ? `This page holds the arm as ${rights.operator}.`
+    : !rights.operator ? "This page is read-only: it may stop the arm, nothing else."
+    : rights.taken ? `Another page holds the arm as ${rights.operator}; this one may stop it.`
+    : "Give the token that stands in the terminal to command the arm; stop works without.";
+}
+
+function badge(id, text, kind = "") { $(id).textContent = text; $(id).className = `badge ${kind}`; }
+
+function showState({ state: s, predicted, scene: shape }) {
+  state = s;
+  badge("lifecycle", s.dry_run ? `${s.lifecycle}, dry run` : s.lifecycle, { active: "good", fault: "bad" }[s.lifecycle]);
+  badge("model", `model ${s.model}`, { valid: "good", suspect: "warn" }[s.model]);
+  badge("error", s.error_px === null ? "no error" : `error ${s.error_px.toFixed(2)} px`);
+  badge("activity", s.goal ? `${s.source} ${s.progress === null ? "" : Math.round(100 * s.progress) + " %"}` : s.source);
+  const texts = s.reasons.map((r) => `${r.code}: ${r.hint}`).concat(s.notes, s.health.text && s.health.verdict !== "ok" ? [s.health.text] : []);
+  if ($("reasons").dataset.shown !== texts.join("\n")) {
+    $("reasons").dataset.shown = texts.join("\n");
+    $("reasons").replaceChildren(...(texts.length ? texts : ["none"]).map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  }
+  const t = s.t_ns * 1e-9;
+  joints = Object.keys(s.velocities);
+  history.error.push([t, s.error_px]);
+  history.velocity.push([t, ...Object.values(s.velocities)]);
+  history.loop.push([t, s.loop.lateness_us.p99 ?? null]);
+  for (const rows of Object.values(history)) if (rows.length > 1300) rows.splice(0, rows.length - 1300);
+  for (const [camera, markers] of Object.entries(predicted)) {
+    const v = view(camera);
+    v.byMarker = markers;
+    v.predicted = Object.entries(markers).filter(([id]) => !v.ids.size || v.ids.has(Number(id))).map(([, p]) => p);
+  }
+  scene = shape;
+  redraw();
+}
+
+function showInfo(info) {
+  for (const camera of info.cameras) Object.assign(view(camera.name), { width: camera.width, height: camera.height });
+  $("taught").replaceChildren(...info.taught.map((goal) => {
+    const button = document.createElement("button");
+    button.textContent = `Check “${goal.name}”`;
+    button.onclick = () => check(goal.name);
+    return button;
+  }));
+  redraw();
+}
+
+function showEvent(event) {
+  const item = document.createElement("li");
+  item.value = event.seq;
+  item.textContent = `${new Date(1000 * event.t_wall).toLocaleTimeString()} ${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)} ${event.message}`;
+  $("events").prepend(item);
+  while ($("events").childElementCount > 200) $("events").lastChild.remove();
+  stats.events.push([event.kind, event.id, event.error_px]);
+  const done = event.progress === null ? "" : ` (${Math.round(100 * event.progress)} %)`;
+  if (/^(calibrat|fit_|check|trial|zeros)/.test(event.kind)) {
+    const c = event.calibration;
+    $("calibration").textContent = c
+      ? `Calibrated: ${c.verdict}\nrms ${c.rms_px.toFixed(3)} px, ${c.images} images of ${c.joints} joints, stratum ${c.stratum}, grade ${c.grade}\n` +
+        Object.entries(c.per_joint_px).map(([name, px]) => `${name} ${px.toFixed(3)} px`).join(", ") + `\nmodel ${c.model}\nreport on the daemon's host: ${c.report}`
+      : event.check ? `Check of the model: ${event.message}` : `${event.kind.replaceAll("_", " ")}${done}: ${event.message}`;
+  }
+}
+
+function showPlan(plan, what) {
+  for (const v of views.values()) {
+    const shown = Object.values(plan?.pixels[v.camera] ?? {});
+    v.path = shown;
+    v.setPoints = shown.map((way) => way[way.length - 1]);
+  }
+  $("plan").textContent = plan
+    ? `${what}: law ${plan.law}, path ${plan.way}, ${plan.seconds.toFixed(1)} s\n` + plan.approaches
+      .map((a) => `${a.code} ${a.subject}: ${a.room.toPrecision(3)} ${a.unit} clear at ${Math.round(100 * a.share)} % of the path`).join("\n")
+    : `${what}: the law plans no path that could be shown`;
+  redraw();
+}
+
+// -- goals ---------------------------------------------------------------------------------------------------------
+
+async function check(name) {
+  const answer = await command(name ? { do: "check", name } : { do: "check" });
+  if (answer.ok) showPlan(answer.plan, `checked, nothing moves yet${name ? ` (${name})` : ""}`);
+}
+
+function pixelOf(v, event) {
+  const box = v.canvas.getBoundingClientRect();
+  return [((event.clientX - box.left) / box.width) * v.width - 0.5, ((event.clientY - box.top) / box.height) * v.height - 0.5];
+}
+
+function listen(v) {
+  v.canvas.onpointerdown = (event) => {
+    if (!rights.holds) return;
+    const p = pixelOf(v, event), margin = (14 * v.width) / v.canvas.clientWidth;
+    const onDraft = hasDraft && v.draft && inside(hull(v.draft), p, margin);
+    if (!onDraft && !inside(hull(v.predicted), p, margin)) return;
+    v.canvas.setPointerCapture(event.pointerId);
+    drag = { v, from: p, to: p, draft: onDraft, busy: false, ended: false };
+    event.preventDefault();
+  };
+  v.canvas.onpointermove = (event) => { if (drag?.v === v && !drag.ended) { drag.to = pixelOf(v, event); follow(drag); } };
+  v.canvas.onpointerup = v.canvas.onpointercancel = (event) => {
+    if (drag?.v !== v || drag.ended) return;
+    drag.to = pixelOf(v, event);
+    drag.ended = true;
+    follow(drag);
+  };
+}
+
+async function follow(d) {
+  // One request at a time: the newest position waits for the answer to the last one.
+  if (d.busy) return;
+  d.busy = true;
+  for (let sent = null; sent === null || sent.to !== d.to || sent.ended !== d.ended;) {
+    sent = { to: d.to, ended: d.ended };
+    await dragged({ camera: d.v.camera, shift: [d.to[0] - d.from[0], d.to[1] - d.from[1]], draft: d.draft, done: sent.ended });
+  }
+  d.busy = false;
+}
+
+async function dragged(tree) {
+  const answer = await request({ do: "drag", ...tree });
+  if (!answer.ok) return banner("answer", `drag: ${answer.message}`, true);
+  lastCamera = tree.camera;
+  hasDraft = true;
+  for (const v of views.values()) {
+    const markers = answer.pixels[v.camera] ?? {};
+    v.draft = Object.entries(markers).filter(([id]) => !v.ids.size || v.ids.has(Number(id))).map(([, p]) => p);
+    v.lines = answer.lines[v.camera] ?? null;
+    v.path = []; v.setPoints = [];
+  }
+  $("plan").textContent = answer.left_px > 0.5
+    ? `The arm cannot follow the drag all the way: ${answer.left_px.toFixed(1)} px are left in ${answer.camera}.` : "Dragged; check it, then go.";
+  if (tree.done) stats.dragged = answer;
+  redraw();
+}
+
+// By buttons: of the dragged outline, in the picture in which it was dragged last, or of the body in the first one.
+const changed = (change) => dragged({ camera: lastCamera ?? views.keys().next().value, shift: [0, 0], draft: hasDraft, done: true, ...change });
+
+async function go() {
+  const answer = await command({ do: "go" });
+  if (!answer.ok) return;
+  stats.goal = answer.id;
+  hasDraft = false;
+  for (const v of views.values()) v.draft = v.lines = null;
+  redraw();
+}
+
+// -- the controls --------------------------------------------------------------------------------------------------
+
+const stop = () => command({ do: "stop" });
+$("stop").onclick = stop;
+addEventListener("keydown", (event) => { if (event.key === "Escape") { event.preventDefault(); stop(); } });
+for (const button of document.querySelectorAll("[data-do]")) {
+  const verb = button.dataset.do;
+  button.onclick = () => command(verb === "check-model" ? { do: "calibrate", check: true } : { do: verb });
+}
+$("check").onclick = () => check();
+$("go").onclick = go;
+$("turn-left").onclick = () => changed({ turn: -Math.PI / 36 });
+$("turn-right").onclick = () => changed({ turn: Math.PI / 36 });
+$("nearer").onclick = () => changed({ nearer: 0.98 });
+$("farther").onclick = () => changed({ nearer: 1 / 0.98 });
+$("take").onsubmit = (event) => { event.preventDefault(); command({ do: "take", token: $("token").value.trim() }); $("token").value = ""; };
+$("teach").onsubmit = (event) => { event.preventDefault(); command({ do: "teach", name: $("teach-name").value }); };
+let orbit = null;
+$("scene").onpointerdown = (event) => { orbit = [event.clientX, event.clientY]; $("scene").setPointerCapture(event.pointerId); };
+$("scene").onpointermove = (event) => {
+  if (!orbit) return;
+  turn = [turn[0] + (event.clientX - orbit[0]) / 100, turn[1] + (event.clientY - orbit[1]) / 100];
+  orbit = [event.clientX, event.clientY];
+};
+$("scene").onpointerup = () => { orbit = null; };
+setInterval(() => {
+  drawPlot($("plot-error"), history.error, ["error"], true);
+  drawPlot($("plot-velocity"), history.velocity, joints, false);
+  drawPlot($("plot-loop"), history.loop, ["lateness"], false);
+  $("scene-box").hidden = !scene;
+  if (scene) drawScene($("scene"), scene, turn);
+}, 250);
+connect();

@@ -1,0 +1,141 @@
+"""What a page may ask of the server, as strict structs: one JSON object a WebSocket message, with ``do`` and a number
+``n`` that the answer repeats.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from stereoservo.messages.goals import Name
+from stereoservo.messages.wire import decode
+
+Number = Annotated[int, Meta(ge=0, le=2**53)]
+Offset = Annotated[float, Meta(ge=-1e5, le=1e5)]
+
+
+class Stop(msgspec.Struct, frozen=True, tag="stop", tag_field="do", forbid_unknown_fields=True):
+    """Stop the arm. Every page may."""
+
+    n: Number = 0
+
+
+class Take(msgspec.Struct, frozen=True, tag="take", tag_field="do", forbid_unknown_fields=True):
+    """Hold the arm, with the one-time token of the terminal."""
+
+    token: Annotated[str, Meta(max_length=200)]
+    n: Number = 0
+
+
+class Release(msgspec.Struct, frozen=True, tag="release", tag_field="do", forbid_unknown_fields=True):
+    """Hold the arm no longer."""
+
+    n: Number = 0
+
+
+class Enable(msgspec.Struct, frozen=True, tag="enable", tag_field="do", forbid_unknown_fields=True):
+    """Let the arm move."""
+
+    n: Number = 0
+
+
+class Disable(msgspec.Struct, frozen=True, tag="disable", tag_field="do", forbid_unknown_fields=True):
+    """Stop the arm and switch its drives off."""
+
+    n: Number = 0
+
+
+class Hold(msgspec.Struct, frozen=True, tag="hold", tag_field="do", forbid_unknown_fields=True):
+    """Decelerate and hold; the goal is kept."""
+
+    n: Number = 0
+
+
+class Resume(msgspec.Struct, frozen=True, tag="resume", tag_field="do", forbid_unknown_fields=True):
+    """Continue after hold or stop."""
+
+    n: Number = 0
+
+
+class Reset(msgspec.Struct, frozen=True, tag="reset", tag_field="do", forbid_unknown_fields=True):
+    """Leave a fault whose cause is gone."""
+
+    n: Number = 0
+
+
+class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="do", forbid_unknown_fields=True):
+    """Store what the cameras see as goal ``name``."""
+
+    name: Name
+    n: Number = 0
+
+
+class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="do", forbid_unknown_fields=True):
+    """Run the trial motions and fit a model; ``check``: the short check motion instead."""
+
+    check: bool = False
+    n: Number = 0
+
+
+class Drag(msgspec.Struct, frozen=True, tag="drag", tag_field="do", forbid_unknown_fields=True):
+    """Move the outline of the marker body in the picture of ``camera`` by ``shift`` [px] and ``turn`` [rad]; ``nearer``
+    multiplies its depth.
+
+    From where the last drag ended (``draft``) or from where the arm is. ``done``: the next drag goes on from here.
+    Nothing moves.
+    """
+
+    camera: Name
+    shift: tuple[Offset, Offset]
+    turn: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
+    nearer: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0
+    draft: bool = False
+    done: bool = False
+    n: Number = 0
+
+
+class Check(msgspec.Struct, frozen=True, tag="check", tag_field="do", forbid_unknown_fields=True):
+    """Plan the taught goal ``name``, or without one the dragged goal. Nothing moves."""
+
+    name: Name | None = None
+    n: Number = 0
+
+
+class Go(msgspec.Struct, frozen=True, tag="go", tag_field="do", forbid_unknown_fields=True):
+    """Send the goal that was checked last."""
+
+    n: Number = 0
+
+
+class Cancel(msgspec.Struct, frozen=True, tag="cancel", tag_field="do", forbid_unknown_fields=True):
+    """Cancel the active goal."""
+
+    n: Number = 0
+
+
+PageRequest = (
+    Stop
+    | Take
+    | Release
+    | Enable
+    | Disable
+    | Hold
+    | Resume
+    | Reset
+    | Teach
+    | Calibrate
+    | Drag
+    | Check
+    | Go
+    | Cancel
+)
+OPEN = (Stop, Take, Release)
+"""What a page may ask that does not hold the arm."""
+
+
+def decode_request(data: bytes) -> PageRequest:
+    """A page's request. Raises MessageError, whatever the bytes."""
+    kind: type[PageRequest] = PageRequest  # type: ignore[assignment]
+    return decode(data, kind)

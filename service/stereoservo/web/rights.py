@@ -1,0 +1,110 @@
+"""Who may do what through the page: host and origin of a request, the one-time token of an operator, and the one
+page that holds the arm. Everything is decided on the server, before a request goes anywhere.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import threading
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+
+
+class RightsError(Exception):
+    """A request that is not allowed; the text says why, and what would be."""
+
+
+def allowed_hosts(address: str, port: int) -> frozenset[str]:
+    """Values of the header ``Host`` that name this server, an address or name with its port."""
+    names = {*LOOPBACK, address} if address in ("localhost", "127.0.0.1", "::1") else {address}
+    names = {f"[{name}]" if ":" in name and not name.startswith("[") else name for name in names}
+    return frozenset({f"{name}:{port}" for name in names} | ({*names} if port in (80, 443) else set()))
+
+
+def check_host(host: str | None, allowed: frozenset[str]) -> None:
+    """Raises RightsError unless ``host`` names this server: another page's name may resolve to it (DNS rebinding)."""
+    if host is None or host.lower() not in allowed:
+        raise RightsError(f"Host {host!r} is not this server; {', '.join(sorted(allowed))} are")
+
+
+def check_origin(origin: str | None, host: str | None, secure: bool) -> None:
+    """Raises RightsError where a browser says that another page opens the WebSocket.
+
+    Programs send no ``Origin``; browsers always do.
+    """
+    if origin is None:
+        return
+    parts = urlsplit(origin)
+    if parts.scheme != ("https" if secure else "http") or parts.netloc.lower() != (host or "").lower():
+        raise RightsError(f"Origin {origin!r} is another page's; this server is {host!r}")
+
+
+class ArmHolder:
+    """Which page holds the arm: the one that has shown the token, until it is closed.
+
+    ``operator``: the name given with ``--operate``; None: nobody may hold it. ``announce``: called with each new token;
+    one is made at the start, and another as soon as one has been used, so that none works twice.
+    """
+
+    def __init__(self, operator: str | None, announce: Callable[[str], None]) -> None:
+        self.operator = operator
+        self._announce = announce
+        self._lock = threading.Lock()
+        self._token = ""
+        self._holder: object | None = None
+        if operator is not None:
+            self._renew()
+
+    def _renew(self) -> None:
+        self._token = secrets.token_urlsafe(12)
+        self._announce(self._token)
+
+    def take(self, page: object, token: str) -> None:
+        """Let ``page`` hold the arm. Raises RightsError: read-only, a wrong or used token, or another page holds it."""
+        with self._lock:
+            if self.operator is None:
+                raise RightsError(
+                    "this page is read-only; `stereoservo web CELL --operate NAME` lets one command"
+                )
+            if self._holder is page:
+                return
+            if self._holder is not None:
+                raise RightsError(
+                    f"another page holds the arm as {self.operator}; close it, or release it there"
+                )
+            if not hmac.compare_digest(self._token.encode(), token.encode()):
+                raise RightsError(
+                    "this token is wrong, or was used before; the newest stands in the terminal of `stereoservo web`"
+                )
+            self._holder = page
+            self._renew()
+
+    def release(self, page: object) -> bool:
+        """End ``page``'s hold; returns whether it had it."""
+        with self._lock:
+            had = self._holder is page
+            if had:
+                self._holder = None
+            return had
+
+    def holds(self, page: object) -> bool:
+        """Whether ``page`` holds the arm."""
+        return self._holder is page
+
+    @property
+    def taken(self) -> bool:
+        """Whether a page holds the arm."""
+        return self._holder is not None
+
+    def require(self, page: object, what: str) -> None:
+        """Raises RightsError unless ``page`` holds the arm."""
+        if self._holder is not page:
+            how = (
+                "this page is read-only and may stop the arm, nothing else"
+                if self.operator is None
+                else "this page does not hold the arm: give the token that stands in the terminal; stop works without"
+            )
+            raise RightsError(f"{what}: {how}")

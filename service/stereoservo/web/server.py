@@ -1,0 +1,368 @@
+"""The page's server: static files and one WebSocket, over which pages receive what the cell publishes and ask for what
+their rights allow. `docs/web.md` has the messages.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from stereoservo.client import ClientError, SessionError
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.messages.discovery import NotRunningError
+from stereoservo.messages.goals import Goal
+from stereoservo.messages.wire import MessageError, Reply
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.web import requests as ask
+from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, drag_answer, refusal
+from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
+
+FILES = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/drawing.js": ("drawing.js", "text/javascript; charset=utf-8"),
+    "/page.css": ("page.css", "text/css; charset=utf-8"),
+}
+FOLDER = Path(__file__).parent / "page"
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+MAX_PAGES = 16
+MAX_REQUEST_BYTES = 1 << 14
+MAX_WAITING = 512
+EVENTS_KEPT = 100
+CLOSING_S = 2.0
+PING_S = 5.0
+"""A page that does not answer for so long is closed; one that holds the arm then lets it stop."""
+EXPECTED = (
+    ClientError,
+    GeometryError,
+    LinkDownError,
+    MessageError,
+    NotRunningError,
+    RightsError,
+    SessionError,
+)
+
+
+class Page:
+    """One open page: what waits to be sent to it, and the goal that it is making."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, bytes] = {}
+        self.waiting: deque[bytes] = deque(maxlen=MAX_WAITING)
+        self.wake = asyncio.Event()
+        self.base: FloatArray | None = None
+        self.draft: FloatArray | None = None
+        self.checked: Goal | None = None
+
+    def put(self, slot: str, data: bytes) -> None:
+        """Queue a message; of one slot only the newest is kept."""
+        if slot:
+            self.newest[slot] = data
+        else:
+            self.waiting.append(data)
+        self.wake.set()
+
+    def tell(self, tree: Any) -> None:
+        """Queue a message that is not replaced."""
+        self.put("", msgspec.json.encode(tree))
+
+
+class PageServer:
+    """Serves pages of one cell. ``make_link``: makes the link to it, given what publishes to the pages.
+
+    ``operator``: the name under which one page may command the arm; None: none may. ``announce``: called with each new
+    token of that operator. Raises what ``make_link`` does.
+    """
+
+    def __init__(
+        self,
+        make_link: Callable[[Publish], CellLink],
+        operator: str | None,
+        announce: Callable[[str], None],
+    ) -> None:
+        self.holder = ArmHolder(operator, announce)
+        self._pages: set[Page] = set()
+        self._kept: dict[str, bytes] = {}
+        self._events: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._work = ThreadPoolExecutor(4, thread_name_prefix="page-command")
+        self._stops = ThreadPoolExecutor(4, thread_name_prefix="page-stop")
+        self._hosts: frozenset[str] = frozenset()
+        self._secure = False
+        self.link = make_link(self._publish)
+
+    async def start(self, address: str, port: int, tls: ssl.SSLContext | None = None) -> int:
+        """Listen; returns the port (given as 0: a free one). Raises OSError."""
+        self._loop = asyncio.get_running_loop()
+        self._secure = tls is not None
+        self._server: Server = await serve(
+            self._session,
+            address,
+            port,
+            ssl=tls,
+            process_request=self._static,
+            max_size=MAX_REQUEST_BYTES,
+            open_timeout=5.0,
+            close_timeout=1.0,
+            ping_interval=PING_S,
+            ping_timeout=PING_S,
+            compression=None,
+            server_header=None,
+        )
+        found: int = self._server.sockets[0].getsockname()[1]
+        self._hosts = allowed_hosts(address, found)
+        self.link.start()
+        return found
+
+    async def close(self) -> None:
+        """Close all pages, end their goals' leases, leave the daemon. Idempotent."""
+        self._server.close()
+        with suppress(TimeoutError):  # whoever keeps a connection open must not keep the server
+            await asyncio.wait_for(self._server.wait_closed(), CLOSING_S)
+        await asyncio.to_thread(self.link.close)
+        self._work.shutdown(wait=False, cancel_futures=True)
+        self._stops.shutdown(wait=False)
+
+    # -- HTTP ---------------------------------------------------------------------------------------------------
+
+    def _static(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The page's files; None lets a WebSocket open."""
+        hosts = request.headers.get_all("Host")
+        host = hosts[0] if len(hosts) == 1 else None
+        try:
+            check_host(host, self._hosts)
+            if request.path == "/socket":
+                origins = request.headers.get_all("Origin")
+                if len(origins) > 1:
+                    raise RightsError("more than one Origin")
+                check_origin(origins[0] if origins else None, host, self._secure)
+        except RightsError as error:
+            return _response(HTTPStatus.FORBIDDEN, f"{error}\n".encode())
+        if request.path == "/socket":
+            if len(self._pages) >= MAX_PAGES:
+                text = f"{MAX_PAGES} pages are open; close one\n"
+                return _response(HTTPStatus.SERVICE_UNAVAILABLE, text.encode())
+            return None
+        if request.path not in FILES:
+            return _response(HTTPStatus.NOT_FOUND, f"there are: {', '.join(FILES)}, /socket\n".encode())
+        name, kind = FILES[request.path]
+        return _response(HTTPStatus.OK, (FOLDER / name).read_bytes(), kind)
+
+    # -- WebSocket ----------------------------------------------------------------------------------------------
+
+    def _publish(self, slot: str, data: bytes, keep: bool) -> None:
+        """Called by the link's thread."""
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._spread, slot, data, keep)
+
+    def _spread(self, slot: str, data: bytes, keep: bool) -> None:
+        if keep:
+            self._kept[slot] = data
+        elif not slot:
+            self._events.append(data)
+        for page in self._pages:
+            page.put(slot, data)
+
+    async def _session(self, connection: ServerConnection) -> None:
+        page = Page()
+        self._pages.add(page)
+        self.link.watched.set()
+        self._tell_rights(page)
+        page.waiting.extend(self._events)
+        for slot, data in self._kept.items():
+            page.put(slot, data)
+        sender = asyncio.create_task(_send(connection, page))
+        tasks: set[asyncio.Task[None]] = set()
+        try:
+            async for message in connection:
+                task = asyncio.create_task(self._answer(page, message))
+                tasks.add(task)
+                task.add_done_callback(tasks.discard)
+                if len(tasks) > 8:
+                    await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        except ConnectionClosed:
+            pass
+        finally:
+            sender.cancel()
+            self._pages.discard(page)
+            if self.holder.release(page):
+                self.link.end_leases()
+                self._tell_all_rights()
+            if not self._pages:
+                self.link.watched.clear()
+
+    def _tell_rights(self, page: Page) -> None:
+        operator = self.holder.operator
+        page.tell(
+            {
+                "rights": {
+                    "operator": operator,
+                    "holds": self.holder.holds(page),
+                    "taken": self.holder.taken,
+                    "cell": self.link.cell,
+                }
+            }
+        )
+
+    def _tell_all_rights(self) -> None:
+        for page in self._pages:
+            self._tell_rights(page)
+
+    async def _answer(self, page: Page, message: str | bytes) -> None:
+        """Do what a page asks, as far as it may, and tell it how that went."""
+        n = 0
+        try:
+            request = ask.decode_request(message.encode() if isinstance(message, str) else message)
+            n = request.n
+            if not isinstance(request, ask.OPEN):
+                self.holder.require(page, str(request.__struct_config__.tag))
+            pool = self._stops if isinstance(request, ask.Stop) else self._work
+            assert self._loop is not None
+            answer = {"ok": True} | await self._loop.run_in_executor(pool, self._do, page, request)
+        except EXPECTED as error:
+            answer = refusal(error)
+        except Exception as error:  # told to the page; the next request is answered as usual
+            answer = {"ok": False, "message": f"the page's server failed: {type(error).__name__}: {error}"}
+        self._let_go_if_closed(page)
+        page.tell({"answer": {"n": n, **answer}})
+
+    def _let_go_if_closed(self, page: Page) -> None:
+        """What a page was still doing when it was closed must not outlive it."""
+        if page not in self._pages:
+            self.holder.release(page)
+            if not self.holder.taken:  # else its leases are another page's by now
+                self.link.end_leases()
+
+    def _do(self, page: Page, request: ask.PageRequest) -> dict[str, Any]:
+        """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
+        link = self.link
+        match request:
+            case ask.Stop():
+                return _told(link.stop())
+            case ask.Take():
+                self.holder.take(page, request.token)
+                self._rights_changed()
+                return {"message": f"this page holds the arm as {self.holder.operator}"}
+            case ask.Release():
+                if self.holder.release(page):
+                    link.end_leases()
+                self._rights_changed()
+                return {"message": "this page does not hold the arm"}
+            case ask.Enable():
+                link.client.enable()
+                return {"message": "enabled: the arm may move"}
+            case ask.Disable():
+                return _told(link.client.disable())
+            case ask.Hold():
+                return _told(link.client.hold())
+            case ask.Resume():
+                return _told(link.client.resume())
+            case ask.Reset():
+                link.client.reset()
+                return {"message": "the fault is cleared; enable switches on"}
+            case ask.Teach():
+                return {"message": link.client.teach(request.name).message}
+            case ask.Calibrate():
+                return _told(link.calibrate(request.check))
+            case ask.Cancel():
+                return _told(link.cancel())
+            case ask.Drag():
+                return self._drag(page, request)
+            case ask.Check():
+                return self._check(page, request)
+            case ask.Go():
+                return self._go(page)
+
+    def _rights_changed(self) -> None:
+        assert self._loop is not None
+        self._loop.call_soon_threadsafe(self._tell_all_rights)
+
+    def _drag(self, page: Page, request: ask.Drag) -> dict[str, Any]:
+        model = self.link.drag_model
+        if model is None:
+            raise LinkDownError("there is no model of the arm yet: calibrate first")
+        if not request.draft or page.draft is None:
+            page.draft = None
+            page.base = self.link.joints() if page.base is None else page.base
+        base = page.base if page.draft is None else page.draft
+        assert base is not None
+        found = model.dragged(base, request.camera, request.shift, request.turn, request.nearer)
+        page.checked = None
+        if request.done:
+            page.draft, page.base = found.joints, None
+        return drag_answer(model, found.joints, request.camera, found.left_px)
+
+    def _check(self, page: Page, request: ask.Check) -> dict[str, Any]:
+        page.checked = None
+        if request.name is not None:
+            goal = self.link.taught_goal(request.name)
+        elif page.draft is not None:
+            goal = self.link.dragged_goal(np.array(page.draft))
+        else:
+            raise LinkDownError("nothing was dragged yet: drag the outline of the body in a picture")
+        reply = self.link.client.check(goal)
+        page.checked = goal
+        return _told(reply) | {"plan": reply.plan}
+
+    def _go(self, page: Page) -> dict[str, Any]:
+        goal = page.checked
+        if goal is None:
+            raise LinkDownError("check the goal first: its path is shown before anything moves")
+        reply = self.link.send(goal)
+        page.checked = page.draft = page.base = None
+        plan = msgspec.json.encode({"goal": {"id": goal.id, "plan": reply.plan}})
+        self._publish("goal", plan, True)
+        return _told(reply) | {"id": goal.id}
+
+
+async def _send(connection: ServerConnection, page: Page) -> None:
+    """Send what waits for a page, the newest of each slot; one that reads slowly misses pictures, nothing else."""
+    try:
+        while True:
+            await page.wake.wait()
+            page.wake.clear()
+            while page.waiting or page.newest:
+                if page.waiting:
+                    await connection.send(page.waiting.popleft(), text=True)
+                else:
+                    slot = next(iter(page.newest))
+                    data = page.newest.pop(slot)
+                    await connection.send(data, text=not slot.startswith("picture "))
+    except ConnectionClosed:
+        return
+
+
+def _told(reply: Reply) -> dict[str, Any]:
+    return {"message": reply.message or "done"}
+
+
+def _response(status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=utf-8") -> Response:
+    headers = Headers(
+        {
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": POLICY,
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cache-Control": "no-store",
+            "Connection": "close",
+        }
+    )
+    return Response(status.value, status.phrase, headers, body)

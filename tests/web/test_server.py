@@ -1,0 +1,202 @@
+"""What the page's server lets through, over real sockets, to a link that notes it."""
+
+import asyncio
+import http.client
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Event, Thread
+from typing import Any, cast
+
+import msgspec
+import pytest
+
+pytest.importorskip("websockets", reason="the page's server needs websockets (extra web)")
+
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from stereoservo.messages.goals import Goal
+from stereoservo.messages.wire import Reply
+from stereoservo.web.cell_link import CellLink
+from stereoservo.web.requests import PageRequest
+from stereoservo.web.server import PageServer
+
+VERBS = [kind.__struct_config__.tag for kind in PageRequest.__args__]
+
+
+class NotedClient:
+    """Notes the name of every method that is called."""
+
+    def __init__(self, calls: list[str]) -> None:
+        self._calls = calls
+
+    def __getattr__(self, name: str) -> Callable[..., Reply]:
+        def call(*arguments: Any, **named: Any) -> Reply:
+            self._calls.append(name)
+            return Reply(True, name)
+
+        return call
+
+
+class NotedLink(NotedClient):
+    """A `CellLink` without a cell."""
+
+    cell = "noted"
+    drag_model = None
+
+    def __init__(self, calls: list[str]) -> None:
+        super().__init__(calls)
+        self.client = NotedClient(calls)
+        self.watched = Event()
+        self.ended = 0
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def end_leases(self) -> None:
+        self.ended += 1
+
+    def taught_goal(self, name: str) -> Goal:
+        return cast(Goal, None)
+
+
+@contextmanager
+def serving(operator: str | None) -> Iterator[tuple[int, list[str], list[str], NotedLink]]:
+    """A server in a thread: its port, the calls that reach the cell, the tokens, its link."""
+    calls: list[str] = []
+    tokens: list[str] = []
+    link = NotedLink(calls)
+    server = PageServer(lambda publish: cast(CellLink, link), operator, tokens.append)
+    loop = asyncio.new_event_loop()
+    thread = Thread(target=loop.run_forever, daemon=True)
+    thread.start()
+    try:
+        port = asyncio.run_coroutine_threadsafe(server.start("127.0.0.1", 0), loop).result(10)
+        yield port, calls, tokens, link
+    finally:
+        asyncio.run_coroutine_threadsafe(server.close(), loop).result(10)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+def answer(page: ClientConnection, request: Any, n: int) -> dict[str, Any]:
+    """The answer number ``n`` to a request; other messages are passed over."""
+    page.send(
+        request if isinstance(request, str | bytes) else msgspec.json.encode({**request, "n": n}).decode()
+    )
+    while True:
+        message = msgspec.json.decode(page.recv(timeout=10))
+        if message.get("answer", {}).get("n") == n:
+            return cast(dict[str, Any], message["answer"])
+
+
+def fuzzed(rng: random.Random) -> str | bytes:
+    """A request: valid, of a wrong shape, or bytes; never a valid stop."""
+    verb = rng.choice([verb for verb in VERBS if verb != "stop"])
+    tree: dict[str, Any] = {"do": verb, "n": 0}
+    fields: dict[str, Any] = {
+        "token": rng.choice(["", "x" * 16, "\u0000", "ann"]), "name": rng.choice(["park", "../x", "", None, "*"]),
+        "check": rng.random() < 0.5, "camera": rng.choice(["left", "*", 3]),
+        "shift": rng.choice([[1, 2], [1e9, 0], "x"]),
+        "turn": rng.choice([0.1, 1e308]),
+        "draft": True, "done": True, "operator": "ann", "holds": True, "page": 1,
+    }  # fmt: skip
+    for key in rng.sample(sorted(fields), rng.randint(0, 3)):
+        tree[key] = fields[key]
+    if verb in ("take", "teach", "drag") and rng.random() < 0.5:
+        tree |= {
+            "take": {"token": "guess"},
+            "teach": {"name": "a"},
+            "drag": {"camera": "left", "shift": [1, 1]},
+        }[verb]
+    data = bytearray(msgspec.json.encode(tree))
+    match rng.randint(0, 5):
+        case 0:
+            data[rng.randrange(len(data))] = rng.randrange(256)
+            return bytes(data)
+        case 1:
+            return bytes(data[: rng.randrange(len(data))])
+        case 2:
+            return b"[" * rng.randint(1, 4000)
+        case _:
+            return data.decode()
+
+
+def test_a_thousand_fuzzed_requests_of_a_read_only_page_command_nothing_but_stop() -> None:
+    rng = random.Random(18)
+    with serving(None) as (port, calls, _, _), connect(f"ws://127.0.0.1:{port}/socket") as page:
+        for k in range(1000):
+            page.send(fuzzed(rng))
+            if k % 50 == 49:  # the server answers each, and goes on
+                assert answer(page, {"do": "stop"}, k)["ok"]
+        refused = answer(page, {"do": "enable"}, 5000)
+        assert not refused["ok"]
+        assert "read-only" in refused["message"]
+        assert set(calls) == {"stop"}
+        assert len(calls) == 20
+
+
+def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
+    with serving("ann") as (port, calls, tokens, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
+        requests = [
+            {
+                "do": verb,
+                **{"teach": {"name": "a"}, "drag": {"camera": "left", "shift": [0, 0]}}.get(verb, {}),
+            }
+            for verb in VERBS
+            if verb not in ("stop", "take", "release")
+        ]
+        for n, request in enumerate(requests, 1):
+            assert "does not hold the arm" in answer(page, request, n)["message"]
+        assert calls == []
+        assert answer(page, {"do": "take", "token": tokens[0]}, 100)["ok"]
+        for n, verb in enumerate(("enable", "hold", "resume", "disable"), 200):
+            assert answer(page, {"do": verb}, n)["ok"]
+        assert calls == ["enable", "hold", "resume", "disable"]
+        assert "check the goal first" in answer(page, {"do": "go"}, 300)["message"]
+        assert (
+            "calibrate first"
+            in answer(page, {"do": "drag", "camera": "left", "shift": [0, 0]}, 301)["message"]
+        )
+        with connect(f"ws://127.0.0.1:{port}/socket") as other:
+            assert "another page holds" in answer(other, {"do": "take", "token": tokens[1]}, 1)["message"]
+            assert answer(other, {"do": "stop"}, 2)["ok"]
+            page.close()  # whoever holds the arm and goes lets it rest
+            for n in range(3, 200):
+                if answer(other, {"do": "take", "token": tokens[1]}, n)["ok"]:
+                    break
+            assert answer(other, {"do": "hold"}, 500)["ok"]
+            assert link.ended >= 1
+
+
+def test_other_hosts_origins_and_paths_get_nothing() -> None:
+    with serving(None) as (port, calls, _, _):
+        for headers, path, status in (
+            ({}, "/", 200),
+            ({}, "/page.js", 200),
+            ({"Host": "evil.example"}, "/", 403),
+            ({}, "/../server.py", 404),
+            ({}, "/page/index.html", 404),
+        ):
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            connection.request("GET", path, headers=headers)
+            response = connection.getresponse()
+            assert response.status == status, path
+            assert "default-src 'none'" in (response.headers["Content-Security-Policy"] or "")
+            connection.close()
+        for origin in ("http://evil.example", "null"):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(f"ws://127.0.0.1:{port}/socket", origin=origin)
+            assert refused.value.response.status_code == 403
+        assert calls == []
+
+
+def test_the_page_loads_nothing_from_elsewhere() -> None:
+    from stereoservo.web.server import FILES, FOLDER
+
+    assert {name for name, _ in FILES.values()} == {path.name for path in FOLDER.iterdir()}
+    for path in FOLDER.iterdir():
+        assert "://" not in path.read_text().replace('"wss" : "ws"}://', "")
