@@ -10,6 +10,8 @@ import pytest
 
 from stereoservo.core import monitor
 from stereoservo.core.cycle import ModelUpdate
+from stereoservo.core.estimate import workspace
+from stereoservo.core.ingest import _has_shape
 from stereoservo.core.monitors import collision
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings, CoreSettings
@@ -54,16 +56,17 @@ def fly(
     step_ns: int = STEP_NS,
 ) -> list[tuple[int, Any]]:
     """Feed samples (t, n) to the watch while every joint is commanded to move, the first after a gap; the reasons."""
-    limits = collision.collision_thresholds(settings, None)
+    room = workspace(settings, None)
     count = len(efforts if efforts is not None else following)  # type: ignore[arg-type]
     found = []
     for k in range(count):
         state.command = np.full(N, command)
         sample = JointState(
-            k, state.block.loads_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
+            k, state.block.numbers.loads_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
         )  # fmt: skip
-        reason = monitor.detect_collision(state, settings, limits, sample)
+        _has_shape(sample, room.sample)
+        reason = monitor.detect_collision(state, settings, room, sample)
         if reason is not None:
             found.append((k, reason))
     return found
@@ -158,10 +161,7 @@ def test_a_long_silence_of_the_drives_is_no_contact(settings: CoreSettings) -> N
 def test_drives_that_tell_nothing_are_not_watched(settings: CoreSettings) -> None:
     state = enabled(settings)
     sample = JointState(1, 1, np.zeros(N), np.zeros(N))
-    assert (
-        monitor.detect_collision(state, settings, collision.collision_thresholds(settings, None), sample)
-        is None
-    )
+    assert monitor.detect_collision(state, settings, workspace(settings, None), sample) is None
     assert state.efforts is None
     assert state.following_errors is None
     lags = np.zeros((40, N))
@@ -345,7 +345,7 @@ def test_efforts_are_learnt_where_one_joint_moves_alone(bench: Any, speed: float
 @pytest.mark.parametrize(("former", "now"), [("1", "2"), ("2", "1")])
 def test_loads_of_other_trials_are_not_these_trials_loads(bench: Any, former: str, now: str) -> None:
     state = initial_state(bench.settings)
-    state.block.tells_efforts = 1
+    state.block.numbers.tells_efforts = 1
     collision.learn_loads(former, state, np.full(N, 0.9), 10.0 * GRAVITY, np.zeros(N))
     assert collision.learnt_loads(former, state) is not None
     assert collision.learnt_loads(now, state) is None

@@ -510,13 +510,16 @@ def test_a_state_of_version_6_is_taken_up(bench: Any) -> None:
     old["version"] = 6
     data = msgspec.msgpack.encode(old)
     taken = decode_state(data)
-    assert taken.block.last_step_ns == 0
+    assert taken.block.numbers.last_step_ns == 0
     assert len(taken.refused_frames) == len(state.cameras)
     for name in later:
         setattr(taken, name, getattr(state, name))
     for name in in_block:
         getattr(taken.block, name)[:] = getattr(state.block, name)
-    taken.block.last_step_ns, taken.block.silence_known = state.block.last_step_ns, state.block.silence_known
+    taken.block.numbers.last_step_ns, taken.block.numbers.silence_known = (
+        state.block.numbers.last_step_ns,
+        state.block.numbers.silence_known,
+    )
     assert encode_state(taken) == encode_state(state)
     assert is_recorded(state, data)
     state.command[0] += 1e-9

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.core.estimate import workspace
 from stereoservo.core.monitor import detect_following_error
 from stereoservo.core.monitors.following import PLAY, SILENCE_S
 from stereoservo.core.servo_core import ServoCore
@@ -28,11 +29,12 @@ def watched(
     steps, and when. ``state``: what it remembers.
     """
     state = initial_state(settings) if state is None else state
+    room = workspace(settings, None)
     for k, command in enumerate(commands):
         q = np.zeros(len(settings.joint_names))
         q[0] = readings[k - k % every]
-        state.block.last_joints_ns = 1 + k - k % every
-        reason = detect_following_error(state, settings, q, DT_S)
+        state.block.numbers.last_joints_ns = 1 + k - k % every
+        reason = detect_following_error(state, settings, room, q, DT_S)
         if reason is not None:
             return reason, k
         state.command = np.zeros_like(q)
@@ -144,24 +146,24 @@ def test_a_healthy_rail_is_not_blamed(bench):
 
 
 def test_without_new_samples_nothing_is_concluded(bench):
-    state, q = initial_state(bench.settings), np.zeros(6)
-    state.block.last_joints_ns = 1
+    state, room, q = initial_state(bench.settings), workspace(bench.settings, None), np.zeros(6)
+    state.block.numbers.last_joints_ns = 1
     for _ in range(100):  # 0.4 s at 1 rad/s
-        assert detect_following_error(state, bench.settings, q, DT_S) is None
+        assert detect_following_error(state, bench.settings, room, q, DT_S) is None
         state.command = np.eye(6)[0]
     q[0] = 99 * DT_S
-    state.block.last_joints_ns = 2
+    state.block.numbers.last_joints_ns = 2
     state.command = np.zeros(6)
-    assert detect_following_error(state, bench.settings, q, DT_S) is None
+    assert detect_following_error(state, bench.settings, room, q, DT_S) is None
     assert np.abs(state.block.missing_travel).max() < 1e-9
 
 
 def test_what_was_missing_before_a_long_gap_is_forgotten(bench):
-    state, q = initial_state(bench.settings), np.zeros(6)
+    state, room, q = initial_state(bench.settings), workspace(bench.settings, None), np.zeros(6)
     state.block.missing_travel[0] = 0.14
     for k, dt_s in enumerate((DT_S, 3.0)):
-        state.block.last_joints_ns = 1 + k
-        assert detect_following_error(state, bench.settings, q, dt_s) is None
+        state.block.numbers.last_joints_ns = 1 + k
+        assert detect_following_error(state, bench.settings, room, q, dt_s) is None
     assert not state.block.missing_travel.any()
 
 

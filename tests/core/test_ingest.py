@@ -74,7 +74,8 @@ def kept(bench: Any) -> tuple[Any, ...]:
     state = bench.core.state
     return (
         state.history.count, state.history.t_ns.tobytes(), state.history.positions.tobytes(),
-        state.velocities.tobytes(), state.last_joints_ns, state.block.last_joints_seq, state.block.loads_ns,
+        state.velocities.tobytes(), state.last_joints_ns, state.block.numbers.last_joints_seq,
+        state.block.numbers.loads_ns,
     )  # fmt: skip
 
 

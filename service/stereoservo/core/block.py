@@ -9,6 +9,7 @@ part it from the record.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -42,11 +43,34 @@ MOST = {
     "past": steps_of_delay(MAX_RATE_HZ),
 }
 """Counts of the largest cell: ``window`` samples of the watch on contact, and steps of the ``past``."""
-NUMBERS: dict[str, type[int] | type[float]] = {
-    "last_step_ns": int, "last_joints_ns": int, "last_joints_seq": int, "last_followed_ns": int, "history_count": int,
-    "followed": int, "silence_known": int, "delay_steps": int, "loads_ns": int, "leave_s": float,
-    "tells_efforts": int, "tells_following": int,
-}  # fmt: skip
+
+
+class Numbers(ctypes.Structure):
+    """The numbers at the head of a record: the counts, and what is no array. Read and written like attributes."""
+
+    joints: int
+    cameras: int
+    markers: int
+    window: int
+    past: int
+    last_step_ns: int
+    last_joints_ns: int
+    last_joints_seq: int
+    last_followed_ns: int
+    history_count: int
+    followed: int
+    silence_known: int
+    delay_steps: int
+    loads_ns: int
+    leave_s: float
+    tells_efforts: int
+    tells_following: int
+    _fields_ = [
+        (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
+        for name, kind in __annotations__.items()
+    ]
+
+
 JOINTS = ("joints",)
 Shapes = Mapping[str, tuple[str | int, ...]]
 ARRAYS: Shapes = {
@@ -61,23 +85,19 @@ ARRAYS: Shapes = {
     "contact_low": (2, "joints"), "contact_high": (2, "joints"), "efforts": JOINTS, "following_errors": JOINTS,
     "innovation": ("cameras", "markers", 2), "sigma": ("cameras", "markers"), "seen_ns": ("cameras", "markers"),
 }  # fmt: skip
-INTEGERS = ("history_ns", "seen_ns")
-"""Arrays of int64; the others are of float64."""
+OTHER_TYPES: dict[str, Any] = {"history_ns": np.int64, "seen_ns": np.int64}
+"""Of arrays that are not of float64."""
 SIGHTS = ("innovation", "sigma", "seen_ns")
 """Arrays that are written out with the cameras whose rows they are."""
 
 
-def packed_type(
-    arrays: Shapes,
-    numbers: Mapping[str, type[int] | type[float]],
-    integers: tuple[str, ...],
-) -> np.dtype[Any]:
-    """The type of a record with room for ``arrays`` of the largest cell, ``numbers`` and all `MOST`."""
-    fields: list[Any] = [(name, np.int64) for name in MOST]
-    fields += [(name, np.int64 if kind is int else np.float64) for name, kind in numbers.items()]
-    for name, shape in arrays.items():
-        size = math.prod(shape_of(shape, MOST))
-        fields.append((name, np.int64 if name in integers else np.float64, (size,)))
+def packed_type(numbers: type[ctypes.Structure], arrays: Shapes, others: Mapping[str, Any]) -> np.dtype[Any]:
+    """The type of a record of ``numbers`` and room for the ``arrays`` of the largest cell, of float64 or ``others``."""
+    fields: list[Any] = [(name, np.dtype(kind)) for name, kind, *_ in numbers._fields_]
+    fields += [
+        (name, others.get(name, np.float64), (math.prod(shape_of(shape, MOST)),))
+        for name, shape in arrays.items()
+    ]
     return np.dtype(fields, align=True)
 
 
@@ -95,7 +115,7 @@ def views(record: np.ndarray[Any, Any], arrays: Shapes, counts: Mapping[str, int
     return found
 
 
-BLOCK = packed_type(ARRAYS, NUMBERS, INTEGERS)
+BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES)
 
 
 class Block:
@@ -122,14 +142,8 @@ class Block:
     """
 
     record: np.ndarray[Any, Any]
-    numbers: dict[str, np.ndarray[Any, Any]]
-    counts: dict[str, int]
+    numbers: Numbers
     delays: DriveDelays
-    last_step_ns: int
-    last_joints_ns: int
-    last_joints_seq: int
-    last_followed_ns: int
-    history_count: int
     history_ns: IntArray
     history_positions: FloatArray
     velocities: FloatArray
@@ -137,13 +151,10 @@ class Block:
     correction: FloatArray
     missing_travel: FloatArray
     untold_travel: FloatArray
-    followed: int
     last_positions: FloatArray
-    silence_known: int
     silent_from: FloatArray
     silent_travel: FloatArray
     silent_s: FloatArray
-    delay_steps: int
     delay_s: FloatArray
     delay_samples: FloatArray
     delay_onset: FloatArray
@@ -153,91 +164,80 @@ class Block:
     delay_under_way: FloatArray
     delay_accounted: FloatArray
     delay_missing: FloatArray
-    loads_ns: int
-    leave_s: float
     mean_efforts: FloatArray
     effort_excess: FloatArray
     following_excess: FloatArray
     contact_low: FloatArray
     contact_high: FloatArray
-    tells_efforts: int
     efforts: FloatArray
-    tells_following: int
     following_errors: FloatArray
     innovation: FloatArray
     sigma: FloatArray
     seen_ns: IntArray
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Nothing known, in a cell with these ``counts``."""
-        beyond = [
-            f"{count} {name}, {MOST[name]} are possible"
-            for name, count in counts.items()
-            if count > MOST[name]
-        ]
-        if beyond:
-            raise ValueError(f"a cell with {'; '.join(beyond)}")
-        self.__dict__["record"] = np.zeros(1, BLOCK)
-        self.__dict__["numbers"] = {name: self.record[name] for name in NUMBERS}
+        """Nothing known, in a cell with these ``counts``. Raises ValueError."""
+        for name, most in MOST.items():
+            if not 0 <= counts[name] <= most:
+                raise ValueError(f"{counts[name]} {name}; {most} are possible")
+        keep = self.__dict__
+        keep["record"] = np.zeros(1, BLOCK)
+        keep["numbers"] = Numbers.from_buffer(self.record.view(np.uint8).data)
         self._count(counts)
-        self.last_joints_seq = -1
+        self.numbers.last_joints_seq = -1
         self.delay_samples[:] = np.nan
         self.sigma[:] = 1.0
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name not in NUMBERS:
-            raise AttributeError(f"{name} of the block is a view of its record: write into it")
-        self.numbers[name][0] = value
+        raise AttributeError(f"{name} of the block is a view of its record: write into it")
 
     def _count(self, counts: Mapping[str, int]) -> None:
-        self.__dict__["counts"] = dict(counts)
-        for name, count in counts.items():
-            self.record[name] = count
+        for name in MOST:
+            setattr(self.numbers, name, counts[name])
         self.__dict__.update(views(self.record, ARRAYS, counts))
         self.__dict__["delays"] = DriveDelays(
             self.delay_s, self.delay_samples, self.delay_onset, self.delay_sent, self.delay_past, self.delay_velocity,
             self.delay_under_way, self.delay_accounted, self.delay_missing,
         )  # fmt: skip
 
+    def counts(self) -> dict[str, int]:
+        """Of each of `MOST`, how many the cell has."""
+        return {name: getattr(self.numbers, name) for name in MOST}
+
     def begin_sights(self, markers: int) -> None:
         """Sights of so many markers, none of which is seen yet."""
-        self._count({**self.counts, "markers": markers})
+        self._count({**self.counts(), "markers": markers})
         self.innovation[:], self.sigma[:], self.seen_ns[:] = 0.0, 1.0, 0
 
     def remember_steps(self, past: int) -> None:
         """Room for so many steps of the past, of which nothing is known."""
-        self._count({**self.counts, "past": past})
+        self._count({**self.counts(), "past": past})
         self.delay_past[:] = 0.0
 
     def kept(self) -> dict[str, Any]:
-        """All that is to be written out but the `SIGHTS`, by name: counts, numbers, and arrays."""
+        """All that is to be written out but the `SIGHTS`, by name: numbers, then arrays."""
         return {
-            "counts": self.counts,
-            **{name: getattr(self, name) for name in NUMBERS},
+            **{name: getattr(self.numbers, name) for name, *_ in Numbers._fields_},
             **{name: getattr(self, name) for name in ARRAYS if name not in SIGHTS},
         }
 
 
 def restored(kept: Mapping[str, Any]) -> Block:
-    """The block of which `Block.kept` wrote ``kept``; what it does not name is as in the beginning. Raises KeyError,
-    ValueError, TypeError where it is none.
+    """The block of which `Block.kept` wrote ``kept``; what it does not name is as in the beginning. Raises ValueError,
+    TypeError where it is none.
     """
-    counts = kept["counts"]
-    block = Block({name: int(counts[name]) for name in MOST})
-    for name, value in kept.items():
-        if name in NUMBERS:
-            setattr(block, name, NUMBERS[name](value))
-        elif name in ARRAYS:
-            array = getattr(block, name)
-            if value.shape != array.shape:
-                raise ValueError(f"{name} of shape {value.shape}; {array.shape} is needed")
-            array[:] = value
+    counts = {name: kept.get(name) for name in MOST}
+    if not all(isinstance(count, int) for count in counts.values()):
+        raise ValueError(f"a block with counts {counts}")
+    block = Block(counts)  # type: ignore[arg-type]
+    for name, *_ in Numbers._fields_:
+        if name in kept:
+            setattr(block.numbers, name, kept[name])
+    for name in ARRAYS:
+        if name not in kept:
+            continue
+        array, value = getattr(block, name), kept[name]
+        if not isinstance(value, np.ndarray) or value.shape != array.shape or value.dtype != array.dtype:
+            raise ValueError(f"{name} that is no {array.dtype} of shape {array.shape}")
+        array[:] = value
     return block
-
-
-def _number(name: str) -> property:
-    return property(lambda block: block.numbers[name].item())
-
-
-for _name in NUMBERS:
-    setattr(Block, _name, _number(_name))

@@ -18,7 +18,7 @@ from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays, model_arrays, require_fitting
 from stereoservo.core.monitor_state import MOVED, CameraTiming, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
-from stereoservo.core.monitors.collision import collision_thresholds
+from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
 from stereoservo.core.monitors.diagnosis import start_model_monitor
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
@@ -42,6 +42,7 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CameraEstimate, CoreState, JointHistory, camera_estimate, share_sights
+from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
@@ -54,19 +55,25 @@ AT_REST = 1e-3
 
 def estimate(context: StepContext) -> StepContext:
     """The context with the present in it: model, prediction, weights and pixels of the markers."""
-    _take_model(context)
-    for camera, observation in _new_frames(context):
+    if context.inputs.model_update is not None or context.state.pending_model is not None:
+        _take_model(context)
+    for sighting in context.state.watching.sightings:
+        sighting.fresh = False
+    for camera, observation in context.ingested.observations:
         _fold_frame(camera, observation, context)
+    context.observations = tuple([observation for _, observation in context.ingested.observations])
     arrays, state = context.derived.arrays, context.state
-    if arrays is None or state.block.history_count == 0:
+    if arrays is None or state.block.numbers.history_count == 0:
         return context
     context.arrays = arrays
-    context.prediction, context.weights, context.pixels = present(
-        arrays, context.q, state.block, context.now_ns, context.settings.limits.coast_s
-    )
+    room = context.derived.room
+    present(state.block.record, room.record, context.q, context.now_ns)
+    context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
     if any(state.mobile):
         context = moving_camera.step(context)
-        context.derived.arrays = context.arrays
+        if context.arrays is not arrays:
+            assert context.arrays is not None
+            context.derived.use(context.arrays)
     return context
 
 
@@ -127,10 +134,12 @@ def _await_model(update: ModelUpdate, context: StepContext) -> None:
 def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = ()) -> None:
     """Put a model in use. ``masked``: markers that have slipped and stay unused."""
     state, settings = context.state, context.settings
-    arrays = context.derived.arrays = model_arrays(model, settings)
+    arrays = model_arrays(model, settings)
+    context.derived.use(arrays)
     start_model_monitor(state, arrays, settings, masked)
     state.model = model
-    context.derived.load_limits = load_limits(settings, model)
+    loads = context.derived.load_limits = load_limits(settings, model)
+    context.derived.room.limit_loads(loads)
     state.readiness = fitted_readiness(model)
     offsets = stated_offsets(model)
     state.cameras = [
@@ -152,16 +161,12 @@ def load_limits(settings: CoreSettings, model: CellModel | None) -> tuple[FloatA
     return collision_thresholds(settings, None if model is None else model.loads)
 
 
+def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
+    """Room for the steps of a core, with the constants of the cell, and the limits of what ``model`` says of loads."""
+    return Workspace(settings, load_limits(settings, model), stated_thresholds(settings))
+
+
 # -- frames -------------------------------------------------------------------------------------------------
-
-
-def _new_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], ...]:
-    """The frames of this step; the model monitor's cameras await them."""
-    for sighting in context.state.watching.sightings:
-        sighting.fresh = False
-    found = context.ingested.observations
-    context.observations = tuple(observation for _, observation in found)
-    return found
 
 
 def _fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law import Scene
-from stereoservo.core.block import Block
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.monitor_state import CameraMonitor, ModelMonitor
 from stereoservo.core.state import CameraEstimate, JointHistory, ServoGoal
@@ -28,7 +27,7 @@ from stereoservo.kinematics.kernels import (
     triangulate,
     undistort_pixel,
 )
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
@@ -252,22 +251,22 @@ LARGE_CORRECTION = 3e-3
 FURTHER_STEPS = 3
 
 
-def present(
-    arrays: ModelArrays, q: FloatArray, block: Block, now_ns: int, coast_s: float
-) -> tuple[Prediction, FloatArray, FloatArray]:
-    """The present at ``q`` (n,): the markers by kinematics, the weights (c, m) and pixels (c, m, 2) of what the cameras
-    saw of late; into the ``block``, the correction (n,) of the joints; see `_present`.
+@kernel
+def present(block: Record, room: Record, q: FloatArray, now_ns: int) -> None:
+    """Into the ``room``, the present at ``q`` (n,): the markers by kinematics, the weights and pixels of what the
+    cameras saw of late; into the ``block``, the correction of the joints. See `_present`.
     """
-    n, (cameras, markers) = q.size, block.sigma.shape
-    prediction = room(n, cameras, markers)
-    weights, pixels = np.empty((cameras, markers)), np.empty((cameras, markers, 2))
+    state, work = block[0], room[0]
+    n, c, m = state.joints, state.cameras, state.markers
     _present(
-        arrays.generators, arrays.kinds, arrays.zero, q, arrays.tip_first, arrays.marker_points, arrays.matrices,
-        block.innovation, block.sigma, block.seen_ns, now_ns, int(coast_s * 1e9) + SEEN_SLACK_NS,
-        prediction.operators, prediction.points, prediction.pixels,
-        prediction.jacobian, weights, pixels, block.correction,
+        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], q, work.tip_first != 0,
+        work.marker_points[: 4 * m].reshape((m, 4)), work.matrices[: 12 * c].reshape((c, 3, 4)),
+        state.innovation[: 2 * c * m].reshape((c, m, 2)), state.sigma[: c * m].reshape((c, m)),
+        state.seen_ns[: c * m].reshape((c, m)), now_ns, work.lasting_ns, work.operators[: 16 * n].reshape((n, 4, 4)),
+        work.points[: 4 * m].reshape((m, 4)), work.predicted[: 2 * c * m].reshape((c, m, 2)),
+        work.jacobian[: 2 * c * m * n].reshape((c, m, 2, n)), work.weights[: c * m].reshape((c, m)),
+        work.pixels[: 2 * c * m].reshape((c, m, 2)), state.correction[:n],
     )  # fmt: skip
-    return prediction, weights, pixels
 
 
 @kernel

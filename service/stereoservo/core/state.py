@@ -431,12 +431,12 @@ class CoreState(msgspec.Struct, eq=False):
     def history(self) -> JointHistory:
         """The joint samples of late: arrays of the block, and how many there are now."""
         block = self.block
-        return JointHistory(block.history_ns, block.history_positions, block.history_count)
+        return JointHistory(block.history_ns, block.history_positions, block.numbers.history_count)
 
     @property
     def last_joints_ns(self) -> int:
         """Stamp of the newest joint sample, 0 before the first."""
-        return self.block.last_joints_ns
+        return self.block.numbers.last_joints_ns
 
     @property
     def velocities(self) -> FloatArray:
@@ -465,12 +465,12 @@ class CoreState(msgspec.Struct, eq=False):
     @property
     def efforts(self) -> FloatArray | None:
         """As the drives told them last (n,); None: they did not."""
-        return self.block.efforts.copy() if self.block.tells_efforts else None
+        return self.block.efforts.copy() if self.block.numbers.tells_efforts else None
 
     @property
     def following_errors(self) -> FloatArray | None:
         """Likewise."""
-        return self.block.following_errors.copy() if self.block.tells_following else None
+        return self.block.following_errors.copy() if self.block.numbers.tells_following else None
 
 
 def initial_state(settings: CoreSettings) -> CoreState:

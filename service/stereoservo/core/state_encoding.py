@@ -126,14 +126,7 @@ def _block_of(state: dict[str, Any]) -> dict[str, Any]:
     cameras, markers = len(state["cameras"]), state["cameras"][0]["sigma"][1][0] if state["cameras"] else 0
     joints, window = block["command"][1][0], block["effort_excess"][1][0]
     past = block["delay_past"][1][0] if "delay_past" in block else 0
-    block["counts"] = {
-        "joints": joints,
-        "cameras": cameras,
-        "markers": markers,
-        "window": window,
-        "past": past,
-    }
-    return block
+    return block | {"joints": joints, "cameras": cameras, "markers": markers, "window": window, "past": past}
 
 
 def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:

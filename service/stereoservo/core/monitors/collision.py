@@ -71,13 +71,17 @@ def learnt_collision_thresholds(
 def learnt_loads(trials_id: str, state: CoreState) -> JointLoads | None:
     """What the trial motions showed; None where the drives tell nothing."""
     loads, block = state.loads, state.block
-    if loads is None or loads.id != trials_id or not (block.tells_efforts or block.tells_following):
+    if (
+        loads is None
+        or loads.id != trials_id
+        or not (block.numbers.tells_efforts or block.numbers.tells_following)
+    ):
         return None
     return JointLoads(
         velocities=loads.velocities.copy(),
-        efforts=loads.efforts.copy() if block.tells_efforts else None,
-        largest_efforts=loads.largest_efforts.copy() if block.tells_efforts else None,
-        following_errors=loads.following_errors.copy() if block.tells_following else None,
+        efforts=loads.efforts.copy() if block.numbers.tells_efforts else None,
+        largest_efforts=loads.largest_efforts.copy() if block.numbers.tells_efforts else None,
+        following_errors=loads.following_errors.copy() if block.numbers.tells_following else None,
     )
 
 
