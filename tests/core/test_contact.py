@@ -60,7 +60,7 @@ def fly(
     count = len(efforts if efforts is not None else following)  # type: ignore[arg-type]
     found = []
     for k in range(count):
-        state.command = np.full(N, command)
+        state.block.command[:] = np.full(N, command)
         sample = JointState(
             k, state.block.numbers.loads_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
@@ -162,8 +162,8 @@ def test_drives_that_tell_nothing_are_not_watched(settings: CoreSettings) -> Non
     state = enabled(settings)
     sample = JointState(1, 1, np.zeros(N), np.zeros(N))
     assert monitor.detect_collision(state, settings, workspace(settings, None), sample) is None
-    assert state.efforts is None
-    assert state.following_errors is None
+    assert not state.block.numbers.tells_efforts
+    assert not state.block.numbers.tells_following
     lags = np.zeros((40, N))
     lags[20:, 2] = np.nan  # one that is not a number says nothing either
     assert fly(state, settings, following=lags) == []

@@ -522,7 +522,7 @@ def test_a_state_of_version_6_is_taken_up(bench: Any) -> None:
     )
     assert encode_state(taken) == encode_state(state)
     assert is_recorded(state, data)
-    state.command[0] += 1e-9
+    state.block.command[0] += 1e-9
     assert not is_recorded(state, data)
     old["version"] = 5
     with pytest.raises(StateVersionError):

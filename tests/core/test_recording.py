@@ -111,7 +111,7 @@ def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
     (aborted,) = [event for event in events if event.kind == "goal_aborted"]
     assert aborted.reasons[0].code == "LAW_FAILED"
     assert "ZeroDivisionError: by zero" in aborted.reasons[0].hint
-    assert not np.any(bench.core.state.command)
+    assert not np.any(bench.core.state.block.command)
 
 
 def test_a_law_whose_numbers_are_of_another_type_compiles_nothing_in_the_loop(
@@ -132,7 +132,7 @@ def test_a_law_whose_numbers_are_of_another_type_compiles_nothing_in_the_loop(
         target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
         bench.step(RunGoal(Goal(str(uuid.UUID(int=1 + number)), FeatureTarget(bench.features(target)))))
         bench.run(0.3)
-        assert np.any(bench.core.state.command)
+        assert np.any(bench.core.state.block.command)
         compiled.append(set(overloads()))
     assert compiled[0] == compiled[1]
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.core.block import Block
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays, model_arrays, require_fitting
@@ -41,7 +42,7 @@ from stereoservo.core.prediction import (
     velocities_at,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState, JointHistory, camera_estimate, share_sights
+from stereoservo.core.state import CameraEstimate, CoreState, camera_estimate, share_sights
 from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
@@ -103,7 +104,7 @@ def _take_model(context: StepContext) -> None:
     elif (
         MOTION_SOURCES[type(state.source)].runs_law
         or state.planning is not None
-        or bool((np.abs(state.command) > AT_REST).any())
+        or bool((np.abs(state.block.command) > AT_REST).any())
     ):
         return
     else:
@@ -178,7 +179,7 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
     shutter_ns = observation.t_shutter_ns + estimate.offset_ns
     if arrays is None:
         return
-    frame = seen_frame(arrays, camera, observation, state.history, shutter_ns, state.velocities)
+    frame = seen_frame(arrays, camera, observation, state.block, shutter_ns)
     if frame is None:
         return
     sights = frame.sights
@@ -276,12 +277,11 @@ class SeenFrame(NamedTuple):
 
 
 def seen_frame(
-    arrays: ModelArrays, camera: int, observation: CameraObservation, history: JointHistory, shutter_ns: int,
-    velocities: FloatArray,
-) -> SeenFrame | None:  # fmt: skip
+    arrays: ModelArrays, camera: int, observation: CameraObservation, block: Block, shutter_ns: int
+) -> SeenFrame | None:
     """An observation of ``camera``, in raw pixels, taken at ``shutter_ns``; None where the joints then are not known.
 
-    ``velocities`` (n,): of the joints at present, for a frame that is newer than their last sample. Sights that the
+    The velocities of the joints at present are those of a frame that is newer than their last sample. Sights that the
     camera's lens cannot have made are left out.
     """
     n, markers = arrays.zero.size, len(arrays.marker_points)
@@ -292,7 +292,8 @@ def seen_frame(
         np.empty((rows, 2)),
     )  # fmt: skip
     known, told = _seen_frame(
-        history.t_ns, history.positions, history.count, shutter_ns, velocities, arrays.generators, arrays.kinds,
+        block.history_ns, block.history_positions, block.numbers.history_count, shutter_ns, block.velocities,
+        arrays.generators, arrays.kinds,
         arrays.zero, arrays.tip_first, arrays.marker_points, arrays.matrices[camera : camera + 1],
         arrays.lenses[camera], observation.ids.astype(np.int64), np.array(observation.pixels, np.float64),
         np.array(observation.covariances, np.float64), arrays.row_ids, arrays.row_of, arrays.scene_pixels[camera],

@@ -117,21 +117,24 @@ def take_sample(
 
     The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
     """
-    state, work = block[0], room[0]
-    n = state.joints
-    kept = state.history_positions[: HISTORY * n].reshape((HISTORY, n))
+    memory, work = block[0], room[0]
+    n = memory.joints
+    kept = memory.history_positions[: HISTORY * n].reshape((HISTORY, n))
     sound = True
     if told:
-        values, elapsed_s = work.sample[: 4 * n].reshape((4, n)), (t_ns - state.last_joints_ns) * 1e-9
-        sound = _sound(values, kept, state.history_count, elapsed_s, work.velocity_max[:n], active)
+        values, elapsed_s = (
+            work.sample[: 4 * n].reshape((4, n)),
+            (t_ns - memory.last_joints_ns) * 1e-9,
+        )
+        sound = _sound(values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], active)
         if sound:
-            state.history_count = _append_sample(
-                state.history_ns, kept, state.history_count, t_ns, values[0], state.last_joints_ns,
-                work.velocity_max[:n], state.velocities[:n],
+            memory.history_count = _append_sample(
+                memory.history_ns, kept, memory.history_count, t_ns, values[0], memory.last_joints_ns,
+                work.velocity_max[:n], memory.velocities[:n],
             )  # fmt: skip
-            state.last_joints_seq, state.last_joints_ns = seq, t_ns
+            memory.last_joints_seq, memory.last_joints_ns = seq, t_ns
     for j in range(n):
-        q[j] = kept[(state.history_count - 1) % HISTORY, j] if state.history_count > 0 else 0.0
+        q[j] = kept[(memory.history_count - 1) % HISTORY, j] if memory.history_count > 0 else 0.0
     return sound
 
 

@@ -49,13 +49,7 @@ from stereoservo.core.monitors.fault_isolation import (
     bench_now,
     diagnosed_beside_joint_errors,
 )
-from stereoservo.core.monitors.following import (
-    LAG_S,
-    MEMORY_S,
-    SILENCE_S,
-    not_following,
-    silent,
-)
+from stereoservo.core.monitors.following import LAG_S, MEMORY_S, SILENCE_S, not_following, silent
 from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
@@ -158,7 +152,7 @@ def detect_collision(
     """Account for one step, with the sample's values in the ``room``; the reason where a joint (worst first) is in
     contact.
 
-    ``state.command`` is still that of the last step.
+    The block's command is still that of the last step.
     """
     block = state.block
     if sample is None or sample.t_ns <= block.numbers.loads_ns:
@@ -192,36 +186,36 @@ def account_loads(
 
     What a sample does not tell, or what is no number, becomes what is expected, in the ``room``, too.
     """
-    state, work = block[0], room[0]
-    n, window = state.joints, state.window
+    memory, work = block[0], room[0]
+    n, window = memory.joints, memory.window
     efforts, following = work.sample[2 * n : 3 * n], work.sample[3 * n : 4 * n]
-    mean = state.mean_efforts[:n]
-    elapsed_s = (t_ns - state.loads_ns) * 1e-9 if state.loads_ns > 0 else math.inf
-    state.loads_ns, state.tells_efforts, state.tells_following = (
+    mean = memory.mean_efforts[:n]
+    elapsed_s = (t_ns - memory.loads_ns) * 1e-9 if memory.loads_ns > 0 else math.inf
+    memory.loads_ns, memory.tells_efforts, memory.tells_following = (
         t_ns,
         int(tells_efforts),
         int(tells_following),
     )
     for j in range(n):
         if tells_efforts:
-            state.efforts[j] = efforts[j]
+            memory.efforts[j] = efforts[j]
         else:
             efforts[j] = mean[j]
         if tells_following:
-            state.following_errors[j] = following[j]
+            memory.following_errors[j] = following[j]
     forgets = elapsed_s > GAP_S or not active
     if forgets:
-        state.leave_s = 0.0
-    moving = not (forgets or stopped) and _moves(state.command[:n])
+        memory.leave_s = 0.0
+    moving = not (forgets or stopped) and _moves(memory.command[:n])
     if moving:
-        state.leave_s = max(0.0, state.leave_s - elapsed_s)
+        memory.leave_s = max(0.0, memory.leave_s - elapsed_s)
     effort_limits, following_limits = work.effort_limits[:n], work.following_limits[:n]
     if learning:
         effort_limits, following_limits = work.stated_effort_limits[:n], work.stated_following_limits[:n]
     beyond = _account_loads(
-        efforts, following, mean, state.effort_excess[: window * n].reshape((window, n)),
-        state.following_excess[: window * n].reshape((window, n)), state.contact_low[: 2 * n].reshape((2, n)),
-        state.contact_high[: 2 * n].reshape((2, n)), elapsed_s, forgets, moving, state.leave_s > 0.0, effort_limits,
+        efforts, following, mean, memory.effort_excess[: window * n].reshape((window, n)),
+        memory.following_excess[: window * n].reshape((window, n)), memory.contact_low[: 2 * n].reshape((2, n)),
+        memory.contact_high[: 2 * n].reshape((2, n)), elapsed_s, forgets, moving, memory.leave_s > 0.0, effort_limits,
         following_limits,
     )  # fmt: skip
     return moving, beyond and moving
@@ -296,9 +290,9 @@ def detect_following_error(
 ) -> Reason | None:
     """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
 
-    ``state.command`` is still that of the last step. A joint's missing travel is its commanded minus its measured one,
-    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What is
-    sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
+    The block's command is still that of the last step. A joint's missing travel is its commanded minus its measured
+    one, forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What
+    is sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
     ends, too. Without a new joint sample nothing is concluded: stale samples are the safety stage's affair.
     """
     block, numbers = state.block, room.numbers
@@ -317,35 +311,39 @@ def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -
     """Account for ``dt_s`` of the last command with the joints at ``q`` (n,), in the ``block``; what was found, of
     which joint and how much is missing being in the ``room``.
     """
-    state, work = block[0], room[0]
-    n, past = state.joints, state.past
-    command, answers = state.command[:n], work.answers[:n]
-    last, delay_s, sent = state.last_positions[:n], state.delay_s[:n], state.delay_sent[:n]
-    samples = state.delay_samples[: DELAY_SAMPLES * n].reshape((DELAY_SAMPLES, n))
-    accounted, missing_late = state.delay_accounted[:n], state.delay_missing[:n]
-    silent_from, silent_travel, silent_s = state.silent_from[:n], state.silent_travel[:n], state.silent_s[:n]
-    untold, missing, velocity = state.untold_travel[:n], state.missing_travel[:n], state.delay_velocity[:n]
-    if state.silence_known == 0:
+    memory, work = block[0], room[0]
+    n, past = memory.joints, memory.past
+    command, answers = memory.command[:n], work.answers[:n]
+    last, delay_s, sent = memory.last_positions[:n], memory.delay_s[:n], memory.delay_sent[:n]
+    samples = memory.delay_samples[: DELAY_SAMPLES * n].reshape((DELAY_SAMPLES, n))
+    accounted, missing_late = memory.delay_accounted[:n], memory.delay_missing[:n]
+    silent_from, silent_travel, silent_s = (
+        memory.silent_from[:n],
+        memory.silent_travel[:n],
+        memory.silent_s[:n],
+    )
+    untold, missing, velocity = memory.untold_travel[:n], memory.missing_travel[:n], memory.delay_velocity[:n]
+    if memory.silence_known == 0:
         silent_from[:], silent_travel[:], silent_s[:] = q, 0.0, 0.0
-        state.silence_known = 1
-    onset = state.delay_onset[: 7 * n].reshape((7, n))
+        memory.silence_known = 1
+    onset = memory.delay_onset[: 7 * n].reshape((7, n))
     measure_delays(command, q, answers, dt_s, sent, onset, samples, delay_s)
-    if state.followed == 0:
+    if memory.followed == 0:
         last[:], missing_late[:], accounted[:] = q, 0.0, sent
-    told = state.last_joints_ns != state.last_followed_ns
+    told = memory.last_joints_ns != memory.last_followed_ns
     account_travel(
-        command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, work.period_s, state.delay_steps, answers,
+        command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, work.period_s, memory.delay_steps, answers,
         (
-            delay_s, sent, state.delay_past[: past * n].reshape((past, n)), velocity, state.delay_under_way[:n],
+            delay_s, sent, memory.delay_past[: past * n].reshape((past, n)), velocity, memory.delay_under_way[:n],
             accounted, missing_late,
         ),
         samples, untold, missing,
     )  # fmt: skip
-    state.delay_steps += 1
+    memory.delay_steps += 1
     account_silence(q, velocity, answers, work.friction[:n], dt_s, silent_from, silent_travel, silent_s)
     if not told:
         return FOLLOWS
-    state.last_followed_ns, state.followed = state.last_joints_ns, 1
+    memory.last_followed_ns, memory.followed = memory.last_joints_ns, 1
     last[:] = q
     work.worst, work.missing = worst_follower(work.lag[:n], missing, missing_late)
     if work.worst >= 0:
@@ -357,7 +355,7 @@ def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -
         if silent_s[j] > SILENCE_S and share > most:
             work.worst, most = j, share
     if most > 1.0:
-        state.silence_known = 0
+        memory.silence_known = 0
         return SILENT
     return FOLLOWS
 

@@ -189,9 +189,9 @@ def move(context: StepContext) -> SourceOutput:
 
 def _foreseen(output: SourceOutput, context: StepContext) -> SourceOutput:
     """The output; the safety stage is told where late drives will have their joints before they obey it."""
-    delays = context.state.delays
+    delays = context.state.block.delays
     if delays.delay_s.any():
-        towards = np.where(output.velocity != 0.0, output.velocity, context.state.command)
+        towards = np.where(output.velocity != 0.0, output.velocity, context.state.block.command)
         ahead = context.q + delays.under_way
         context.outermost = np.where(
             towards > 0.0, np.maximum(context.q, ahead), np.minimum(context.q, ahead)
@@ -252,7 +252,7 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
     inexact = state.model is not None and state.model.joint_accuracy is not None
     most, travel = _bounds(settings.joint_kinds, settings.resolution, inexact)
     looks = context.ingested.joints is not None and _fresh(output, context)
-    arrives = state.delays.velocity if settings.watch_following else state.command
+    arrives = state.block.delays.velocity if settings.watch_following else state.block.command
     velocity = np.empty(context.q.size)
     changed = _compensated(
         output.velocity, arrives, context.q, known.velocity, known.stood_at, known.sent, known.sent_s, most,

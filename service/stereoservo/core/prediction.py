@@ -256,16 +256,16 @@ def present(block: Record, room: Record, q: FloatArray, now_ns: int) -> None:
     """Into the ``room``, the present at ``q`` (n,): the markers by kinematics, the weights and pixels of what the
     cameras saw of late; into the ``block``, the correction of the joints. See `_present`.
     """
-    state, work = block[0], room[0]
-    n, c, m = state.joints, state.cameras, state.markers
+    memory, work = block[0], room[0]
+    n, c, m = memory.joints, memory.cameras, memory.markers
     _present(
         work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], q, work.tip_first != 0,
         work.marker_points[: 4 * m].reshape((m, 4)), work.matrices[: 12 * c].reshape((c, 3, 4)),
-        state.innovation[: 2 * c * m].reshape((c, m, 2)), state.sigma[: c * m].reshape((c, m)),
-        state.seen_ns[: c * m].reshape((c, m)), now_ns, work.lasting_ns, work.operators[: 16 * n].reshape((n, 4, 4)),
+        memory.innovation[: 2 * c * m].reshape((c, m, 2)), memory.sigma[: c * m].reshape((c, m)),
+        memory.seen_ns[: c * m].reshape((c, m)), now_ns, work.lasting_ns, work.operators[: 16 * n].reshape((n, 4, 4)),
         work.points[: 4 * m].reshape((m, 4)), work.predicted[: 2 * c * m].reshape((c, m, 2)),
         work.jacobian[: 2 * c * m * n].reshape((c, m, 2, n)), work.weights[: c * m].reshape((c, m)),
-        work.pixels[: 2 * c * m].reshape((c, m, 2)), state.correction[:n],
+        work.pixels[: 2 * c * m].reshape((c, m, 2)), memory.correction[:n],
     )  # fmt: skip
 
 

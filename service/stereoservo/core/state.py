@@ -15,7 +15,6 @@ from stereoservo.control.filters import ClientClock, TargetTrack
 from stereoservo.core.block import SIGHTS, Block, steps_of_delay
 from stereoservo.core.cycle import WayFrame
 from stereoservo.core.monitor_state import (
-    DriveDelays,
     MobileCamera,
     ModelMonitor,
     ObservationStatistics,
@@ -432,45 +431,6 @@ class CoreState(msgspec.Struct, eq=False):
         """The joint samples of late: arrays of the block, and how many there are now."""
         block = self.block
         return JointHistory(block.history_ns, block.history_positions, block.numbers.history_count)
-
-    @property
-    def last_joints_ns(self) -> int:
-        """Stamp of the newest joint sample, 0 before the first."""
-        return self.block.numbers.last_joints_ns
-
-    @property
-    def velocities(self) -> FloatArray:
-        """Of the joints (n,), filtered [rad/s or m/s]."""
-        return self.block.velocities
-
-    @property
-    def correction(self) -> FloatArray:
-        """Joint-space correction that explains the innovations best (n,)."""
-        return self.block.correction
-
-    @property
-    def command(self) -> FloatArray:
-        """The last command (n,) [rad/s or m/s]."""
-        return self.block.command
-
-    @command.setter
-    def command(self, velocity: FloatArray) -> None:
-        self.block.command[:] = velocity
-
-    @property
-    def delays(self) -> DriveDelays:
-        """How late the drives are: arrays of the block."""
-        return self.block.delays
-
-    @property
-    def efforts(self) -> FloatArray | None:
-        """As the drives told them last (n,); None: they did not."""
-        return self.block.efforts.copy() if self.block.numbers.tells_efforts else None
-
-    @property
-    def following_errors(self) -> FloatArray | None:
-        """Likewise."""
-        return self.block.following_errors.copy() if self.block.numbers.tells_following else None
 
 
 def initial_state(settings: CoreSettings) -> CoreState:

@@ -96,7 +96,7 @@ def place_now(context: StepContext) -> BodyState:
     arrays, prediction = context.arrays, context.prediction
     assert arrays is not None
     assert prediction is not None
-    points = markers_at(arrays, context.q + context.state.correction)
+    points = markers_at(arrays, context.q + context.state.block.correction)
     seen = (
         np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
     )
