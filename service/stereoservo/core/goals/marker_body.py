@@ -106,7 +106,8 @@ def place_now(context: StepContext) -> BodyState:
         faces = find_faces(
             points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators
         )
-    return BodyState(context.settings, arrays, points, prediction.operators, faces)
+    # The goal may be resolved over several steps: what the room holds is of this one.
+    return BodyState(context.settings, arrays, points, prediction.operators.copy(), faces)
 
 
 def view_of(settings: CoreSettings, arrays: ModelArrays, points: FloatArray) -> tuple[FloatArray, FloatArray]:
