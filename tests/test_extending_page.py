@@ -147,7 +147,7 @@ def test_the_motion_source_swings_a_joint_waits_in_hold_and_ends(monkeypatch):
     assert not np.delete(swing, 2, axis=1).any()
     bench.run(1.0)
     assert isinstance(bench.core.state.source, Holding)
-    assert not bench.core.state.command.any()
+    assert not bench.core.state.block.command.any()
     np.testing.assert_allclose(bench.q, start, atol=0.02)
     # Its tag is one of its own in the checkpoint.
     data = msgspec.msgpack.encode(source)

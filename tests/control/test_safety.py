@@ -445,8 +445,8 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
         np.testing.assert_allclose(result.limited, wanted.limited, rtol=1e-9, atol=1e-10)
         assert [reason.code for reason in result.reasons] == [reason[0] for reason in wanted.reasons]
         command = result.limited if lifecycle == Lifecycle.ACTIVE else np.zeros(3)
-        np.testing.assert_array_equal(context.state.command, command)
-        assert not np.shares_memory(context.state.command, result.limited)
+        np.testing.assert_array_equal(context.state.block.command, command)
+        assert not np.shares_memory(context.state.block.command, result.limited)
 
 
 def test_the_limits_are_those_of_the_cell():

@@ -196,7 +196,7 @@ class CorruptedCell(RuleBasedStateMachine):
             self.bench.step()
         state = self.core.state
         stopped = state.refused_joints.reason is not None or state.stopped
-        silent = self.bench.now_ns - state.last_joints_ns > limits.joint_timeout_s * 1e9
+        silent = self.bench.now_ns - state.block.numbers.last_joints_ns > limits.joint_timeout_s * 1e9
         rests = not self.previous.any()
         self.corrupt_joints = self.corrupt_frames = None
         assert rests or not (stopped or silent)
@@ -259,7 +259,7 @@ class CorruptedCell(RuleBasedStateMachine):
     @invariant()
     def nothing_that_is_kept_is_not_finite(self) -> None:
         state = self.core.state
-        for values in (state.velocities, state.command, state.history.positions):
+        for values in (state.block.velocities, state.block.command, state.history.positions):
             assert np.isfinite(values).all()
         for estimate in state.cameras:
             assert np.isfinite(estimate.innovation).all()

@@ -16,7 +16,7 @@ import zstandard
 from oracles.former_recording import FormerRecorder
 from stereoservo.cli import main as cli
 from stereoservo.core.cycle import decode_array, encode
-from stereoservo.core.state import encode_state
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.recording import flight_recorder
 from stereoservo.recording.compression import Checkpoints, StepBlocks
 from stereoservo.recording.flight_recorder import FlightRecorder

@@ -114,4 +114,4 @@ def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> Non
     bench.ended()
     bench.run(0.1)
     assert bench.core.state.friction is None
-    assert np.abs(bench.core.state.command).max() == 0.0
+    assert np.abs(bench.core.state.block.command).max() == 0.0

@@ -11,7 +11,7 @@ import pytest
 
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.goals import (
     Calibrate,
     Enable,
@@ -74,7 +74,8 @@ def kept(bench: Any) -> tuple[Any, ...]:
     state = bench.core.state
     return (
         state.history.count, state.history.t_ns.tobytes(), state.history.positions.tobytes(),
-        state.velocities.tobytes(), state.last_joints_ns, state.last_joints_seq, state.contact.seen_ns,
+        state.block.velocities.tobytes(), state.block.numbers.last_joints_ns, state.block.numbers.last_joints_seq,
+        state.block.numbers.loads_ns,
     )  # fmt: skip
 
 
@@ -113,7 +114,7 @@ def test_a_joint_sample_with_an_impossible_value_stops_the_arm_and_is_not_kept(
     (reason,) = [r for r in outputs.status.reasons if r.code == "JOINT_VALUE"]
     assert told in reason.hint
     assert bench.run(0.5).command.tobytes() == np.zeros(6).tobytes()
-    assert np.isfinite(bench.core.state.velocities).all()
+    assert np.isfinite(bench.core.state.block.velocities).all()
     assert bench.reply(Resume()).accepted
     assert bench.reply(Jog({JOINT: -1.0}, 60.0)).accepted
     assert bench.run(0.4).command[3] == pytest.approx(-1.0)
@@ -143,7 +144,7 @@ def test_an_encoder_that_is_set_while_the_drives_are_off_begins_a_new_history(be
     bench.zero_offset[2] = 1.5
     outputs = bench.step()
     assert bench.core.state.history.count == 1
-    assert not bench.core.state.velocities.any()
+    assert not bench.core.state.block.velocities.any()
     assert "JOINT_JUMP" not in codes(outputs)
 
 

@@ -14,7 +14,8 @@ from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.estimate import seen_frame
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import JointHistory, decode_state, encode_state
+from stereoservo.core.state import initial_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.goals import FeatureTarget, Goal, Jog, JointTarget, RunGoal, Teach
 from stereoservo.ports.devices import CameraObservation
 
@@ -128,8 +129,9 @@ def test_sights_beyond_the_fold_are_dropped_and_pinholes_pass_untouched(benches:
     for bench in (straight, bent):
         arrays = model_arrays(bench.truth.model, bench.settings)
         rest = np.zeros_like(arrays.zero)
-        history = JointHistory(np.array([0, 1]), np.array([rest, rest]), 2)
-        frame = seen_frame(arrays, 0, observation, history, 1, rest)
+        block = initial_state(bench.settings).block
+        block.history_ns[1], block.history_positions[:2], block.numbers.history_count = 1, rest, 2
+        frame = seen_frame(arrays, 0, observation, block, 1)
         assert frame is not None
         seen.append(frame.sights.seen[:3].tolist())
         pixels.append((frame.prediction.pixels[0] + frame.sights.innovation[: len(arrays.ids)])[:3])

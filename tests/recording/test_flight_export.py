@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 
 from core.conftest import Bench, make_bench
 from stereoservo.cli import main as cli
-from stereoservo.core.state import encode_state
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 from stereoservo.messages.recording_request import images_directory
 from stereoservo.ports.devices import Frame

@@ -15,9 +15,10 @@ import numpy as np
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import CameraSights, Prediction
+from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
+from stereoservo.core.workspace import Workspace
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Health
@@ -35,10 +36,9 @@ class Derived:
     ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
     ``frame_timeout_s``: age from which on a frame is refused; ``features_fresh_s``: up to which features are fresh
     enough not to coast. ``prior_every``: steps between priors. ``laws``: those
-    that are installed, by name. ``cameras``: indices by name. ``samples`` (4, n): room for the values of a joint
-    sample. ``load_limits``:
-    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored. ``sights``: of
-    the state's cameras, with a model.
+    that are installed, by name. ``cameras``: indices by name. ``room``: for the results of kernels, with the constants
+    that they take. ``load_limits``:
+    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
     """
 
     nominal_period_ns: int
@@ -48,12 +48,16 @@ class Derived:
     prior_every: int
     laws: Mapping[str, Law]
     cameras: Mapping[str, int]
-    samples: FloatArray
+    room: Workspace
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
-    sights: CameraSights | None = None
     health: tuple[object, Health] | None = None
     """What the status last said of the model's health, and of what."""
+
+    def use(self, arrays: ModelArrays) -> None:
+        """Work with a model from here on."""
+        self.arrays = arrays
+        self.room.use(arrays)
 
 
 class Ingested(msgspec.Struct, frozen=True, eq=False):

@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.core.block import Block
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays, model_arrays, require_fitting
 from stereoservo.core.monitor_state import MOVED, CameraTiming, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
-from stereoservo.core.monitors.collision import collision_thresholds
+from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
 from stereoservo.core.monitors.diagnosis import start_model_monitor
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
@@ -36,13 +37,13 @@ from stereoservo.core.prediction import (
     present,
     room,
     rows_of,
-    shared_sights,
     undistort_sights,
     used_rows,
     velocities_at,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState, JointHistory, camera_estimate
+from stereoservo.core.state import CameraEstimate, CoreState, camera_estimate, share_sights
+from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
@@ -55,20 +56,25 @@ AT_REST = 1e-3
 
 def estimate(context: StepContext) -> StepContext:
     """The context with the present in it: model, prediction, weights and pixels of the markers."""
-    _take_model(context)
-    for camera, observation in _new_frames(context):
+    if context.inputs.model_update is not None or context.state.pending_model is not None:
+        _take_model(context)
+    for sighting in context.state.watching.sightings:
+        sighting.fresh = False
+    for camera, observation in context.ingested.observations:
         _fold_frame(camera, observation, context)
+    context.observations = tuple([observation for _, observation in context.ingested.observations])
     arrays, state = context.derived.arrays, context.state
-    if arrays is None or state.history.count == 0:
+    if arrays is None or state.block.numbers.history_count == 0:
         return context
-    assert context.derived.sights is not None
     context.arrays = arrays
-    context.prediction, context.weights, context.pixels, state.correction = present(
-        arrays, context.q, context.derived.sights, context.now_ns, context.settings.limits.coast_s
-    )
+    room = context.derived.room
+    present(state.block.record, room.record, context.q, context.now_ns)
+    context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
     if any(state.mobile):
         context = moving_camera.step(context)
-        context.derived.arrays = context.arrays
+        if context.arrays is not arrays:
+            assert context.arrays is not None
+            context.derived.use(context.arrays)
     return context
 
 
@@ -98,7 +104,7 @@ def _take_model(context: StepContext) -> None:
     elif (
         MOTION_SOURCES[type(state.source)].runs_law
         or state.planning is not None
-        or bool((np.abs(state.command) > AT_REST).any())
+        or bool((np.abs(state.block.command) > AT_REST).any())
     ):
         return
     else:
@@ -129,16 +135,18 @@ def _await_model(update: ModelUpdate, context: StepContext) -> None:
 def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = ()) -> None:
     """Put a model in use. ``masked``: markers that have slipped and stay unused."""
     state, settings = context.state, context.settings
-    arrays = context.derived.arrays = model_arrays(model, settings)
+    arrays = model_arrays(model, settings)
+    context.derived.use(arrays)
     start_model_monitor(state, arrays, settings, masked)
     state.model = model
-    context.derived.load_limits = load_limits(settings, model)
+    loads = context.derived.load_limits = load_limits(settings, model)
+    context.derived.room.limit_loads(loads)
     state.readiness = fitted_readiness(model)
     offsets = stated_offsets(model)
     state.cameras = [
         camera_estimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
     ]
-    context.derived.sights = shared_sights(state.cameras)
+    share_sights(state)
 
 
 def fitted_readiness(model: CellModel) -> ModelReadiness:
@@ -154,16 +162,12 @@ def load_limits(settings: CoreSettings, model: CellModel | None) -> tuple[FloatA
     return collision_thresholds(settings, None if model is None else model.loads)
 
 
+def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
+    """Room for the steps of a core, with the constants of the cell, and the limits of what ``model`` says of loads."""
+    return Workspace(settings, load_limits(settings, model), stated_thresholds(settings))
+
+
 # -- frames -------------------------------------------------------------------------------------------------
-
-
-def _new_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], ...]:
-    """The frames of this step; the model monitor's cameras await them."""
-    for sighting in context.state.watching.sightings:
-        sighting.fresh = False
-    found = context.ingested.observations
-    context.observations = tuple(observation for _, observation in found)
-    return found
 
 
 def _fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
@@ -175,7 +179,7 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
     shutter_ns = observation.t_shutter_ns + estimate.offset_ns
     if arrays is None:
         return
-    frame = seen_frame(arrays, camera, observation, state.history, shutter_ns, state.velocities)
+    frame = seen_frame(arrays, camera, observation, state.block, shutter_ns)
     if frame is None:
         return
     sights = frame.sights
@@ -273,12 +277,11 @@ class SeenFrame(NamedTuple):
 
 
 def seen_frame(
-    arrays: ModelArrays, camera: int, observation: CameraObservation, history: JointHistory, shutter_ns: int,
-    velocities: FloatArray,
-) -> SeenFrame | None:  # fmt: skip
+    arrays: ModelArrays, camera: int, observation: CameraObservation, block: Block, shutter_ns: int
+) -> SeenFrame | None:
     """An observation of ``camera``, in raw pixels, taken at ``shutter_ns``; None where the joints then are not known.
 
-    ``velocities`` (n,): of the joints at present, for a frame that is newer than their last sample. Sights that the
+    The velocities of the joints at present are those of a frame that is newer than their last sample. Sights that the
     camera's lens cannot have made are left out.
     """
     n, markers = arrays.zero.size, len(arrays.marker_points)
@@ -289,7 +292,8 @@ def seen_frame(
         np.empty((rows, 2)),
     )  # fmt: skip
     known, told = _seen_frame(
-        history.t_ns, history.positions, history.count, shutter_ns, velocities, arrays.generators, arrays.kinds,
+        block.history_ns, block.history_positions, block.numbers.history_count, shutter_ns, block.velocities,
+        arrays.generators, arrays.kinds,
         arrays.zero, arrays.tip_first, arrays.marker_points, arrays.matrices[camera : camera + 1],
         arrays.lenses[camera], observation.ids.astype(np.int64), np.array(observation.pixels, np.float64),
         np.array(observation.covariances, np.float64), arrays.row_ids, arrays.row_of, arrays.scene_pixels[camera],

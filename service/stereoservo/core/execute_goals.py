@@ -203,8 +203,8 @@ def _next_plan(context: StepContext) -> None:
     if state.reanchoring is not None:
         return
     if isinstance(source, ServoGoal) and awaits_plan(source, context):
-        if bool((np.abs(state.command) < AT_REST).all()) and bool(
-            (np.abs(state.velocities) < 10 * AT_REST).all()
+        if bool((np.abs(state.block.command) < AT_REST).all()) and bool(
+            (np.abs(state.block.velocities) < 10 * AT_REST).all()
         ):
             state.planning = plan_again(source, context)
         return

@@ -11,13 +11,14 @@ import math
 
 import numpy as np
 
+from stereoservo.core.block import HISTORY
 from stereoservo.core.context import Ingested, StepContext
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.state import HISTORY, LEAST_APART_NS, CoreState, Refused
+from stereoservo.core.state import LEAST_APART_NS, CoreState, Refused
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation, JointState
 
@@ -45,47 +46,34 @@ def ingest(context: StepContext) -> Ingested:
     Of what is refused nothing is kept but the count and the reason. After a gap the drives were left alone, and the
     last command is not what they do: commands begin from rest.
     """
-    if context.inputs.now_ns < context.state.last_step_ns:
-        _forget_stamps(context.state)
-    ingested = context.ingested = _passed(context)
-    _count_refused(ingested, context)
-    if ingested.gap is not None:
-        context.state.command = np.zeros_like(context.state.command)
-        forget_travel(context.state)
-    context.q = _append_joints(ingested.joints, context)
-    _follow_driver(context)
-    return ingested
-
-
-def _passed(context: StepContext) -> Ingested:
-    """What passes the gate, and why the rest does not; changes nothing."""
-    inputs, state = context.inputs, context.state
-    elapsed_ns = (
-        inputs.now_ns - state.last_step_ns if state.last_step_ns else context.derived.nominal_period_ns
-    )
-    gap = _gap(elapsed_ns * 1e-9, context)
-    joints, refused_joints = _joints(context)
-    observations, refused_frames = _observations(context)
-    stops = [reason for reason in (gap, refused_joints) if reason is not None]
-    if MOTION_SOURCES[type(state.source)].by_images:
-        stops.extend(reason for _, reason in refused_frames if reason.level == "hold")
-    return Ingested(
-        joints=joints,
-        observations=observations,
-        elapsed_s=elapsed_ns * 1e-9,
-        refused_joints=refused_joints,
-        refused_frames=refused_frames,
-        gap=gap,
-        stops=tuple(stops),
-    )
-
-
-def _count_refused(ingested: Ingested, context: StepContext) -> None:
-    """Keep the time of the step, and of each source what was refused since its last good sample."""
-    state = context.state
-    state.last_step_ns = context.now_ns
-    if ingested.joints is not None:
+    state, inputs, numbers = context.state, context.inputs, context.state.block.numbers
+    if inputs.now_ns < numbers.last_step_ns:
+        _forget_stamps(state)
+    last_ns = numbers.last_step_ns
+    elapsed_s = (inputs.now_ns - last_ns if last_ns else context.derived.nominal_period_ns) * 1e-9
+    gap = _gap(elapsed_s, context)
+    observations, refused_frames = _observations(context) if inputs.observations else ((), ())
+    joints, refused_joints = _take_joints(context)
+    numbers.last_step_ns = context.now_ns
+    stops: tuple[Reason, ...] = ()
+    if gap is not None or refused_joints is not None or refused_frames:
+        stops = tuple(reason for reason in (gap, refused_joints) if reason is not None)
+        if MOTION_SOURCES[type(state.source)].by_images:
+            stops += tuple(reason for _, reason in refused_frames if reason.level == "hold")
+    context.ingested = Ingested(joints, observations, elapsed_s, refused_joints, refused_frames, gap, stops)
+    if joints is not None:
         state.refused_joints.reason = None
+    if observations or refused_joints is not None or refused_frames:
+        _count_refused(context.ingested, state)
+    if gap is not None:
+        state.block.command[:] = 0.0
+        forget_travel(state)
+    _follow_driver(context)
+    return context.ingested
+
+
+def _count_refused(ingested: Ingested, state: CoreState) -> None:
+    """Keep of each source what was refused since its last good sample."""
     if ingested.refused_joints is not None:
         _count(state.refused_joints, ingested.refused_joints)
     for camera, _ in ingested.observations:
@@ -96,30 +84,11 @@ def _count_refused(ingested: Ingested, context: StepContext) -> None:
 
 def _forget_stamps(state: CoreState) -> None:
     """The clock went back: what was stamped before is of a time to come, and would refuse all that is new."""
-    state.history.count = 0
-    state.last_joints_ns, state.last_joints_seq = 0, -1
+    block = state.block
+    block.numbers.history_count, block.numbers.last_joints_ns, block.numbers.last_joints_seq = 0, 0, -1
     for estimate in state.cameras:
         estimate.last_seq, estimate.accepted_ns = -1, 0
         estimate.seen_ns[:] = 0
-
-
-def _append_joints(sample: JointState | None, context: StepContext) -> FloatArray:
-    """Append a new joint sample to the history; return the newest positions (zero before the first).
-
-    The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
-    """
-    state = context.state
-    history = state.history
-    if sample is not None:
-        history.count = _append_sample(
-            history.t_ns, history.positions, history.count, sample.t_ns, _positions(sample, context),
-            state.last_joints_ns, context.settings.limits.velocity_max, state.velocities,
-        )  # fmt: skip
-        state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
-    if history.count == 0:
-        return np.zeros_like(state.command)
-    newest: FloatArray = history.positions[(history.count - 1) % HISTORY].copy()
-    return newest
 
 
 @kernel
@@ -136,6 +105,37 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
     for j in range(positions.size):
         kept[slot, j] = positions[j]
     return count + 1
+
+
+@kernel
+def take_sample(
+    block: Record, room: Record, told: bool, t_ns: int, seq: int, active: bool, q: FloatArray
+) -> bool:
+    """Whether a joint sample, of which the ``room`` holds the values, may be right; then it is the newest one of the
+    ``block``, and the filtered velocities are those since the last one. Into ``q`` (n,): the newest positions,
+    zero before the first. Without a sample (``told``): nothing is wrong.
+
+    The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
+    """
+    memory, work = block[0], room[0]
+    n = memory.joints
+    kept = memory.history_positions[: HISTORY * n].reshape((HISTORY, n))
+    sound = True
+    if told:
+        values, elapsed_s = (
+            work.sample[: 4 * n].reshape((4, n)),
+            (t_ns - memory.last_joints_ns) * 1e-9,
+        )
+        sound = _sound(values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], active)
+        if sound:
+            memory.history_count = _append_sample(
+                memory.history_ns, kept, memory.history_count, t_ns, values[0], memory.last_joints_ns,
+                work.velocity_max[:n], memory.velocities[:n],
+            )  # fmt: skip
+            memory.last_joints_seq, memory.last_joints_ns = seq, t_ns
+    for j in range(n):
+        q[j] = kept[(memory.history_count - 1) % HISTORY, j] if memory.history_count > 0 else 0.0
+    return sound
 
 
 @kernel
@@ -188,13 +188,6 @@ def _sound(
         and count > 0
         and _jumped(values[0], kept[(count - 1) % kept.shape[0]], velocity_max, elapsed_s)
     )
-
-
-def _positions(sample: JointState, context: StepContext) -> FloatArray:
-    """The positions (n,) of a sample that has passed, in an array of the type that kernels are compiled for."""
-    positions: FloatArray = context.derived.samples[0]
-    positions[:] = sample.positions
-    return positions
 
 
 def _follow_driver(context: StepContext) -> None:
@@ -254,7 +247,7 @@ def _count(refused: Refused, reason: Reason) -> None:
 def _gap(gap_s: float, context: StepContext) -> Reason | None:
     """The reason where the loop stood still while the drives were on."""
     state, limit_s = context.state, context.derived.longest_gap_s
-    if not state.last_step_ns or state.lifecycle != Lifecycle.ACTIVE or 0.0 <= gap_s <= limit_s:
+    if not state.block.numbers.last_step_ns or state.lifecycle != Lifecycle.ACTIVE or 0.0 <= gap_s <= limit_s:
         return None
     return Reason(
         "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
@@ -264,41 +257,27 @@ def _gap(gap_s: float, context: StepContext) -> Reason | None:
     )  # fmt: skip
 
 
-def _joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
-    """The joint sample, or why it is refused; neither where there is none or it was here before."""
-    inputs, state = context.inputs, context.state
-    sample = inputs.joints
-    if sample is None or sample.seq == state.last_joints_seq or sample.t_ns <= state.last_joints_ns:
+def _take_joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
+    """The joint sample, which is in the history now, or why it is refused; neither where there is none or it was here
+    before.
+    """
+    state, sample = context.state, context.inputs.joints
+    block, room = state.block, context.derived.room
+    numbers, q = block.numbers, context.q
+    if sample is None or sample.seq == numbers.last_joints_seq or sample.t_ns <= numbers.last_joints_ns:
+        take_sample(block.record, room.record, False, 0, 0, False, q)
         return None, None
-    age_s = (inputs.now_ns - sample.t_ns) * 1e-9
-    timeout_s = context.settings.limits.joint_timeout_s
-    if not 0.0 <= age_s <= timeout_s:
-        what = (
-            f"{age_s:.3f} s old, {timeout_s:g} s is allowed"
-            if age_s > 0.0
-            else f"{-age_s:.6g} s in the future"
-        )
-        return None, Reason(
-            "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
-            f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then "
-            "resume",
-        )  # fmt: skip
-    if _is_sound(sample, context):
+    age_s = (context.now_ns - sample.t_ns) * 1e-9
+    in_time = 0.0 <= age_s <= context.settings.limits.joint_timeout_s
+    told = in_time and _has_shape(sample, room.sample)
+    active = state.lifecycle == Lifecycle.ACTIVE
+    if take_sample(block.record, room.record, told, sample.t_ns, sample.seq, active, q) and told:
         return sample, None
-    wrong = _wrong_values(sample, context.settings.joint_names)
-    if wrong:
-        return None, Reason(
-            "JOINT_VALUE", "hold", "", None, None, "",
-            f"joint sample {sample.seq} is refused: {wrong}: check the drive, its encoder and the joint driver; then "
-            "resume",
-        )  # fmt: skip
-    reason = _jump(sample, context) if state.lifecycle == Lifecycle.ACTIVE else None
-    return (sample, None) if reason is None else (None, reason)
+    return None, _late(sample, age_s, context) if not in_time else _wrong(sample, context)
 
 
-def _is_sound(sample: JointState, context: StepContext) -> bool:
-    """Whether nothing is wrong with the values of a joint sample, and, while the drives are on, it is no jump."""
-    values, state = context.derived.samples, context.state
+def _has_shape(sample: JointState, values: FloatArray) -> bool:
+    """Whether all that a sample tells is of every joint; into ``values`` (4, n), what it does not tell being zero."""
     shape = values.shape[1:]
     for row, given in enumerate(
         (sample.positions, sample.velocities, sample.efforts, sample.following_errors)
@@ -309,11 +288,29 @@ def _is_sound(sample: JointState, context: StepContext) -> bool:
         if given.shape != shape:
             return False
         values[row] = given
-    return bool(
-        _sound(
-            values, state.history.positions, state.history.count, (sample.t_ns - state.last_joints_ns) * 1e-9,
-            context.settings.limits.velocity_max, state.lifecycle == Lifecycle.ACTIVE,
-        )
+    return True
+
+
+def _late(sample: JointState, age_s: float, context: StepContext) -> Reason:
+    timeout_s = context.settings.limits.joint_timeout_s
+    what = (
+        f"{age_s:.3f} s old, {timeout_s:g} s is allowed" if age_s > 0.0 else f"{-age_s:.6g} s in the future"
+    )
+    return Reason(
+        "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
+        f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then "
+        "resume",
+    )  # fmt: skip
+
+
+def _wrong(sample: JointState, context: StepContext) -> Reason:
+    wrong = _wrong_values(sample, context.settings.joint_names)
+    if not wrong:
+        return _jump(sample, context)
+    return Reason(
+        "JOINT_VALUE", "hold", "", None, None, "",
+        f"joint sample {sample.seq} is refused: {wrong}: check the drive, its encoder and the joint driver; then "
+        "resume",
     )  # fmt: skip
 
 
@@ -336,16 +333,12 @@ def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
     return ""
 
 
-def _jump(sample: JointState, context: StepContext) -> Reason | None:
-    """The reason where a joint cannot have come from its last position to this one in the time between."""
-    state, settings = context.state, context.settings
-    if state.history.count == 0:
-        return None
-    elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
-    travel = np.abs(sample.positions - state.history.positions[(state.history.count - 1) % HISTORY])
+def _jump(sample: JointState, context: StepContext) -> Reason:
+    """That a joint cannot have come from its last position to this one in the time between."""
+    block, settings = context.state.block, context.settings
+    elapsed_s = (sample.t_ns - block.numbers.last_joints_ns) * 1e-9
+    travel = np.abs(sample.positions - block.history_positions[(block.numbers.history_count - 1) % HISTORY])
     possible = settings.limits.velocity_max * (FASTEST * elapsed_s + STAMP_JITTER_S)
-    if (travel <= possible).all():
-        return None
     j = int((travel / possible).argmax())
     name, value, limit = settings.joint_names[j], float(travel[j]), float(possible[j])
     return Reason(
@@ -364,8 +357,6 @@ def _observations(
     counts its frames anew is known by their stamps, which are checked; numbers alone are not trusted.
     """
     inputs = context.inputs
-    if not inputs.observations:
-        return (), ()
     cameras = context.derived.cameras
     newest = [(estimate.last_seq, estimate.accepted_ns) for estimate in context.state.cameras]
     timeout_s = context.derived.frame_timeout_s
@@ -455,7 +446,7 @@ def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: floa
 
 def forget_travel(state: CoreState) -> None:
     """Begin anew: what the drives did of late was not what they were sent."""
-    state.missing_travel[:] = 0.0
-    state.untold_travel[:] = 0.0
-    state.last_positions = None
-    state.silent_from = None
+    block = state.block
+    block.missing_travel[:] = 0.0
+    block.untold_travel[:] = 0.0
+    block.numbers.followed = block.numbers.silence_known = 0

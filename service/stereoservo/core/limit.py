@@ -232,9 +232,9 @@ def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> S
         SafetyInputs(
             raw=motion.velocity,
             positions=context.q if context.outermost is None else context.outermost,
-            previous=state.command,
+            previous=state.block.command,
             dt_s=context.dt_s,
-            joint_age_s=(context.now_ns - state.last_joints_ns) * 1e-9,
+            joint_age_s=(context.now_ns - state.block.numbers.last_joints_ns) * 1e-9,
             feature_age_s=(context.now_ns - newest_ns) * 1e-9,
             needs_features=motion.needs_features,
             speed_scale=motion.speed_scale * context.settings.limits.speed_scale,
@@ -243,7 +243,7 @@ def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> S
         limits,
     )
     active = state.lifecycle == Lifecycle.ACTIVE
-    state.command = result.limited.copy() if active else np.zeros_like(context.q)
+    state.block.command[:] = result.limited if active else 0.0
     return result
 
 

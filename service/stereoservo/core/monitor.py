@@ -19,11 +19,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.core.block import DELAY_SAMPLES
 from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
@@ -38,7 +38,7 @@ from stereoservo.core.monitor_state import (
     ModelMonitor,
 )
 from stereoservo.core.monitors import camera_relocalization, moving_camera
-from stereoservo.core.monitors.collision import learn_loads, stated_thresholds, worst_contact
+from stereoservo.core.monitors.collision import learn_loads, worst_contact
 from stereoservo.core.monitors.diagnosis import (
     camera_moved_findings,
     emit_diagnosis,
@@ -49,15 +49,8 @@ from stereoservo.core.monitors.fault_isolation import (
     bench_now,
     diagnosed_beside_joint_errors,
 )
-from stereoservo.core.monitors.following import (
-    LAG_S,
-    MEMORY_S,
-    SILENCE_S,
-    not_following,
-    of_kinds,
-    silent,
-)
-from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays, unknown_delays
+from stereoservo.core.monitors.following import LAG_S, MEMORY_S, SILENCE_S, not_following, silent
+from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
@@ -70,9 +63,10 @@ from stereoservo.core.prediction import (
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
 from stereoservo.core.state import CalibrationMotion, CoreState
+from stereoservo.core.workspace import Workspace
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import JointState
 
@@ -153,60 +147,78 @@ GAP_S = 0.5  # without a sample for so long, means are of another time
 
 
 def detect_collision(
-    state: CoreState,
-    settings: CoreSettings,
-    limits: tuple[FloatArray, FloatArray] | None,
-    sample: JointState | None,
+    state: CoreState, settings: CoreSettings, room: Workspace, sample: JointState | None
 ) -> Reason | None:
-    """Account for one step; the reason where a joint (worst first) is in contact.
+    """Account for one step, with the sample's values in the ``room``; the reason where a joint (worst first) is in
+    contact.
 
-    ``state.command`` is still that of the last step. ``limits``: thresholds (n,), (n,) of efforts and following errors.
+    The block's command is still that of the last step.
     """
-    contact = state.contact
-    if sample is None or sample.t_ns <= contact.seen_ns:
+    block = state.block
+    if sample is None or sample.t_ns <= block.numbers.loads_ns:
         return None
-    elapsed_s = (sample.t_ns - contact.seen_ns) * 1e-9 if contact.seen_ns else np.inf
-    contact.seen_ns = sample.t_ns
-    contact.efforts = None if sample.efforts is None else sample.efforts.copy()
-    contact.following_errors = None if sample.following_errors is None else sample.following_errors.copy()
-    efforts = np.array(contact.mean_efforts if sample.efforts is None else sample.efforts, np.float64)
-    following = np.zeros(efforts.shape)
-    if sample.following_errors is not None:
-        following[:] = sample.following_errors
-    forgets = elapsed_s > GAP_S or state.lifecycle != Lifecycle.ACTIVE
-    if forgets:
-        contact.leave_s = 0.0
-    moving = not (forgets or state.stopped) and bool(_moves(state.command))
-    if moving:
-        contact.leave_s = max(0.0, contact.leave_s - elapsed_s)
     learning = isinstance(state.source, CalibrationMotion)
-    thresholds = (stated_thresholds(settings) if moving else None) if learning else limits
-    if thresholds is None:
-        unlimited = _unlimited(efforts.size)
-        thresholds = unlimited, unlimited
-    beyond = _account_loads(
-        efforts, following, contact.mean_efforts, contact.effort_excess, contact.following_excess, contact.low,
-        contact.high, elapsed_s, forgets, moving, contact.leave_s > 0.0, *thresholds,
+    moving, beyond = account_loads(
+        block.record, room.record, sample.t_ns, sample.efforts is not None, sample.following_errors is not None,
+        state.lifecycle == Lifecycle.ACTIVE, state.stopped, learning,
     )  # fmt: skip
-    if not moving:
+    efforts, following = room.sample[2], room.sample[3]
+    if learning and moving:
+        learn_loads(state.source.id, state, np.abs(block.command), efforts, following)  # type: ignore[union-attr]
+    if not (beyond and room.watches_loads):
         return None
-    if learning:
-        learn_loads(state.source.id, contact, np.abs(state.command), efforts, following)  # type: ignore[union-attr]
-    if limits is None or not beyond:
-        return None
-    reason = worst_contact(contact, settings, *thresholds, learning)
+    reason = worst_contact(block, settings, *(room.stated_limits if learning else room.limits), learning)
     if reason is not None:
-        contact.low = np.array([np.minimum(contact.mean_efforts, efforts), np.minimum(following, 0.0)])
-        contact.high = np.array([np.maximum(contact.mean_efforts, efforts), np.maximum(following, 0.0)])
-        contact.leave_s = LEAVE_S
-        contact.effort_excess[:], contact.following_excess[:] = 0.0, 0.0
+        block.contact_low[:] = np.minimum(block.mean_efforts, efforts), np.minimum(following, 0.0)
+        block.contact_high[:] = np.maximum(block.mean_efforts, efforts), np.maximum(following, 0.0)
+        block.numbers.leave_s = LEAVE_S
+        block.effort_excess[:], block.following_excess[:] = 0.0, 0.0
     return reason
 
 
-@lru_cache(maxsize=8)
-def _unlimited(n: int) -> FloatArray:
-    """Thresholds (n,) that nothing reaches; not to be written to."""
-    return np.full(n, np.inf)
+@kernel
+def account_loads(
+    block: Record, room: Record, t_ns: int, tells_efforts: bool, tells_following: bool, active: bool, stopped: bool,
+    learning: bool,
+) -> tuple[bool, bool]:  # fmt: skip
+    """Take the efforts and following errors of a sample at ``t_ns``, in the ``room``, into the ``block``; whether the
+    arm moves and is watched, and whether a joint is beyond a limit then: see `_account_loads`.
+
+    What a sample does not tell, or what is no number, becomes what is expected, in the ``room``, too.
+    """
+    memory, work = block[0], room[0]
+    n, window = memory.joints, memory.window
+    efforts, following = work.sample[2 * n : 3 * n], work.sample[3 * n : 4 * n]
+    mean = memory.mean_efforts[:n]
+    elapsed_s = (t_ns - memory.loads_ns) * 1e-9 if memory.loads_ns > 0 else math.inf
+    memory.loads_ns, memory.tells_efforts, memory.tells_following = (
+        t_ns,
+        int(tells_efforts),
+        int(tells_following),
+    )
+    for j in range(n):
+        if tells_efforts:
+            memory.efforts[j] = efforts[j]
+        else:
+            efforts[j] = mean[j]
+        if tells_following:
+            memory.following_errors[j] = following[j]
+    forgets = elapsed_s > GAP_S or not active
+    if forgets:
+        memory.leave_s = 0.0
+    moving = not (forgets or stopped) and _moves(memory.command[:n])
+    if moving:
+        memory.leave_s = max(0.0, memory.leave_s - elapsed_s)
+    effort_limits, following_limits = work.effort_limits[:n], work.following_limits[:n]
+    if learning:
+        effort_limits, following_limits = work.stated_effort_limits[:n], work.stated_following_limits[:n]
+    beyond = _account_loads(
+        efforts, following, mean, memory.effort_excess[: window * n].reshape((window, n)),
+        memory.following_excess[: window * n].reshape((window, n)), memory.contact_low[: 2 * n].reshape((2, n)),
+        memory.contact_high[: 2 * n].reshape((2, n)), elapsed_s, forgets, moving, memory.leave_s > 0.0, effort_limits,
+        following_limits,
+    )  # fmt: skip
+    return moving, beyond and moving
 
 
 @kernel
@@ -223,7 +235,7 @@ def _account_loads(
     following_excess: FloatArray, low: FloatArray, high: FloatArray, elapsed_s: float, forgets: bool, moving: bool,
     leaving: bool, effort_limits: FloatArray, following_limits: FloatArray,
 ) -> bool:  # fmt: skip
-    """Take a sample's ``efforts`` and ``following`` errors (n,) into the arrays of a `Contact`; whether all samples of
+    """Take a sample's ``efforts`` and ``following`` errors (n,) into the arrays of the block; whether all samples of
     a window are beyond a limit on one side, or a limit is none.
 
     Readings that are no numbers become what is expected. The mean begins anew where it ``forgets`` (the drives were
@@ -269,54 +281,83 @@ def _push(window: FloatArray, newest: float) -> float:
     return max(least, -most, 0.0)
 
 
+FOLLOWS, LACKS, SILENT = range(3)
+"""What `account_following` has found."""
+
+
 def detect_following_error(
-    state: CoreState, settings: CoreSettings, q: FloatArray, dt_s: float
+    state: CoreState, settings: CoreSettings, room: Workspace, q: FloatArray, dt_s: float
 ) -> Reason | None:
     """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
 
-    ``state.command`` is still that of the last step. A joint's missing travel is its commanded minus its measured one,
-    forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What is
-    sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
+    The block's command is still that of the last step. A joint's missing travel is its commanded minus its measured
+    one, forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What
+    is sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
     ends, too. Without a new joint sample nothing is concluded: stale samples are the safety stage's affair.
     """
-    delays = state.delays
-    if delays is None:
-        delays = state.delays = unknown_delays(settings)
-    if state.silent_from is None:
-        state.silent_from, state.silent_travel, state.silent_s = q.copy(), np.zeros_like(q), np.zeros_like(q)
-    play, answers, friction = of_kinds(settings.joint_kinds, settings.resolution)
-    measure_delays(state.command, q, answers, dt_s, delays.sent, delays.onset, delays.samples, delays.delay_s)
-    last = q if state.last_positions is None else state.last_positions
-    if state.last_positions is None:
-        delays.missing[:] = 0.0
-        delays.accounted = delays.sent.copy()
-    told = state.last_joints_ns != state.last_followed_ns
-    account_travel(
-        state.command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, 1.0 / settings.rate_hz, delays.steps,
-        answers,
-        (delays.delay_s, delays.sent, delays.past, delays.velocity, delays.under_way, delays.accounted, delays.missing),
-        delays.samples, state.untold_travel, state.missing_travel,
-    )  # fmt: skip
-    delays.steps += 1
-    account_silence(
-        q, delays.velocity, answers, friction, dt_s, state.silent_from, state.silent_travel, state.silent_s
+    block, numbers = state.block, room.numbers
+    found = account_following(block.record, room.record, q, dt_s)
+    if found == FOLLOWS:
+        return None
+    joint = numbers.worst
+    if found == LACKS:
+        lag, delay_s = LAG_S * settings.limits.velocity_max, block.delay_s
+        return not_following(joint, numbers.missing, float(lag[joint]), float(delay_s[joint]), settings)
+    return silent(joint, float(block.silent_travel[joint]), float(block.silent_s[joint]), settings)
+
+
+@kernel
+def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -> int:
+    """Account for ``dt_s`` of the last command with the joints at ``q`` (n,), in the ``block``; what was found, of
+    which joint and how much is missing being in the ``room``.
+    """
+    memory, work = block[0], room[0]
+    n, past = memory.joints, memory.past
+    command, answers = memory.command[:n], work.answers[:n]
+    last, delay_s, sent = memory.last_positions[:n], memory.delay_s[:n], memory.delay_sent[:n]
+    samples = memory.delay_samples[: DELAY_SAMPLES * n].reshape((DELAY_SAMPLES, n))
+    accounted, missing_late = memory.delay_accounted[:n], memory.delay_missing[:n]
+    silent_from, silent_travel, silent_s = (
+        memory.silent_from[:n],
+        memory.silent_travel[:n],
+        memory.silent_s[:n],
     )
+    untold, missing, velocity = memory.untold_travel[:n], memory.missing_travel[:n], memory.delay_velocity[:n]
+    if memory.silence_known == 0:
+        silent_from[:], silent_travel[:], silent_s[:] = q, 0.0, 0.0
+        memory.silence_known = 1
+    onset = memory.delay_onset[: 7 * n].reshape((7, n))
+    measure_delays(command, q, answers, dt_s, sent, onset, samples, delay_s)
+    if memory.followed == 0:
+        last[:], missing_late[:], accounted[:] = q, 0.0, sent
+    told = memory.last_joints_ns != memory.last_followed_ns
+    account_travel(
+        command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, work.period_s, memory.delay_steps, answers,
+        (
+            delay_s, sent, memory.delay_past[: past * n].reshape((past, n)), velocity, memory.delay_under_way[:n],
+            accounted, missing_late,
+        ),
+        samples, untold, missing,
+    )  # fmt: skip
+    memory.delay_steps += 1
+    account_silence(q, velocity, answers, work.friction[:n], dt_s, silent_from, silent_travel, silent_s)
     if not told:
-        return None
-    state.last_followed_ns = state.last_joints_ns
-    state.last_positions = q.copy()
-    allowed = LAG_S * settings.limits.velocity_max
-    joint, missing = worst_follower(allowed, state.missing_travel, delays.missing)
-    if joint >= 0:
-        state.missing_travel[:] = 0.0
-        delays.missing[:] = 0.0
-        return not_following(joint, missing, float(allowed[joint]), float(delays.delay_s[joint]), settings)
-    share = np.abs(state.silent_travel) / play * (state.silent_s > SILENCE_S)
-    joint = int(share.argmax())
-    if share[joint] <= 1.0:
-        return None
-    state.silent_from = None
-    return silent(joint, float(state.silent_travel[joint]), float(state.silent_s[joint]), settings)
+        return FOLLOWS
+    memory.last_followed_ns, memory.followed = memory.last_joints_ns, 1
+    last[:] = q
+    work.worst, work.missing = worst_follower(work.lag[:n], missing, missing_late)
+    if work.worst >= 0:
+        missing[:], missing_late[:] = 0.0, 0.0
+        return LACKS
+    most = 1.0
+    for j in range(n):
+        share = abs(silent_travel[j]) / work.play[j]
+        if silent_s[j] > SILENCE_S and share > most:
+            work.worst, most = j, share
+    if most > 1.0:
+        memory.silence_known = 0
+        return SILENT
+    return FOLLOWS
 
 
 @kernel
@@ -355,9 +396,7 @@ def account_silence(
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
     """The arm has met something: it stops with its drives on, as if a person had stopped it."""
-    reason = detect_collision(
-        context.state, context.settings, context.derived.load_limits, context.ingested.joints
-    )
+    reason = detect_collision(context.state, context.settings, context.derived.room, context.ingested.joints)
     if reason is None:
         return ()
     return (Finding("stop", reason, reason.hint, f"contact: {reason.hint}"),)
@@ -366,11 +405,12 @@ def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
 def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
     state = context.state
-    if not context.settings.watch_following or state.history.count == 0:
+    if not context.settings.watch_following or state.block.numbers.history_count == 0:
         return ()
-    reason = detect_following_error(state, context.settings, context.q, context.ingested.elapsed_s)
+    room, elapsed_s = context.derived.room, context.ingested.elapsed_s
+    reason = detect_following_error(state, context.settings, room, context.q, elapsed_s)
     if state.lifecycle != Lifecycle.ACTIVE:
-        state.silent_from = None  # what was sent before is no matter of what is sent next
+        state.block.numbers.silence_known = 0  # what was sent before is no matter of what is sent next
         return ()  # an arm that is off may be moved by hand
     if reason is None:
         return ()
@@ -419,8 +459,12 @@ LATEST_MODEL_PX = 0.1
 def finish_round(context: StepContext) -> ModelDiagnosis | None:
     """Finish a round where one is complete; the new verdict where it has changed."""
     watching, arrays = context.state.watching, context.arrays
-    if arrays is None or not (watching.due or all(not s.looked for s in watching.sightings)):
+    if arrays is None:
         return None
+    if not watching.due:
+        for sighting in watching.sightings:
+            if sighting.looked:
+                return None
     if context.state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
         return None  # joints that a faulty drive tells are no measure of cameras
     watching.due = False

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,7 +27,7 @@ from stereoservo.kinematics.kernels import (
     triangulate,
     undistort_pixel,
 )
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
@@ -252,45 +251,22 @@ LARGE_CORRECTION = 3e-3
 FURTHER_STEPS = 3
 
 
-class CameraSights(NamedTuple):
-    """What all cameras said, per marker: the arrays of their `CameraEstimate`, (c, m, 2), (c, m), (c, m)."""
-
-    innovation: FloatArray
-    sigma: FloatArray
-    seen_ns: IntArray
-
-
-def shared_sights(cameras: list[CameraEstimate]) -> CameraSights:
-    """The arrays of ``cameras`` in one block each, of which each camera has its row from here on."""
-    sights = CameraSights(
-        np.array([camera.innovation for camera in cameras]),
-        np.array([camera.sigma for camera in cameras]),
-        np.array([camera.seen_ns for camera in cameras]),
-    )
-    for camera, *rows in zip(cameras, *sights, strict=True):
-        camera.innovation, camera.sigma, camera.seen_ns = rows
-    return sights
-
-
-def present(
-    arrays: ModelArrays, q: FloatArray, sights: CameraSights, now_ns: int, coast_s: float
-) -> tuple[Prediction, FloatArray, FloatArray, FloatArray]:
-    """The present at ``q`` (n,): the markers by kinematics, the weights (c, m) and pixels (c, m, 2) of what the cameras
-    saw of late, and the correction (n,) of the joints; see `_present`.
+@kernel
+def present(block: Record, room: Record, q: FloatArray, now_ns: int) -> None:
+    """Into the ``room``, the present at ``q`` (n,): the markers by kinematics, the weights and pixels of what the
+    cameras saw of late; into the ``block``, the correction of the joints. See `_present`.
     """
-    n, (cameras, markers) = q.size, sights.sigma.shape
-    prediction = room(n, cameras, markers)
-    weights, pixels, correction = (
-        np.empty((cameras, markers)),
-        np.empty((cameras, markers, 2)),
-        np.empty(n),
-    )
+    memory, work = block[0], room[0]
+    n, c, m = memory.joints, memory.cameras, memory.markers
     _present(
-        arrays.generators, arrays.kinds, arrays.zero, q, arrays.tip_first, arrays.marker_points, arrays.matrices,
-        *sights, now_ns, int(coast_s * 1e9) + SEEN_SLACK_NS, prediction.operators, prediction.points, prediction.pixels,
-        prediction.jacobian, weights, pixels, correction,
+        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], q, work.tip_first != 0,
+        work.marker_points[: 4 * m].reshape((m, 4)), work.matrices[: 12 * c].reshape((c, 3, 4)),
+        memory.innovation[: 2 * c * m].reshape((c, m, 2)), memory.sigma[: c * m].reshape((c, m)),
+        memory.seen_ns[: c * m].reshape((c, m)), now_ns, work.lasting_ns, work.operators[: 16 * n].reshape((n, 4, 4)),
+        work.points[: 4 * m].reshape((m, 4)), work.predicted[: 2 * c * m].reshape((c, m, 2)),
+        work.jacobian[: 2 * c * m * n].reshape((c, m, 2, n)), work.weights[: c * m].reshape((c, m)),
+        work.pixels[: 2 * c * m].reshape((c, m, 2)), memory.correction[:n],
     )  # fmt: skip
-    return prediction, weights, pixels, correction
 
 
 @kernel

@@ -41,7 +41,7 @@ def report(
         finish(motion, context)
     state.step += 1
     return StepOutputs(
-        command=state.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
+        command=state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
         status=_status(context, motion, limited),
         priors=_priors(context),
         events=tuple(events),
@@ -50,7 +50,7 @@ def report(
 
 
 def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
-    state, settings = context.state, context.settings
+    state, settings, block = context.state, context.settings, context.state.block
     masked = masked_ids(state)
     diagnosis = shown_diagnosis(state.watching.verdict, masked)
     reasons = _reasons(context, motion, limited, diagnosis)
@@ -73,17 +73,17 @@ def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -
         level=_level(reasons),
         reasons=reasons,
         positions=context.q,
-        velocities=state.velocities.copy(),
+        velocities=state.block.velocities.copy(),
         command_raw=motion.velocity,
-        command=state.command.copy(),
+        command=state.block.command.copy(),
         error_px=motion.error_px,
         task_error=motion.task_error,
         innovation_px=innovation_px,
         visible=visible,
         progress=done,
         seconds_left=left_s,
-        efforts=state.contact.efforts,
-        following_errors=state.contact.following_errors,
+        efforts=block.efforts.copy() if block.numbers.tells_efforts else None,
+        following_errors=block.following_errors.copy() if block.numbers.tells_following else None,
         effort_limits=effort_limits,
         following_limits=following_limits,
         health=_health(context, diagnosis, masked),
@@ -145,7 +145,9 @@ def _priors(context: StepContext) -> tuple[Prior, ...]:
     unknown: tuple[str, ...] = ()
     if state.reanchoring is not None or any(state.mobile):
         arrays, prediction, cameras, unknown = moving_camera.to_look_from(arrays, context)
-    return priors(arrays, context.settings, prediction, cameras, state.velocities, context.now_ns, unknown)
+    return priors(
+        arrays, context.settings, prediction, cameras, state.block.velocities, context.now_ns, unknown
+    )
 
 
 def _level(reasons: tuple[Reason, ...]) -> str:

@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS
+from stereoservo.core.block import steps_of_delay
 from stereoservo.core.context import Derived, Ingested, StepContext
 from stereoservo.core.cycle import Event, StepInputs, StepOutputs
-from stereoservo.core.estimate import estimate, load_limits
+from stereoservo.core.estimate import estimate, load_limits, workspace
 from stereoservo.core.execute_goals import execute_goals
 from stereoservo.core.ingest import (
     features_fresh_s,
@@ -37,7 +38,6 @@ from stereoservo.core.limit import limit, safety_limits
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitor import monitor
 from stereoservo.core.move import move
-from stereoservo.core.prediction import shared_sights
 from stereoservo.core.report import report
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, initial_state
@@ -52,6 +52,9 @@ class ServoCore:
     def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
         self.settings = settings
         self.state = initial_state(settings) if state is None else state
+        block, past = self.state.block, steps_of_delay(settings.rate_hz)
+        if block.numbers.past != past:  # of a state that was written before drives were known to be late
+            block.remember_steps(past)
         model = self.state.model
         self._derived = Derived(
             nominal_period_ns=nominal_period_ns(settings),
@@ -60,12 +63,12 @@ class ServoCore:
             features_fresh_s=features_fresh_s(settings),
             laws=LAWS.usable(),
             cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
-            samples=np.zeros((4, len(settings.joint_names))),
+            room=workspace(settings, model),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
-            arrays=None if model is None else model_arrays(model, settings),
             load_limits=load_limits(settings, model),
-            sights=None if model is None else shared_sights(self.state.cameras),
         )
+        if model is not None:
+            self._derived.use(model_arrays(model, settings))
         self._limits = safety_limits(settings, self._derived.features_fresh_s)
 
     def step(self, inputs: StepInputs) -> StepOutputs:
@@ -99,6 +102,6 @@ class ServoCore:
             self.settings,
             self._derived,
             emit,
-            state.command,
+            np.empty(state.block.command.size),
             NOTHING,
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,3 +12,5 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 KindArray = npt.NDArray[np.uint8]
 ImageArray = npt.NDArray[np.uint8]
+Record = Any
+"""An array (1,) of a structured type: `core.block.BLOCK` and its like."""

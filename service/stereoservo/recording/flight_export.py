@@ -18,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from stereoservo.core.cycle import Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import decode_state
+from stereoservo.core.state_encoding import decode_state
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import RunGoal
 from stereoservo.messages.recording_request import images_directory

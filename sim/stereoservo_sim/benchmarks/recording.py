@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from stereoservo.core.cycle import StepInputs, StepOutputs, encode
-from stereoservo.core.state import encode_state
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.daemon.ipc_messages import pack_step_message, unpack_step_message
 from stereoservo.daemon.lockstep import LockstepCell
 from stereoservo.daemon.record_ring import RingReader, RingWriter

@@ -96,7 +96,7 @@ def place_now(context: StepContext) -> BodyState:
     arrays, prediction = context.arrays, context.prediction
     assert arrays is not None
     assert prediction is not None
-    points = markers_at(arrays, context.q + context.state.correction)
+    points = markers_at(arrays, context.q + context.state.block.correction)
     seen = (
         np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
     )
@@ -106,7 +106,8 @@ def place_now(context: StepContext) -> BodyState:
         faces = find_faces(
             points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators
         )
-    return BodyState(context.settings, arrays, points, prediction.operators, faces)
+    # The goal may be resolved over several steps: what the room holds is of this one.
+    return BodyState(context.settings, arrays, points, prediction.operators.copy(), faces)
 
 
 def view_of(settings: CoreSettings, arrays: ModelArrays, points: FloatArray) -> tuple[FloatArray, FloatArray]:

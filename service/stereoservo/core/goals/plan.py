@@ -60,7 +60,7 @@ def begin_plan(job: PlanJob, context: StepContext) -> None:
 def plan_again(source: ServoGoal, context: StepContext) -> PlanJob:
     """Begin to plan the way of the active ``source`` anew, from where the body is. Raises RefusalError."""
     assert context.arrays is not None
-    points = markers_at(context.arrays, context.q + context.state.correction)
+    points = markers_at(context.arrays, context.q + context.state.block.correction)
     job = PlanJob(
         request=-1,
         purpose="again",
@@ -94,7 +94,7 @@ def _plan_request(
         points=points.copy(),
         targets=source.target_points.copy(),
         kept=kept,
-        centre=centre_of(source, joints + context.state.correction, arrays, points),
+        centre=centre_of(source, joints + context.state.block.correction, arrays, points),
         centre_target=source.centre_target.copy(),
         faces=kept_faces(source.faces, points, source.target_points, arrays.camera_centres[used]),
         limits=PlanLimits(

@@ -56,7 +56,7 @@ def prepare(
     job = PlanJob(
         request=request, purpose=purpose, source=None, planning=None,
         joints=(context.q if joints is None else joints).copy(), points=body.points.copy(), goal=goal,
-        resolution=begin_resolution(body, context.q + context.state.correction, law.needs_goal_pose),
+        resolution=begin_resolution(body, context.q + context.state.block.correction, law.needs_goal_pose),
     )  # fmt: skip
     if body.arrays.sights <= AT_ONCE:
         set_up(job, context)

@@ -152,7 +152,9 @@ def step(context: StepContext) -> None:
     if isinstance(state.source, PoseMeasurement):
         state.reanchoring = None  # what calibrates, or checks, needs no model of before
         return
-    resting = bool((np.abs(state.command) < AT_REST).all() and (np.abs(state.velocities) < RESTING).all())
+    resting = bool(
+        (np.abs(state.block.command) < AT_REST).all() and (np.abs(state.block.velocities) < RESTING).all()
+    )
     if run.phase in ("collect", "wait", "failed") and _moved_again(run, context):
         return
     if run.phase == "brake":

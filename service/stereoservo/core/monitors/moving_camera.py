@@ -154,7 +154,7 @@ def _known(
     """Points (k, 4) where the joints ``q``, corrected, have them, with the static ones; what the camera saw of them
     (k, 2) and its weights (k,) [1/px].
     """
-    H = chain_at(arrays, q + state.correction)[0]
+    H = chain_at(arrays, q + state.block.correction)[0]
     points = np.concatenate((transform_points(H, arrays.marker_points), arrays.scene_points))
     observed = np.concatenate((prediction.pixels[0], arrays.scene_pixels[camera])) + sights.innovation
     variance = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
@@ -345,7 +345,7 @@ def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
     """A camera that rests, sees enough and is lost all the same is found anew like one that was bumped."""
     state, settings = context.state, context.settings
     waited_s = (context.now_ns - mobile.found_ns) * 1e-9
-    resting = bool((np.abs(state.command) < AT_REST).all())
+    resting = bool((np.abs(state.block.command) < AT_REST).all())
     if (
         waited_s < HAND_OVER_S
         or mobile.seen < FEWEST
@@ -383,7 +383,7 @@ def to_look_from(
         if mobile.place == "lost":
             unknown = (*unknown, settings.cameras[c].name)
     here = _arrays_with(arrays, matrices)
-    corrected = predict(here, context.q + state.correction)
+    corrected = predict(here, context.q + state.block.correction)
     pixels, jacobian = context.prediction.pixels.copy(), context.prediction.jacobian.copy()
     pixels[moving], jacobian[moving] = corrected.pixels[moving], corrected.jacobian[moving]
     return (

@@ -91,7 +91,7 @@ def _move(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
         if trials.phase == "finish":
             context.emit(
                 "calibration_finished", id=trials.id, message="trial motions done", progress=1.0,
-                loads=learnt_loads(trials.id, context.state.contact),
+                loads=learnt_loads(trials.id, context.state),
             )  # fmt: skip
             return _rest(context, finished=True)
         if trials.phase == "return":
@@ -148,7 +148,7 @@ def _record_way(trials: CalibrationMotion, context: StepContext) -> None:
                     np.asarray(observation.ids[chosen], dtype=np.int64), np.array(observation.pixels[chosen]),
                 )
             )  # fmt: skip
-    now_ns = context.state.last_joints_ns
+    now_ns = context.state.block.numbers.last_joints_ns
     due = not trials.way_ns or now_ns - trials.way_ns[-1] >= WAY_APART_NS
     if due and len(trials.way_ns) < WAY_JOINTS:
         trials.way_ns.append(now_ns)

@@ -238,7 +238,7 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     if arrays is None or prediction is None or weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")
     usable = weights * source.used[:, None]
-    points = points_now(arrays, context.q, pixels, usable, context.state.correction, source.points)
+    points = points_now(arrays, context.q, pixels, usable, context.state.block.correction, source.points)
     scene = scene_of(prediction, pixels, arrays, points, usable)
     task, how = _task(source), options(source, context, source.error_px)
     second = _second(source, context, scene, how.gain)

@@ -88,8 +88,8 @@ def goal_error(
     usable, points, centre = np.empty(weights.shape), np.empty(arrays.marker_points.shape), np.empty(4)
     measured, error_px, seen = _goal_error(
         weights, source.used, source.wanted, pixels, source.set_points, arrays.generators, arrays.kinds,
-        arrays.zero, context.q, context.state.correction, arrays.tip_first, arrays.marker_points, source.centre_weights,
-        source.centre_body, usable, points, centre,
+        arrays.zero, context.q, context.state.block.correction, arrays.tip_first, arrays.marker_points,
+        source.centre_weights, source.centre_body, usable, points, centre,
     )  # fmt: skip
     return GoalError(usable, error_px if measured else None, seen, points, centre)
 
@@ -183,7 +183,7 @@ def scene_and_task(
     points, centre = found.points, found.centre
     if source.points == "triangulated":
         points = triangulated(arrays, pixels, found.usable, points)
-        centre = centre_of(source, context.q + context.state.correction, arrays, points)
+        centre = centre_of(source, context.q + context.state.block.correction, arrays, points)
     scene = scene_of(prediction, pixels, arrays, points, found.usable)
     task = Task(
         source.set_points,
@@ -463,7 +463,7 @@ def _examine_progress(
 
 
 def _near_limits(context: StepContext) -> list[Reason]:
-    limits, moving = context.settings.limits, context.state.command
+    limits, moving = context.settings.limits, context.state.block.command
     found = []
     for j, name in enumerate(context.settings.joint_names):
         for bound, side in ((limits.position_max[j], 1.0), (limits.position_min[j], -1.0)):

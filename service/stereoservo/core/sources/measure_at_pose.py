@@ -150,7 +150,7 @@ def at_target(visit: PoseMeasurement, context: StepContext) -> bool:
     return (
         arrived(context.q, visit.target, context.settings)
         and arrived(joints_ahead(context), visit.target, context.settings)
-        and bool((np.abs(context.state.command) < AT_REST).all())
+        and bool((np.abs(context.state.block.command) < AT_REST).all())
     )
 
 

@@ -31,11 +31,11 @@ def start_teaching(command: Teach, request: Request, context: StepContext) -> st
         )
     refuse_while_moved(state)
     refuse_moving(moving_cameras(state, context.settings))
-    if bool((np.abs(state.command) > AT_REST).any()):
+    if bool((np.abs(state.block.command) > AT_REST).any()):
         raise RefusalError(
             "MOVING",
             "the arm moves; a goal is taught at rest",
-            value=float(np.abs(state.command).max()),
+            value=float(np.abs(state.block.command).max()),
             threshold=AT_REST,
             unit="rad/s or m/s",
         )
@@ -51,7 +51,7 @@ def teach_step(context: StepContext) -> None:
     teaching = state.teaching
     if teaching is None:
         return
-    if bool((np.abs(state.command) > AT_REST).any()):
+    if bool((np.abs(state.block.command) > AT_REST).any()):
         _give_up(teaching, context, "the arm moved")
         return
     if state.reanchoring is not None or moving_cameras(state, settings):

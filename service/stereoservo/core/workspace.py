@@ -1,0 +1,101 @@
+"""What compiled kernels take beside the block: the constants of settings and model, and room for the results of one
+step, as one flat record of fixed size. Nothing of it is remembered: it follows from settings, model and block.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+
+from stereoservo.core.block import JOINTS, Shapes, packed_type, views
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitors.following import LAG_S, of_kinds
+from stereoservo.core.prediction import SEEN_SLACK_NS, Prediction
+from stereoservo.core.settings import CoreSettings
+from stereoservo.numerics.arrays import FloatArray
+
+
+class Numbers(ctypes.Structure):
+    """The numbers at the head of the record."""
+
+    period_s: float
+    lasting_ns: int
+    tip_first: int
+    worst: int
+    missing: float
+    _fields_ = [
+        (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
+        for name, kind in __annotations__.items()
+    ]
+
+
+ARRAYS: Shapes = {
+    "velocity_max": JOINTS, "lag": JOINTS, "play": JOINTS, "answers": JOINTS, "friction": JOINTS,
+    "effort_limits": JOINTS, "following_limits": JOINTS, "stated_effort_limits": JOINTS,
+    "stated_following_limits": JOINTS, "generators": ("joints", 4, 4), "kinds": JOINTS, "zero": JOINTS,
+    "marker_points": ("markers", 4), "matrices": ("cameras", 3, 4),
+    "sample": (4, "joints"), "operators": ("joints", 4, 4), "points": ("markers", 4),
+    "predicted": ("cameras", "markers", 2), "jacobian": ("cameras", "markers", 2, "joints"),
+    "weights": ("cameras", "markers"), "pixels": ("cameras", "markers", 2),
+}  # fmt: skip
+WORKSPACE = packed_type(Numbers, ARRAYS, {"kinds": np.uint8})
+Limits = tuple[FloatArray, FloatArray]
+
+
+class Workspace:
+    """Constants and room; ``record`` (1,) of type `WORKSPACE` is all of it, and what kernels take.
+
+    Of the settings: ``period_s`` of the loop; ``velocity_max`` (n,); the ``lag`` [rad or m] of a healthy joint's drive
+    and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for how long a sight has a weight,
+    ``lasting_ns``. Limits (n,) of efforts and following errors: of the model, and those that the cell file states. Of
+    the model: as in `ModelArrays`.
+
+    Of a step: the ``sample`` (4, n) of the joints (positions, velocities, efforts, following errors), the fields of its
+    ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2), and the joint that follows ``worst``, with what it is
+    ``missing``.
+    """
+
+    def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
+        self.record: np.ndarray[Any, Any] = np.zeros(1, WORKSPACE)
+        self._counts = {"joints": len(settings.joint_names), "cameras": len(settings.cameras), "markers": 0}
+        self._arrays: dict[str, Any] = {}
+        self._view()
+        self.numbers = Numbers.from_buffer(self.record.view(np.uint8).data)
+        self.numbers.period_s = 1.0 / settings.rate_hz
+        self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
+        given = self._arrays
+        given["velocity_max"][:] = settings.limits.velocity_max
+        given["lag"][:] = LAG_S * settings.limits.velocity_max
+        given["play"][:], given["answers"][:], given["friction"][:] = of_kinds(
+            settings.joint_kinds, settings.resolution
+        )
+        self.limit_loads(load_limits)
+        efforts, following = stated
+        given["stated_effort_limits"][:], given["stated_following_limits"][:] = efforts, following
+
+    def limit_loads(self, limits: Limits | None) -> None:
+        """Collision thresholds (n,), (n,) from here on; None: nothing reaches them."""
+        self.watches_loads = limits is not None
+        efforts, following = limits or (np.inf, np.inf)
+        self._arrays["effort_limits"][:], self._arrays["following_limits"][:] = efforts, following
+
+    def use(self, arrays: ModelArrays) -> None:
+        """Work with a model from here on."""
+        self._counts["markers"] = len(arrays.marker_points)
+        self._view()
+        self.numbers.tip_first = arrays.tip_first
+        for name in ("generators", "kinds", "zero", "marker_points", "matrices"):
+            self._arrays[name][:] = getattr(arrays, name)
+
+    def _view(self) -> None:
+        given = self._arrays = views(self.record, ARRAYS, self._counts)
+        self.sample: FloatArray = given["sample"]
+        self.limits: Limits = given["effort_limits"], given["following_limits"]
+        self.stated_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
+        self.weights: FloatArray = given["weights"]
+        self.pixels: FloatArray = given["pixels"]
+        self.prediction = Prediction(
+            given["operators"], given["points"], given["predicted"], given["jacobian"]
+        )
