@@ -48,7 +48,7 @@ def recorded(path: Path, kinds: tuple[str, ...] = ()) -> list[str]:
     """
     from stereoservo.control.marker_groups import with_groups
     from stereoservo.core.cycle import StepInputs, encode
-    from stereoservo.core.state import encode_state
+    from stereoservo.core.state_encoding import encode_state
     from stereoservo.messages.goals import (
         DisplacementTarget,
         Goal,
@@ -111,7 +111,7 @@ def counts(path: Path) -> dict[str, tuple[int, int]]:
     from stereoservo.core.cycle import StepInputs, decode_array
     from stereoservo.core.servo_core import ServoCore
     from stereoservo.core.settings import CoreSettings
-    from stereoservo.core.state import decode_state
+    from stereoservo.core.state_encoding import decode_state
 
     found = {}
     for step in msgspec.msgpack.decode(path.read_bytes(), type=list[RecordedStep]):

@@ -13,7 +13,8 @@ from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.monitors import collision
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings, CoreSettings
-from stereoservo.core.state import CoreState, decode_state, encode_state, initial_state
+from stereoservo.core.state import CoreState, initial_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.messages.goals import Calibrate, Enable, Goal, Jog, JointTarget, Resume, RunGoal
 from stereoservo.messages.status import Lifecycle
@@ -59,7 +60,7 @@ def fly(
     for k in range(count):
         state.command = np.full(N, command)
         sample = JointState(
-            k, state.contact.seen_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
+            k, state.block.loads_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
         )  # fmt: skip
         reason = monitor.detect_collision(state, settings, limits, sample)
@@ -161,8 +162,8 @@ def test_drives_that_tell_nothing_are_not_watched(settings: CoreSettings) -> Non
         monitor.detect_collision(state, settings, collision.collision_thresholds(settings, None), sample)
         is None
     )
-    assert state.contact.efforts is None
-    assert state.contact.following_errors is None
+    assert state.efforts is None
+    assert state.following_errors is None
     lags = np.zeros((40, N))
     lags[20:, 2] = np.nan  # one that is not a number says nothing either
     assert fly(state, settings, following=lags) == []
@@ -181,7 +182,7 @@ def test_the_expected_effort_follows_with_its_time_constant_at_any_rate(
     flown = {"command": command, "step_ns": 1_000_000_000 // rate_hz}
     fly(state, settings, np.zeros((20, N)), **flown)
     assert fly(state, settings, np.tile(load, (round(2.0 * constant_s * rate_hz), 1)), **flown) == []
-    left = 1.0 - state.contact.mean_efforts[1] / load[1]
+    left = 1.0 - state.block.mean_efforts[1] / load[1]
     assert np.exp(-2.0) < left < np.exp(-2.0 + 1.0 / (constant_s * rate_hz))
 
 
@@ -331,25 +332,25 @@ def test_switched_off_means_off(bench: Any) -> None:
 def test_efforts_are_learnt_where_one_joint_moves_alone(bench: Any, speed: float) -> None:
     """Alone: the others' speeds are at most ``ALONE`` of the fastest's."""
     for share, learnt in ((0.8, 2.0), (1.2, 0.0)):
-        contact = initial_state(bench.settings).contact
-        contact.effort_excess = np.full_like(contact.effort_excess, -2.0)
+        state = initial_state(bench.settings)
+        state.block.effort_excess[:] = -2.0
         speeds = speed * np.array([0.0, share * collision.ALONE, 0.0, 1.0, 0.0, 0.0])
-        collision.learn_loads("trials", contact, speeds, GRAVITY, np.zeros(N))
-        assert contact.loads is not None
-        np.testing.assert_array_equal(contact.loads.efforts, learnt * np.tile(np.eye(N)[3], (N, 1)))
-        np.testing.assert_array_equal(contact.loads.velocities, speeds)
-        np.testing.assert_array_equal(contact.loads.largest_efforts, np.abs(GRAVITY))
+        collision.learn_loads("trials", state, speeds, GRAVITY, np.zeros(N))
+        assert state.loads is not None
+        np.testing.assert_array_equal(state.loads.efforts, learnt * np.tile(np.eye(N)[3], (N, 1)))
+        np.testing.assert_array_equal(state.loads.velocities, speeds)
+        np.testing.assert_array_equal(state.loads.largest_efforts, np.abs(GRAVITY))
 
 
 @pytest.mark.parametrize(("former", "now"), [("1", "2"), ("2", "1")])
 def test_loads_of_other_trials_are_not_these_trials_loads(bench: Any, former: str, now: str) -> None:
-    contact = initial_state(bench.settings).contact
-    contact.efforts = GRAVITY
-    collision.learn_loads(former, contact, np.full(N, 0.9), 10.0 * GRAVITY, np.zeros(N))
-    assert collision.learnt_loads(former, contact) is not None
-    assert collision.learnt_loads(now, contact) is None
-    collision.learn_loads(now, contact, np.full(N, 0.5), GRAVITY, np.zeros(N))
-    loads = collision.learnt_loads(now, contact)
+    state = initial_state(bench.settings)
+    state.block.tells_efforts = 1
+    collision.learn_loads(former, state, np.full(N, 0.9), 10.0 * GRAVITY, np.zeros(N))
+    assert collision.learnt_loads(former, state) is not None
+    assert collision.learnt_loads(now, state) is None
+    collision.learn_loads(now, state, np.full(N, 0.5), GRAVITY, np.zeros(N))
+    loads = collision.learnt_loads(now, state)
     assert loads is not None
     assert loads.velocities == pytest.approx(0.5)
     assert loads.largest_efforts == pytest.approx(np.abs(GRAVITY))

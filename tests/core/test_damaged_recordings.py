@@ -13,7 +13,7 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.core.cycle import decode_array, encode
-from stereoservo.core.state import encode_state
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.recording import flight_recorder
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.recorded_motion import read_motion

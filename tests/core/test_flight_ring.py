@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from stereoservo.core.state import encode_state
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.recording import ring as ring_module
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.ring import FlightRing, RingLimits, RingThread

@@ -11,7 +11,6 @@ import pytest
 
 from stereoservo.core.monitor import detect_following_error
 from stereoservo.core.monitors.following import PLAY, SILENCE_S
-from stereoservo.core.move import unknown_delays
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import CoreState, initial_state
 from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Jog, JointTarget, Reset
@@ -32,7 +31,7 @@ def watched(
     for k, command in enumerate(commands):
         q = np.zeros(len(settings.joint_names))
         q[0] = readings[k - k % every]
-        state.last_joints_ns = 1 + k - k % every
+        state.block.last_joints_ns = 1 + k - k % every
         reason = detect_following_error(state, settings, q, DT_S)
         if reason is not None:
             return reason, k
@@ -146,24 +145,24 @@ def test_a_healthy_rail_is_not_blamed(bench):
 
 def test_without_new_samples_nothing_is_concluded(bench):
     state, q = initial_state(bench.settings), np.zeros(6)
-    state.last_joints_ns = 1
+    state.block.last_joints_ns = 1
     for _ in range(100):  # 0.4 s at 1 rad/s
         assert detect_following_error(state, bench.settings, q, DT_S) is None
         state.command = np.eye(6)[0]
     q[0] = 99 * DT_S
-    state.last_joints_ns = 2
+    state.block.last_joints_ns = 2
     state.command = np.zeros(6)
     assert detect_following_error(state, bench.settings, q, DT_S) is None
-    assert np.abs(state.missing_travel).max() < 1e-9
+    assert np.abs(state.block.missing_travel).max() < 1e-9
 
 
 def test_what_was_missing_before_a_long_gap_is_forgotten(bench):
     state, q = initial_state(bench.settings), np.zeros(6)
-    state.missing_travel[0] = 0.14
+    state.block.missing_travel[0] = 0.14
     for k, dt_s in enumerate((DT_S, 3.0)):
-        state.last_joints_ns = 1 + k
+        state.block.last_joints_ns = 1 + k
         assert detect_following_error(state, bench.settings, q, dt_s) is None
-    assert not state.missing_travel.any()
+    assert not state.block.missing_travel.any()
 
 
 def test_a_slow_jog_with_an_encoder_that_stands_still_ends_in_a_fault(bench: Any) -> None:
@@ -212,7 +211,6 @@ def test_the_delay_of_a_drive_is_measured_where_it_sets_out(bench, speed, delay_
     state, commands = initial_state(settings), setting_out(speed, 2.0)
     readings = delayed(commands - np.clip(commands, -friction, friction), delay_s)
     assert watched(settings, commands, readings, state=state) == (None, len(commands))
-    assert state.delays is not None
     assert abs(state.delays.delay_s[0] - delay_s) < 0.02
     assert not state.delays.delay_s[1:].any()
 
@@ -241,7 +239,6 @@ def test_play_before_an_encoder_is_no_delay(bench):
     pulse = np.concatenate([setting_out(0.2, 0.5), rest])
     commands = np.concatenate([pulse, pulse, pulse, -pulse, pulse, -pulse, pulse])
     assert watched(settings, commands, with_play(travelled(commands), 0.015), state=state)[0] is None
-    assert state.delays is not None
     assert state.delays.delay_s[0] == 0.0
 
 
@@ -250,7 +247,6 @@ def test_a_delay_that_is_too_long_hides_no_blocked_joint(bench, known_s):
     """A joint whose play was taken for a delay: in a steady motion it is ahead of it, and is prompt from there on."""
     settings = at_the_rate_of_these_tests(bench.settings)
     state = initial_state(settings)
-    state.delays = unknown_delays(settings)
     state.delays.samples[:, 0] = state.delays.delay_s[0] = known_s
     commands, blocked = setting_out(1.0, 2.0), round(1.25 * RATE_HZ)
     readings = travelled(commands)
@@ -265,7 +261,6 @@ def test_a_drive_that_has_become_faster_is_not_blamed(bench):
     state = initial_state(settings)
     slow = setting_out(1.0, 1.0)
     assert watched(settings, slow, delayed(slow, 0.2), state=state)[0] is None
-    assert state.delays is not None
     assert state.delays.delay_s[0] == pytest.approx(0.2, abs=0.01)
     steady = np.full(round(2.0 * RATE_HZ), 1.0)
     began = delayed(slow, 0.2)[-1]

@@ -11,7 +11,7 @@ import pytest
 
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.goals import (
     AcknowledgeGoal,
     CancelGoal,

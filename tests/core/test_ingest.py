@@ -11,7 +11,7 @@ import pytest
 
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.goals import (
     Calibrate,
     Enable,
@@ -74,7 +74,7 @@ def kept(bench: Any) -> tuple[Any, ...]:
     state = bench.core.state
     return (
         state.history.count, state.history.t_ns.tobytes(), state.history.positions.tobytes(),
-        state.velocities.tobytes(), state.last_joints_ns, state.last_joints_seq, state.contact.seen_ns,
+        state.velocities.tobytes(), state.last_joints_ns, state.block.last_joints_seq, state.block.loads_ns,
     )  # fmt: skip
 
 

@@ -14,7 +14,8 @@ from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.estimate import seen_frame
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import JointHistory, decode_state, encode_state
+from stereoservo.core.state import JointHistory
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.goals import FeatureTarget, Goal, Jog, JointTarget, RunGoal, Teach
 from stereoservo.ports.devices import CameraObservation
 

@@ -13,7 +13,7 @@ import pytest
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import DriverFault, ModelUpdate
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.cell_file import CellFileError, check_cell
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal, Teach
 

@@ -12,7 +12,8 @@ import pytest
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import PoseMeasurement, decode_state, encode_state
+from stereoservo.core.state import PoseMeasurement
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, relocalize_from_events
 from stereoservo.kinematics.shutter_stamps import ShutterOffset
 from stereoservo.messages.goals import (

@@ -16,7 +16,8 @@ import pytest
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import StepInputs, StepOutputs, encode
 from stereoservo.core.servo_core import ServoCore
-from stereoservo.core.state import ServoGoal, decode_state, encode_state
+from stereoservo.core.state import ServoGoal
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.kinematics.model import save_model
 from stereoservo.messages.goals import Goal, Request, RunGoal
 from stereoservo_sim.benchmarks.core_loop import PARTS, CoreLoop, rx90_with_facets

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereoservo.core.block import HISTORY
 from stereoservo.core.estimate import fold_timing
 from stereoservo.core.ingest import remember_joints
 from stereoservo.core.monitor_state import CameraTiming
 from stereoservo.core.prediction import MODEL_SIGMA_PX, FrameResiduals, joints_at, velocities_at
 from stereoservo.core.report import advice, offset_s
-from stereoservo.core.state import HISTORY, JointHistory
+from stereoservo.core.state import JointHistory
 from stereoservo.numerics.arrays import FloatArray
 
 

@@ -22,7 +22,7 @@ from stereoservo.core.sources.trial_stops import (
     plan_sides,
     stop_offset,
 )
-from stereoservo.core.state import decode_state, encode_state
+from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.cell_file import MAX_JOINTS
 from stereoservo.messages.goals import Calibrate, Enable, Home, JointTarget, RenewGoal
 from stereoservo.messages.reasons import Reason

@@ -15,7 +15,7 @@ import numpy as np
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import CameraSights, Prediction
+from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.messages.goals import PlanReport
@@ -37,8 +37,7 @@ class Derived:
     enough not to coast. ``prior_every``: steps between priors. ``laws``: those
     that are installed, by name. ``cameras``: indices by name. ``samples`` (4, n): room for the values of a joint
     sample. ``load_limits``:
-    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored. ``sights``: of
-    the state's cameras, with a model.
+    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
     """
 
     nominal_period_ns: int
@@ -51,7 +50,6 @@ class Derived:
     samples: FloatArray
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
-    sights: CameraSights | None = None
     health: tuple[object, Health] | None = None
     """What the status last said of the model's health, and of what."""
 

@@ -36,13 +36,12 @@ from stereoservo.core.prediction import (
     present,
     room,
     rows_of,
-    shared_sights,
     undistort_sights,
     used_rows,
     velocities_at,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState, JointHistory, camera_estimate
+from stereoservo.core.state import CameraEstimate, CoreState, JointHistory, camera_estimate, share_sights
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
@@ -59,12 +58,11 @@ def estimate(context: StepContext) -> StepContext:
     for camera, observation in _new_frames(context):
         _fold_frame(camera, observation, context)
     arrays, state = context.derived.arrays, context.state
-    if arrays is None or state.history.count == 0:
+    if arrays is None or state.block.history_count == 0:
         return context
-    assert context.derived.sights is not None
     context.arrays = arrays
-    context.prediction, context.weights, context.pixels, state.correction = present(
-        arrays, context.q, context.derived.sights, context.now_ns, context.settings.limits.coast_s
+    context.prediction, context.weights, context.pixels = present(
+        arrays, context.q, state.block, context.now_ns, context.settings.limits.coast_s
     )
     if any(state.mobile):
         context = moving_camera.step(context)
@@ -138,7 +136,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     state.cameras = [
         camera_estimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
     ]
-    context.derived.sights = shared_sights(state.cameras)
+    share_sights(state)
 
 
 def fitted_readiness(model: CellModel) -> ModelReadiness:

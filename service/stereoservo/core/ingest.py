@@ -11,10 +11,11 @@ import math
 
 import numpy as np
 
+from stereoservo.core.block import HISTORY
 from stereoservo.core.context import Ingested, StepContext
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.state import HISTORY, LEAST_APART_NS, CoreState, Refused
+from stereoservo.core.state import LEAST_APART_NS, CoreState, Refused
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -45,12 +46,12 @@ def ingest(context: StepContext) -> Ingested:
     Of what is refused nothing is kept but the count and the reason. After a gap the drives were left alone, and the
     last command is not what they do: commands begin from rest.
     """
-    if context.inputs.now_ns < context.state.last_step_ns:
+    if context.inputs.now_ns < context.state.block.last_step_ns:
         _forget_stamps(context.state)
     ingested = context.ingested = _passed(context)
     _count_refused(ingested, context)
     if ingested.gap is not None:
-        context.state.command = np.zeros_like(context.state.command)
+        context.state.block.command[:] = 0.0
         forget_travel(context.state)
     context.q = _append_joints(ingested.joints, context)
     _follow_driver(context)
@@ -60,9 +61,8 @@ def ingest(context: StepContext) -> Ingested:
 def _passed(context: StepContext) -> Ingested:
     """What passes the gate, and why the rest does not; changes nothing."""
     inputs, state = context.inputs, context.state
-    elapsed_ns = (
-        inputs.now_ns - state.last_step_ns if state.last_step_ns else context.derived.nominal_period_ns
-    )
+    last_ns = state.block.last_step_ns
+    elapsed_ns = inputs.now_ns - last_ns if last_ns else context.derived.nominal_period_ns
     gap = _gap(elapsed_ns * 1e-9, context)
     joints, refused_joints = _joints(context)
     observations, refused_frames = _observations(context)
@@ -83,7 +83,7 @@ def _passed(context: StepContext) -> Ingested:
 def _count_refused(ingested: Ingested, context: StepContext) -> None:
     """Keep the time of the step, and of each source what was refused since its last good sample."""
     state = context.state
-    state.last_step_ns = context.now_ns
+    state.block.last_step_ns = context.now_ns
     if ingested.joints is not None:
         state.refused_joints.reason = None
     if ingested.refused_joints is not None:
@@ -96,8 +96,8 @@ def _count_refused(ingested: Ingested, context: StepContext) -> None:
 
 def _forget_stamps(state: CoreState) -> None:
     """The clock went back: what was stamped before is of a time to come, and would refuse all that is new."""
-    state.history.count = 0
-    state.last_joints_ns, state.last_joints_seq = 0, -1
+    block = state.block
+    block.history_count, block.last_joints_ns, block.last_joints_seq = 0, 0, -1
     for estimate in state.cameras:
         estimate.last_seq, estimate.accepted_ns = -1, 0
         estimate.seen_ns[:] = 0
@@ -108,17 +108,17 @@ def _append_joints(sample: JointState | None, context: StepContext) -> FloatArra
 
     The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
     """
-    state = context.state
-    history = state.history
+    block = context.state.block
     if sample is not None:
-        history.count = _append_sample(
-            history.t_ns, history.positions, history.count, sample.t_ns, _positions(sample, context),
-            state.last_joints_ns, context.settings.limits.velocity_max, state.velocities,
+        block.history_count = _append_sample(
+            block.history_ns, block.history_positions, block.history_count, sample.t_ns, _positions(sample, context),
+            block.last_joints_ns, context.settings.limits.velocity_max, block.velocities,
         )  # fmt: skip
-        state.last_joints_seq, state.last_joints_ns = sample.seq, sample.t_ns
-    if history.count == 0:
-        return np.zeros_like(state.command)
-    newest: FloatArray = history.positions[(history.count - 1) % HISTORY].copy()
+        block.last_joints_seq, block.last_joints_ns = sample.seq, sample.t_ns
+    count = block.history_count
+    if count == 0:
+        return np.zeros_like(block.command)
+    newest: FloatArray = block.history_positions[(count - 1) % HISTORY].copy()
     return newest
 
 
@@ -254,7 +254,7 @@ def _count(refused: Refused, reason: Reason) -> None:
 def _gap(gap_s: float, context: StepContext) -> Reason | None:
     """The reason where the loop stood still while the drives were on."""
     state, limit_s = context.state, context.derived.longest_gap_s
-    if not state.last_step_ns or state.lifecycle != Lifecycle.ACTIVE or 0.0 <= gap_s <= limit_s:
+    if not state.block.last_step_ns or state.lifecycle != Lifecycle.ACTIVE or 0.0 <= gap_s <= limit_s:
         return None
     return Reason(
         "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
@@ -268,7 +268,7 @@ def _joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
     """The joint sample, or why it is refused; neither where there is none or it was here before."""
     inputs, state = context.inputs, context.state
     sample = inputs.joints
-    if sample is None or sample.seq == state.last_joints_seq or sample.t_ns <= state.last_joints_ns:
+    if sample is None or sample.seq == state.block.last_joints_seq or sample.t_ns <= state.last_joints_ns:
         return None, None
     age_s = (inputs.now_ns - sample.t_ns) * 1e-9
     timeout_s = context.settings.limits.joint_timeout_s
@@ -298,7 +298,7 @@ def _joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
 
 def _is_sound(sample: JointState, context: StepContext) -> bool:
     """Whether nothing is wrong with the values of a joint sample, and, while the drives are on, it is no jump."""
-    values, state = context.derived.samples, context.state
+    values, state, block = context.derived.samples, context.state, context.state.block
     shape = values.shape[1:]
     for row, given in enumerate(
         (sample.positions, sample.velocities, sample.efforts, sample.following_errors)
@@ -311,7 +311,7 @@ def _is_sound(sample: JointState, context: StepContext) -> bool:
         values[row] = given
     return bool(
         _sound(
-            values, state.history.positions, state.history.count, (sample.t_ns - state.last_joints_ns) * 1e-9,
+            values, block.history_positions, block.history_count, (sample.t_ns - block.last_joints_ns) * 1e-9,
             context.settings.limits.velocity_max, state.lifecycle == Lifecycle.ACTIVE,
         )
     )  # fmt: skip
@@ -338,11 +338,11 @@ def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
 
 def _jump(sample: JointState, context: StepContext) -> Reason | None:
     """The reason where a joint cannot have come from its last position to this one in the time between."""
-    state, settings = context.state, context.settings
-    if state.history.count == 0:
+    block, settings = context.state.block, context.settings
+    if block.history_count == 0:
         return None
-    elapsed_s = (sample.t_ns - state.last_joints_ns) * 1e-9
-    travel = np.abs(sample.positions - state.history.positions[(state.history.count - 1) % HISTORY])
+    elapsed_s = (sample.t_ns - block.last_joints_ns) * 1e-9
+    travel = np.abs(sample.positions - block.history_positions[(block.history_count - 1) % HISTORY])
     possible = settings.limits.velocity_max * (FASTEST * elapsed_s + STAMP_JITTER_S)
     if (travel <= possible).all():
         return None
@@ -455,7 +455,7 @@ def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: floa
 
 def forget_travel(state: CoreState) -> None:
     """Begin anew: what the drives did of late was not what they were sent."""
-    state.missing_travel[:] = 0.0
-    state.untold_travel[:] = 0.0
-    state.last_positions = None
-    state.silent_from = None
+    block = state.block
+    block.missing_travel[:] = 0.0
+    block.untold_travel[:] = 0.0
+    block.followed = block.silence_known = 0

@@ -243,7 +243,7 @@ def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> S
         limits,
     )
     active = state.lifecycle == Lifecycle.ACTIVE
-    state.command = result.limited.copy() if active else np.zeros_like(context.q)
+    state.command[:] = result.limited if active else 0.0
     return result
 
 

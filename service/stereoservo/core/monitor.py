@@ -57,7 +57,7 @@ from stereoservo.core.monitors.following import (
     of_kinds,
     silent,
 )
-from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays, unknown_delays
+from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
@@ -162,44 +162,50 @@ def detect_collision(
 
     ``state.command`` is still that of the last step. ``limits``: thresholds (n,), (n,) of efforts and following errors.
     """
-    contact = state.contact
-    if sample is None or sample.t_ns <= contact.seen_ns:
+    block = state.block
+    if sample is None or sample.t_ns <= block.loads_ns:
         return None
-    elapsed_s = (sample.t_ns - contact.seen_ns) * 1e-9 if contact.seen_ns else np.inf
-    contact.seen_ns = sample.t_ns
-    contact.efforts = None if sample.efforts is None else sample.efforts.copy()
-    contact.following_errors = None if sample.following_errors is None else sample.following_errors.copy()
-    efforts = np.array(contact.mean_efforts if sample.efforts is None else sample.efforts, np.float64)
+    elapsed_s = (sample.t_ns - block.loads_ns) * 1e-9 if block.loads_ns else np.inf
+    block.loads_ns = sample.t_ns
+    block.tells_efforts, block.tells_following = (
+        sample.efforts is not None,
+        sample.following_errors is not None,
+    )
+    if sample.efforts is not None:
+        block.efforts[:] = sample.efforts
+    if sample.following_errors is not None:
+        block.following_errors[:] = sample.following_errors
+    efforts = np.array(block.mean_efforts if sample.efforts is None else sample.efforts, np.float64)
     following = np.zeros(efforts.shape)
     if sample.following_errors is not None:
         following[:] = sample.following_errors
     forgets = elapsed_s > GAP_S or state.lifecycle != Lifecycle.ACTIVE
     if forgets:
-        contact.leave_s = 0.0
+        block.leave_s = 0.0
     moving = not (forgets or state.stopped) and bool(_moves(state.command))
     if moving:
-        contact.leave_s = max(0.0, contact.leave_s - elapsed_s)
+        block.leave_s = max(0.0, block.leave_s - elapsed_s)
     learning = isinstance(state.source, CalibrationMotion)
     thresholds = (stated_thresholds(settings) if moving else None) if learning else limits
     if thresholds is None:
         unlimited = _unlimited(efforts.size)
         thresholds = unlimited, unlimited
     beyond = _account_loads(
-        efforts, following, contact.mean_efforts, contact.effort_excess, contact.following_excess, contact.low,
-        contact.high, elapsed_s, forgets, moving, contact.leave_s > 0.0, *thresholds,
+        efforts, following, block.mean_efforts, block.effort_excess, block.following_excess, block.contact_low,
+        block.contact_high, elapsed_s, forgets, moving, block.leave_s > 0.0, *thresholds,
     )  # fmt: skip
     if not moving:
         return None
     if learning:
-        learn_loads(state.source.id, contact, np.abs(state.command), efforts, following)  # type: ignore[union-attr]
+        learn_loads(state.source.id, state, np.abs(state.command), efforts, following)  # type: ignore[union-attr]
     if limits is None or not beyond:
         return None
-    reason = worst_contact(contact, settings, *thresholds, learning)
+    reason = worst_contact(block, settings, *thresholds, learning)
     if reason is not None:
-        contact.low = np.array([np.minimum(contact.mean_efforts, efforts), np.minimum(following, 0.0)])
-        contact.high = np.array([np.maximum(contact.mean_efforts, efforts), np.maximum(following, 0.0)])
-        contact.leave_s = LEAVE_S
-        contact.effort_excess[:], contact.following_excess[:] = 0.0, 0.0
+        block.contact_low[:] = np.minimum(block.mean_efforts, efforts), np.minimum(following, 0.0)
+        block.contact_high[:] = np.maximum(block.mean_efforts, efforts), np.maximum(following, 0.0)
+        block.leave_s = LEAVE_S
+        block.effort_excess[:], block.following_excess[:] = 0.0, 0.0
     return reason
 
 
@@ -223,7 +229,7 @@ def _account_loads(
     following_excess: FloatArray, low: FloatArray, high: FloatArray, elapsed_s: float, forgets: bool, moving: bool,
     leaving: bool, effort_limits: FloatArray, following_limits: FloatArray,
 ) -> bool:  # fmt: skip
-    """Take a sample's ``efforts`` and ``following`` errors (n,) into the arrays of a `Contact`; whether all samples of
+    """Take a sample's ``efforts`` and ``following`` errors (n,) into the arrays of the block; whether all samples of
     a window are beyond a limit on one side, or a limit is none.
 
     Readings that are no numbers become what is expected. The mean begins anew where it ``forgets`` (the drives were
@@ -279,44 +285,43 @@ def detect_following_error(
     sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
     ends, too. Without a new joint sample nothing is concluded: stale samples are the safety stage's affair.
     """
-    delays = state.delays
-    if delays is None:
-        delays = state.delays = unknown_delays(settings)
-    if state.silent_from is None:
-        state.silent_from, state.silent_travel, state.silent_s = q.copy(), np.zeros_like(q), np.zeros_like(q)
+    block, delays = state.block, state.delays
+    if not block.silence_known:
+        block.silence_known = 1
+        block.silent_from[:], block.silent_travel[:], block.silent_s[:] = q, 0.0, 0.0
     play, answers, friction = of_kinds(settings.joint_kinds, settings.resolution)
     measure_delays(state.command, q, answers, dt_s, delays.sent, delays.onset, delays.samples, delays.delay_s)
-    last = q if state.last_positions is None else state.last_positions
-    if state.last_positions is None:
+    last = block.last_positions if block.followed else q
+    if not block.followed:
         delays.missing[:] = 0.0
-        delays.accounted = delays.sent.copy()
-    told = state.last_joints_ns != state.last_followed_ns
+        delays.accounted[:] = delays.sent
+    told = block.last_joints_ns != block.last_followed_ns
     account_travel(
-        state.command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, 1.0 / settings.rate_hz, delays.steps,
+        state.command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, 1.0 / settings.rate_hz, block.delay_steps,
         answers,
         (delays.delay_s, delays.sent, delays.past, delays.velocity, delays.under_way, delays.accounted, delays.missing),
-        delays.samples, state.untold_travel, state.missing_travel,
+        delays.samples, block.untold_travel, block.missing_travel,
     )  # fmt: skip
-    delays.steps += 1
+    block.delay_steps += 1
     account_silence(
-        q, delays.velocity, answers, friction, dt_s, state.silent_from, state.silent_travel, state.silent_s
+        q, delays.velocity, answers, friction, dt_s, block.silent_from, block.silent_travel, block.silent_s
     )
     if not told:
         return None
-    state.last_followed_ns = state.last_joints_ns
-    state.last_positions = q.copy()
+    block.last_followed_ns, block.followed = block.last_joints_ns, 1
+    block.last_positions[:] = q
     allowed = LAG_S * settings.limits.velocity_max
-    joint, missing = worst_follower(allowed, state.missing_travel, delays.missing)
+    joint, missing = worst_follower(allowed, block.missing_travel, delays.missing)
     if joint >= 0:
-        state.missing_travel[:] = 0.0
+        block.missing_travel[:] = 0.0
         delays.missing[:] = 0.0
         return not_following(joint, missing, float(allowed[joint]), float(delays.delay_s[joint]), settings)
-    share = np.abs(state.silent_travel) / play * (state.silent_s > SILENCE_S)
+    share = np.abs(block.silent_travel) / play * (block.silent_s > SILENCE_S)
     joint = int(share.argmax())
     if share[joint] <= 1.0:
         return None
-    state.silent_from = None
-    return silent(joint, float(state.silent_travel[joint]), float(state.silent_s[joint]), settings)
+    block.silence_known = 0
+    return silent(joint, float(block.silent_travel[joint]), float(block.silent_s[joint]), settings)
 
 
 @kernel
@@ -366,11 +371,11 @@ def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
 def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
     state = context.state
-    if not context.settings.watch_following or state.history.count == 0:
+    if not context.settings.watch_following or state.block.history_count == 0:
         return ()
     reason = detect_following_error(state, context.settings, context.q, context.ingested.elapsed_s)
     if state.lifecycle != Lifecycle.ACTIVE:
-        state.silent_from = None  # what was sent before is no matter of what is sent next
+        state.block.silence_known = 0  # what was sent before is no matter of what is sent next
         return ()  # an arm that is off may be moved by hand
     if reason is None:
         return ()

@@ -207,7 +207,7 @@ class DriveDelays(msgspec.Struct, eq=False):
     """How late the joints' drives are, and what they lack of their travel besides; see `core.move`.
 
     ``delay_s`` (n,) as measured, 0 before and where it is no matter: the median of ``samples`` (k, n) [s]. ``onset``
-    (7, n): the measurement in progress. ``sent`` (n,) [rad or m] in all, and ``past`` (r, n) of the last r ``steps``.
+    (7, n): the measurement in progress. ``sent`` (n,) [rad or m] in all, and ``past`` (r, n) of the last r steps.
     ``velocity`` (n,): the commands that arrive now; ``under_way`` (n,): travel that is sent and has not arrived yet.
     ``missing`` (n,): arrived less measured travel of late, ``accounted`` (n,): arrived when the joints last told.
     """
@@ -221,4 +221,3 @@ class DriveDelays(msgspec.Struct, eq=False):
     under_way: FloatArray
     accounted: FloatArray
     missing: FloatArray
-    steps: int = 0

@@ -25,10 +25,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from stereoservo.core.block import LONGEST_DELAY_S
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.servoing import unplanned_report
-from stereoservo.core.monitor_state import DriveDelays
-from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step
 from stereoservo.core.sources.incidence import incidence_motion, incidence_report
@@ -191,7 +190,7 @@ def move(context: StepContext) -> SourceOutput:
 def _foreseen(output: SourceOutput, context: StepContext) -> SourceOutput:
     """The output; the safety stage is told where late drives will have their joints before they obey it."""
     delays = context.state.delays
-    if delays is not None and delays.delay_s.any():
+    if delays.delay_s.any():
         towards = np.where(output.velocity != 0.0, output.velocity, context.state.command)
         ahead = context.q + delays.under_way
         context.outermost = np.where(
@@ -253,7 +252,7 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
     inexact = state.model is not None and state.model.joint_accuracy is not None
     most, travel = _bounds(settings.joint_kinds, settings.resolution, inexact)
     looks = context.ingested.joints is not None and _fresh(output, context)
-    arrives = state.command if state.delays is None else state.delays.velocity
+    arrives = state.delays.velocity if settings.watch_following else state.command
     velocity = np.empty(context.q.size)
     changed = _compensated(
         output.velocity, arrives, context.q, known.velocity, known.stood_at, known.sent, known.sent_s, most,
@@ -306,10 +305,8 @@ def _fresh(output: SourceOutput, context: StepContext) -> bool:
 
 # -- late drives ------------------------------------------------------------------------------------------------
 
-LEAST_S, LONGEST_S = 0.04, 0.25
-"""Friction and play look like less; a drive that is later does not follow."""
-SAMPLES = 5
-"""Of a joint's delay, of which the median counts."""
+LEAST_S = 0.04
+"""Friction and play look like less."""
 ONSET_S = 0.1
 """In which a joint that sets out must be sent the travel that is timed; friction and play would count at less speed."""
 ONSET_TRAVEL = 2.0
@@ -320,16 +317,6 @@ STEADY = 0.1
 """Share of a joint's command from which the one that arrives may differ in a motion that tells of the delay."""
 PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S, TOWARDS = range(7)
 """Rows of `DriveDelays.onset`."""
-
-
-def unknown_delays(settings: CoreSettings) -> DriveDelays:
-    """Of joints of which nothing has been sent or seen."""
-    n = len(settings.joint_names)
-    return DriveDelays(
-        delay_s=np.zeros(n), samples=np.full((SAMPLES, n), np.nan), onset=np.zeros((7, n)), sent=np.zeros(n),
-        past=np.zeros((math.ceil(LONGEST_S * settings.rate_hz) + 2, n)), velocity=np.zeros(n),
-        under_way=np.zeros(n), accounted=np.zeros(n), missing=np.zeros(n),
-    )  # fmt: skip
 
 
 @kernel
@@ -345,7 +332,7 @@ def measure_delays(
         sent[j] += command[j] * dt_s
         travel = ONSET_TRAVEL * answers[j]
         onset[RESTED_S, j] = onset[RESTED_S, j] + dt_s if command[j] == 0.0 else 0.0
-        if onset[PHASE, j] == WAITS and onset[RESTED_S, j] >= LONGEST_S:
+        if onset[PHASE, j] == WAITS and onset[RESTED_S, j] >= LONGEST_DELAY_S:
             onset[PHASE, j] = RESTS
         if onset[PHASE, j] == RESTS:
             if command[j] == 0.0:
@@ -362,7 +349,9 @@ def measure_delays(
             onset[PASSED_S, j] += dt_s
         elif abs(was_sent) >= travel:
             onset[PASSED_S, j] = 0.0
-        late = onset[PASSED_S, j] > LONGEST_S or (onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S)
+        late = onset[PASSED_S, j] > LONGEST_DELAY_S or (
+            onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S
+        )
         if abs(made) >= travel or late:
             onset[PHASE, j], onset[TOWARDS, j] = WAITS, was_sent
             if not late and onset[PASSED_S, j] >= 0.0 and made * was_sent > 0.0:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from stereoservo.control.law import Scene
+from stereoservo.core.block import Block
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
 from stereoservo.core.monitor_state import CameraMonitor, ModelMonitor
 from stereoservo.core.state import CameraEstimate, JointHistory, ServoGoal
@@ -252,45 +252,22 @@ LARGE_CORRECTION = 3e-3
 FURTHER_STEPS = 3
 
 
-class CameraSights(NamedTuple):
-    """What all cameras said, per marker: the arrays of their `CameraEstimate`, (c, m, 2), (c, m), (c, m)."""
-
-    innovation: FloatArray
-    sigma: FloatArray
-    seen_ns: IntArray
-
-
-def shared_sights(cameras: list[CameraEstimate]) -> CameraSights:
-    """The arrays of ``cameras`` in one block each, of which each camera has its row from here on."""
-    sights = CameraSights(
-        np.array([camera.innovation for camera in cameras]),
-        np.array([camera.sigma for camera in cameras]),
-        np.array([camera.seen_ns for camera in cameras]),
-    )
-    for camera, *rows in zip(cameras, *sights, strict=True):
-        camera.innovation, camera.sigma, camera.seen_ns = rows
-    return sights
-
-
 def present(
-    arrays: ModelArrays, q: FloatArray, sights: CameraSights, now_ns: int, coast_s: float
-) -> tuple[Prediction, FloatArray, FloatArray, FloatArray]:
+    arrays: ModelArrays, q: FloatArray, block: Block, now_ns: int, coast_s: float
+) -> tuple[Prediction, FloatArray, FloatArray]:
     """The present at ``q`` (n,): the markers by kinematics, the weights (c, m) and pixels (c, m, 2) of what the cameras
-    saw of late, and the correction (n,) of the joints; see `_present`.
+    saw of late; into the ``block``, the correction (n,) of the joints; see `_present`.
     """
-    n, (cameras, markers) = q.size, sights.sigma.shape
+    n, (cameras, markers) = q.size, block.sigma.shape
     prediction = room(n, cameras, markers)
-    weights, pixels, correction = (
-        np.empty((cameras, markers)),
-        np.empty((cameras, markers, 2)),
-        np.empty(n),
-    )
+    weights, pixels = np.empty((cameras, markers)), np.empty((cameras, markers, 2))
     _present(
         arrays.generators, arrays.kinds, arrays.zero, q, arrays.tip_first, arrays.marker_points, arrays.matrices,
-        *sights, now_ns, int(coast_s * 1e9) + SEEN_SLACK_NS, prediction.operators, prediction.points, prediction.pixels,
-        prediction.jacobian, weights, pixels, correction,
+        block.innovation, block.sigma, block.seen_ns, now_ns, int(coast_s * 1e9) + SEEN_SLACK_NS,
+        prediction.operators, prediction.points, prediction.pixels,
+        prediction.jacobian, weights, pixels, block.correction,
     )  # fmt: skip
-    return prediction, weights, pixels, correction
+    return prediction, weights, pixels
 
 
 @kernel

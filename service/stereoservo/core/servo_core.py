@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS
+from stereoservo.core.block import steps_of_delay
 from stereoservo.core.context import Derived, Ingested, StepContext
 from stereoservo.core.cycle import Event, StepInputs, StepOutputs
 from stereoservo.core.estimate import estimate, load_limits
@@ -37,7 +38,6 @@ from stereoservo.core.limit import limit, safety_limits
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitor import monitor
 from stereoservo.core.move import move
-from stereoservo.core.prediction import shared_sights
 from stereoservo.core.report import report
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, initial_state
@@ -52,6 +52,9 @@ class ServoCore:
     def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
         self.settings = settings
         self.state = initial_state(settings) if state is None else state
+        block, past = self.state.block, steps_of_delay(settings.rate_hz)
+        if block.counts["past"] != past:  # of a state that was written before drives were known to be late
+            block.remember_steps(past)
         model = self.state.model
         self._derived = Derived(
             nominal_period_ns=nominal_period_ns(settings),
@@ -64,7 +67,6 @@ class ServoCore:
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
             arrays=None if model is None else model_arrays(model, settings),
             load_limits=load_limits(settings, model),
-            sights=None if model is None else shared_sights(self.state.cameras),
         )
         self._limits = safety_limits(settings, self._derived.features_fresh_s)
 

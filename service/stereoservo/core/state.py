@@ -4,7 +4,7 @@ active motion source, goal queue and plans, monitors. A copy of it, and the inpu
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -12,7 +12,8 @@ import numpy as np
 from stereoservo.control.face_choice import FaceChoice
 from stereoservo.control.faces import Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
-from stereoservo.core.cycle import WayFrame, decode_array, encode
+from stereoservo.core.block import SIGHTS, Block, steps_of_delay
+from stereoservo.core.cycle import WayFrame
 from stereoservo.core.monitor_state import (
     DriveDelays,
     MobileCamera,
@@ -30,9 +31,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
-STATE_VERSION = 9
-OLDEST_VERSION = 6  # of states that are read
-HISTORY = 128  # joint samples kept for interpolation: a third of a second at 1 kHz, half of one at 250 Hz
+STATE_VERSION = 10
 LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
 
 
@@ -83,26 +82,6 @@ class JointLoadStatistics(msgspec.Struct, eq=False):
     efforts: FloatArray
     largest_efforts: FloatArray
     following_errors: FloatArray
-
-
-class Contact(msgspec.Struct, eq=False):
-    """What the drives say of their loads, (n,) each; see `core.monitors.collision`.
-
-    ``mean_efforts``: moving mean. ``effort_excess``, ``following_excess`` (samples, n), newest last: how far the last
-    samples lay beyond what is expected. ``low``, ``high`` (2, n), of efforts and following errors: what a contact has
-    brought, and what it may take away again in the next ``leave_s`` of motion.
-    """
-
-    mean_efforts: FloatArray
-    effort_excess: FloatArray
-    following_excess: FloatArray
-    low: FloatArray
-    high: FloatArray
-    efforts: FloatArray | None = None
-    following_errors: FloatArray | None = None
-    seen_ns: int = 0
-    leave_s: float = 0.0
-    loads: JointLoadStatistics | None = None
 
 
 class Holding(msgspec.Struct, tag="hold"):
@@ -404,25 +383,19 @@ class FrictionCompensation(msgspec.Struct, eq=False):
 
 
 class CoreState(msgspec.Struct, eq=False):
-    """All state of the core."""
+    """All state of the core: the numbers that kernels work on in a ``block``, and the rest."""
 
     version: int
+    block: Block
     step: int
     event_seq: int
-    last_step_ns: int
-    """0 before the first step."""
     lifecycle: Lifecycle
     readiness: ModelReadiness
     model: CellModel | None
     pending_model: CellModel | None
-    history: JointHistory
-    last_joints_ns: int
-    last_joints_seq: int
     refused_joints: Refused
     refused_frames: list[Refused]
     """By camera."""
-    velocities: FloatArray
-    command: FloatArray
     cameras: list[CameraEstimate]
     source: Source
     queue: list[Goal]
@@ -442,14 +415,7 @@ class CoreState(msgspec.Struct, eq=False):
     """Why the core stopped the arm; None where somebody did."""
     fault: list[Reason]
     driver_request: str
-    missing_travel: FloatArray
-    """Commanded less measured travel of late (n,) [rad or m]; see `core.monitor`."""
-    untold_travel: FloatArray  # commanded since the last joint sample (n,)
-    last_followed_ns: int
-    last_positions: FloatArray | None
-    correction: FloatArray
-    """Joint-space correction that explains the innovations best (n,)."""
-    contact: Contact
+    loads: JointLoadStatistics | None
     watching: ModelMonitor
     reanchoring: Relocalization | None
     """While it is not None, no law runs: its goal waits."""
@@ -459,14 +425,52 @@ class CoreState(msgspec.Struct, eq=False):
     """By camera; None for those that stand for good."""
     adjusted: tuple[str, ...]
     """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
-    silent_from: FloatArray | None = None
-    """Readings (n,) when each last changed; see `core.monitor`."""
-    silent_travel: FloatArray = msgspec.field(default_factory=lambda: np.zeros(0))
-    """Sent since (n,), with its sign, less what friction may hold back [rad or m]."""
-    silent_s: FloatArray = msgspec.field(default_factory=lambda: np.zeros(0))
-    """For how long (n,) more than that was sent since."""
     friction: FrictionCompensation | None = None  # while nothing works on a goal
-    delays: DriveDelays | None = None  # before joints are watched
+
+    @property
+    def history(self) -> JointHistory:
+        """The joint samples of late: arrays of the block, and how many there are now."""
+        block = self.block
+        return JointHistory(block.history_ns, block.history_positions, block.history_count)
+
+    @property
+    def last_joints_ns(self) -> int:
+        """Stamp of the newest joint sample, 0 before the first."""
+        return self.block.last_joints_ns
+
+    @property
+    def velocities(self) -> FloatArray:
+        """Of the joints (n,), filtered [rad/s or m/s]."""
+        return self.block.velocities
+
+    @property
+    def correction(self) -> FloatArray:
+        """Joint-space correction that explains the innovations best (n,)."""
+        return self.block.correction
+
+    @property
+    def command(self) -> FloatArray:
+        """The last command (n,) [rad/s or m/s]."""
+        return self.block.command
+
+    @command.setter
+    def command(self, velocity: FloatArray) -> None:
+        self.block.command[:] = velocity
+
+    @property
+    def delays(self) -> DriveDelays:
+        """How late the drives are: arrays of the block."""
+        return self.block.delays
+
+    @property
+    def efforts(self) -> FloatArray | None:
+        """As the drives told them last (n,); None: they did not."""
+        return self.block.efforts.copy() if self.block.tells_efforts else None
+
+    @property
+    def following_errors(self) -> FloatArray | None:
+        """Likewise."""
+        return self.block.following_errors.copy() if self.block.tells_following else None
 
 
 def initial_state(settings: CoreSettings) -> CoreState:
@@ -474,20 +478,23 @@ def initial_state(settings: CoreSettings) -> CoreState:
     n = len(settings.joint_names)
     return CoreState(
         version=STATE_VERSION,
+        block=Block(
+            {
+                "joints": n,
+                "cameras": len(settings.cameras),
+                "markers": 0,
+                "window": 1 if settings.contact is None else settings.contact.samples,
+                "past": steps_of_delay(settings.rate_hz),
+            }
+        ),
         step=0,
         event_seq=0,
-        last_step_ns=0,
         lifecycle=Lifecycle.UNCONFIGURED,
         readiness=ModelReadiness.NONE,
         model=None,
         pending_model=None,
-        history=JointHistory(np.zeros(HISTORY, np.int64), np.zeros((HISTORY, n))),
-        last_joints_ns=0,
-        last_joints_seq=-1,
         refused_joints=Refused(),
         refused_frames=[Refused() for _ in settings.cameras],
-        velocities=np.zeros(n),
-        command=np.zeros(n),
         cameras=[camera_estimate(0) for _ in settings.cameras],
         source=Holding(),
         queue=[],
@@ -502,24 +509,12 @@ def initial_state(settings: CoreSettings) -> CoreState:
         stop_reason=None,
         fault=[],
         driver_request="",
-        missing_travel=np.zeros(n),
-        untold_travel=np.zeros(n),
-        last_followed_ns=0,
-        last_positions=None,
-        correction=np.zeros(n),
-        contact=no_contact(n, 1 if settings.contact is None else settings.contact.samples),
+        loads=None,
         watching=nothing_sighted(len(settings.cameras), 0, n, 0),
         reanchoring=None,
         pending_reanchored=(),
         mobile=[None for _ in settings.cameras],
         adjusted=(),
-    )
-
-
-def no_contact(n: int, samples: int) -> Contact:
-    """Nothing known of the loads of ``n`` joints."""
-    return Contact(
-        np.zeros(n), np.zeros((samples, n)), np.zeros((samples, n)), np.zeros((2, n)), np.zeros((2, n))
     )
 
 
@@ -531,70 +526,13 @@ def camera_estimate(markers: int, offset_ns: int = 0) -> CameraEstimate:
     )  # fmt: skip
 
 
-class StateVersionError(ValueError):
-    """A state of another version of this program; ``version`` is its own."""
-
-    def __init__(self, version: int) -> None:
-        super().__init__(
-            f"its state is of version {version}, this program works with version {STATE_VERSION}: what the core "
-            "remembers has changed in between"
-        )
-        self.version = version
-
-
-class _Versioned(msgspec.Struct):
-    """What every state says of itself, whatever else it holds."""
-
-    version: int
-
-
-_decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=decode_array)
-
-
-def encode_state(state: CoreState) -> bytes:
-    """The state as bytes, bit for bit."""
-    return encode(state)
-
-
-def decode_state(data: bytes) -> CoreState:
-    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
-    # Asked first: a state of another version may hold other fields, too.
-    version = msgspec.msgpack.decode(data, type=_Versioned).version
-    if not OLDEST_VERSION <= version <= STATE_VERSION:
-        raise StateVersionError(version)
-    if version < STATE_VERSION:
-        data = msgspec.msgpack.encode(_of_this_version(msgspec.msgpack.decode(data), version))
-    state: CoreState = _decoder.decode(data)
-    job = state.planning
-    if job is not None and job.purpose == "again" and isinstance(state.source, ServoGoal):
-        job.source = state.source  # written twice, it is one
-    return state
-
-
-MOVED_IN_VERSION_7 = ("stop_reason",)  # a state of version 6 holds it elsewhere
-
-
-def is_recorded(state: CoreState, data: bytes) -> bool:
-    """Whether ``data`` is this state bit for bit, in the fields that were there when it was written."""
-    now = msgspec.msgpack.decode(encode_state(state))
-    recorded = msgspec.msgpack.decode(encode_state(decode_state(data)))
-    held = msgspec.msgpack.decode(data).keys() | MOVED_IN_VERSION_7
-    return bool(
-        msgspec.msgpack.encode([now[name] for name in now if name in held])
-        == msgspec.msgpack.encode([recorded[name] for name in now if name in held])
-    )
-
-
-def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
-    """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
-    midst of trial motions, whose course is another one now.
-    """
-    if state["source"]["type"] == "trials":
-        raise StateVersionError(version)
-    if version == 6:  # before stamps and gaps of the loop were checked
-        nothing = msgspec.to_builtins(Refused())
-        state |= {"last_step_ns": 0, "refused_joints": nothing, "stop_reason": state["contact"].pop("reason")}
-        state["refused_frames"] = [nothing for _ in state["cameras"]]
-    if version < 8 and (planning := state.get("planning")) is not None:  # large bodies are planned in parts
-        planning["goal"] = planning["source"]["goal"]
-    return state | {"version": STATE_VERSION}
+def share_sights(state: CoreState) -> None:
+    """The sights of the cameras lie in the block from here on, of which each camera has its row."""
+    block = state.block
+    markers = state.cameras[0].sigma.size if state.cameras else 0
+    block.begin_sights(markers)
+    for c, camera in enumerate(state.cameras):
+        for name in SIGHTS:
+            row = getattr(block, name)[c]
+            row[:] = getattr(camera, name)
+            setattr(camera, name, row)

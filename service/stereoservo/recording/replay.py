@@ -23,7 +23,7 @@ from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import StateVersionError, decode_state, is_recorded
+from stereoservo.core.state_encoding import StateVersionError, decode_state, is_recorded
 from stereoservo.messages.decoding import DamagedError, cause_of, decoding
 from stereoservo.messages.goals import IncidenceTarget, JointTarget, RunGoal
 from stereoservo.recording.flight_recorder import FORMAT

@@ -19,7 +19,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import encode_state
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.numerics.arrays import FloatArray
 
 

@@ -21,8 +21,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereoservo.core.block import Block
 from stereoservo.core.settings import ContactSettings, CoreSettings
-from stereoservo.core.state import Contact, JointLoadStatistics
+from stereoservo.core.state import CoreState, JointLoadStatistics
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
@@ -67,20 +68,16 @@ def learnt_collision_thresholds(
     return efforts, following
 
 
-def learnt_loads(trials_id: str, contact: Contact) -> JointLoads | None:
+def learnt_loads(trials_id: str, state: CoreState) -> JointLoads | None:
     """What the trial motions showed; None where the drives tell nothing."""
-    loads = contact.loads
-    if (
-        loads is None
-        or loads.id != trials_id
-        or (contact.efforts is None and contact.following_errors is None)
-    ):
+    loads, block = state.loads, state.block
+    if loads is None or loads.id != trials_id or not (block.tells_efforts or block.tells_following):
         return None
     return JointLoads(
         velocities=loads.velocities.copy(),
-        efforts=None if contact.efforts is None else loads.efforts.copy(),
-        largest_efforts=None if contact.efforts is None else loads.largest_efforts.copy(),
-        following_errors=None if contact.following_errors is None else loads.following_errors.copy(),
+        efforts=loads.efforts.copy() if block.tells_efforts else None,
+        largest_efforts=loads.largest_efforts.copy() if block.tells_efforts else None,
+        following_errors=loads.following_errors.copy() if block.tells_following else None,
     )
 
 
@@ -103,31 +100,31 @@ def _lasting(window: FloatArray) -> FloatArray:
 
 
 def learn_loads(
-    trials_id: str, contact: Contact, speed: FloatArray, efforts: FloatArray, following: FloatArray
+    trials_id: str, state: CoreState, speed: FloatArray, efforts: FloatArray, following: FloatArray
 ) -> None:
     """Note what a threshold would have had to bear: the same quantities as are watched."""
     n = speed.size
-    loads = contact.loads
+    loads, block = state.loads, state.block
     if loads is None or loads.id != trials_id:
-        loads = contact.loads = JointLoadStatistics(
+        loads = state.loads = JointLoadStatistics(
             trials_id, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n)
         )
     loads.velocities = np.maximum(loads.velocities, speed)
     loads.largest_efforts = np.maximum(loads.largest_efforts, np.abs(efforts))
     mover = int(speed.argmax())
     if int((speed > ALONE * speed[mover]).sum()) == 1:  # from one joint's stops to the next one's, two move
-        loads.efforts[:, mover] = np.maximum(loads.efforts[:, mover], _lasting(contact.effort_excess))
-    loads.following_errors = np.maximum(loads.following_errors, _lasting(contact.following_excess))
+        loads.efforts[:, mover] = np.maximum(loads.efforts[:, mover], _lasting(block.effort_excess))
+    loads.following_errors = np.maximum(loads.following_errors, _lasting(block.following_excess))
 
 
 def worst_contact(
-    contact: Contact,
+    block: Block,
     settings: CoreSettings,
     effort_limits: FloatArray,
     following_limits: FloatArray,
     learning: bool,
 ) -> Reason | None:
-    efforts, following = _lasting(contact.effort_excess), _lasting(contact.following_excess)
+    efforts, following = _lasting(block.effort_excess), _lasting(block.following_excess)
     by_effort, by_following = efforts / effort_limits, following / following_limits
     if max(by_effort.max(), by_following.max()) <= 1.0:
         return None

@@ -91,7 +91,7 @@ def _move(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
         if trials.phase == "finish":
             context.emit(
                 "calibration_finished", id=trials.id, message="trial motions done", progress=1.0,
-                loads=learnt_loads(trials.id, context.state.contact),
+                loads=learnt_loads(trials.id, context.state),
             )  # fmt: skip
             return _rest(context, finished=True)
         if trials.phase == "return":

@@ -173,7 +173,7 @@ def approach_velocity(
 def joints_ahead(context: StepContext) -> FloatArray:
     """Where the joints (n,) will be when late drives have made what they were sent, less what friction takes of it."""
     delays, friction = context.state.delays, context.state.friction
-    if delays is None or not delays.delay_s.any():
+    if not delays.delay_s.any():
         return context.q
     lost = 0.0 if friction is None else np.abs(friction.velocity) * delays.delay_s
     return context.q + delays.under_way - np.clip(delays.under_way, -lost, lost)

@@ -1,0 +1,155 @@
+"""The state of the core as bytes, and states that former versions of this program wrote."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from stereoservo.core.block import Block, restored
+from stereoservo.core.cycle import decode_array, encode_array
+from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_sights
+
+OLDEST_VERSION = 6
+"""Of states that are read."""
+
+
+class StateVersionError(ValueError):
+    """A state of another version of this program; ``version`` is its own."""
+
+    def __init__(self, version: int) -> None:
+        super().__init__(
+            f"its state is of version {version}, this program works with version {STATE_VERSION}: what the core "
+            "remembers has changed in between"
+        )
+        self.version = version
+
+
+class _Versioned(msgspec.Struct):
+    """What every state says of itself, whatever else it holds."""
+
+    version: int
+
+
+def _encode_hook(value: object) -> object:
+    return value.kept() if isinstance(value, Block) else encode_array(value)
+
+
+def _decode_hook(kind: type, value: Any) -> object:
+    if kind is not Block:
+        return decode_array(kind, value)
+    return restored({name: decode_array(kind, v) if isinstance(v, list) else v for name, v in value.items()})
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_encode_hook)
+_decoder = msgspec.msgpack.Decoder(CoreState, dec_hook=_decode_hook)
+
+
+def encode_state(state: CoreState) -> bytes:
+    """The state as bytes, bit for bit: arrays and numbers of its block by name, of the cell's sizes."""
+    return _encoder.encode(state)
+
+
+def decode_state(data: bytes) -> CoreState:
+    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
+    # Asked first: a state of another version may hold other fields, too.
+    version = msgspec.msgpack.decode(data, type=_Versioned).version
+    if not OLDEST_VERSION <= version <= STATE_VERSION:
+        raise StateVersionError(version)
+    if version < STATE_VERSION:
+        data = msgspec.msgpack.encode(_of_this_version(msgspec.msgpack.decode(data), version))
+    state: CoreState = _decoder.decode(data)
+    share_sights(state)
+    job = state.planning
+    if job is not None and job.purpose == "again" and isinstance(state.source, ServoGoal):
+        job.source = state.source  # written twice, it is one
+    return state
+
+
+MOVED_IN_VERSION_7 = ("stop_reason",)  # a state of version 6 holds it elsewhere
+
+
+def is_recorded(state: CoreState, data: bytes) -> bool:
+    """Whether ``data`` is this state bit for bit, in the fields that were there when it was written."""
+    held = _as_of_now(msgspec.msgpack.decode(data))
+    now, recorded = (msgspec.msgpack.decode(encode_state(s)) for s in (state, decode_state(data)))
+    blocks = [[s["block"][name] for name in now["block"] if name in held["block"]] for s in (now, recorded)]
+    rest = [[s[name] for name in now if name in held and name != "block"] for s in (now, recorded)]
+    return bool(msgspec.msgpack.encode([blocks[0], rest[0]]) == msgspec.msgpack.encode([blocks[1], rest[1]]))
+
+
+def _as_of_now(state: dict[str, Any]) -> dict[str, Any]:
+    """A state with what it holds, in the places of this version."""
+    if state["version"] < 7:
+        state["stop_reason"] = None
+    return state if state["version"] == STATE_VERSION else state | {"block": _block_of(state)}
+
+
+BEFORE_VERSION_10 = {
+    "last_step_ns": "", "last_joints_ns": "", "last_joints_seq": "", "last_followed_ns": "", "velocities": "",
+    "command": "", "correction": "", "missing_travel": "", "untold_travel": "", "last_positions": "",
+    "silent_from": "", "silent_travel": "", "silent_s": "",
+    "history_ns": "history.t_ns", "history_positions": "history.positions", "history_count": "history.count",
+    "delay_s": "delays.delay_s", "delay_samples": "delays.samples", "delay_onset": "delays.onset",
+    "delay_sent": "delays.sent", "delay_past": "delays.past", "delay_velocity": "delays.velocity",
+    "delay_under_way": "delays.under_way", "delay_accounted": "delays.accounted", "delay_missing": "delays.missing",
+    "delay_steps": "delays.steps", "loads_ns": "contact.seen_ns", "leave_s": "contact.leave_s",
+    "mean_efforts": "contact.mean_efforts", "effort_excess": "contact.effort_excess",
+    "following_excess": "contact.following_excess", "contact_low": "contact.low", "contact_high": "contact.high",
+    "efforts": "contact.efforts", "following_errors": "contact.following_errors",
+}  # fmt: skip
+"""Where a state of before has what is in the block now; empty: under the same name."""
+
+
+KNOWN_BY = {
+    "last_positions": "followed", "silent_from": "silence_known", "efforts": "tells_efforts",
+    "following_errors": "tells_following",
+}  # fmt: skip
+"""What could be None, and what tells now that it is."""
+
+
+def _block_of(state: dict[str, Any]) -> dict[str, Any]:
+    """What was no block before, as one; arrays still encoded."""
+    block: dict[str, Any] = {}
+    for name, place in BEFORE_VERSION_10.items():
+        *path, last = (place or name).split(".")
+        holder: Any = state
+        for part in path:
+            holder = holder.get(part) or {}
+        if last not in holder:
+            continue
+        value = holder[last]
+        if name in KNOWN_BY:
+            block[KNOWN_BY[name]] = int(value is not None)
+        if value is not None and not (isinstance(value, list) and value[1] == [0]):
+            block[name] = value
+    cameras, markers = len(state["cameras"]), state["cameras"][0]["sigma"][1][0] if state["cameras"] else 0
+    joints, window = block["command"][1][0], block["effort_excess"][1][0]
+    past = block["delay_past"][1][0] if "delay_past" in block else 0
+    block["counts"] = {
+        "joints": joints,
+        "cameras": cameras,
+        "markers": markers,
+        "window": window,
+        "past": past,
+    }
+    return block
+
+
+def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
+    """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
+    midst of trial motions, whose course is another one now.
+    """
+    if version < 9 and state["source"]["type"] == "trials":
+        raise StateVersionError(version)
+    if version == 6:  # before stamps and gaps of the loop were checked
+        nothing = msgspec.to_builtins(Refused())
+        state |= {"last_step_ns": 0, "refused_joints": nothing, "stop_reason": state["contact"].pop("reason")}
+        state["refused_frames"] = [nothing for _ in state["cameras"]]
+    if version < 8 and (planning := state.get("planning")) is not None:  # large bodies are planned in parts
+        planning["goal"] = planning["source"]["goal"]
+    return state | {
+        "version": STATE_VERSION,
+        "block": _block_of(state),
+        "loads": state["contact"].get("loads"),
+    }
