@@ -59,6 +59,9 @@ def test_messages_need_msgspec_only() -> None:
         (["warmup", "--help"], 0),
         (["bench", "--help"], 0),
         (["reproduce", "--help"], 0),
+        (["demo", "--help"], 0),
+        (["simulate", "--help"], 0),
+        (["run", "--help"], 0),
     ],
 )
 def test_the_verbs_of_a_client_import_no_numerical_library(

@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from oracles.damped import null_direction_reference
-from stereoservo.numerics.linear import damped_least_squares, null_direction, right_singular
+from stereoservo.numerics.linear import (
+    damped_least_squares,
+    left_null_direction,
+    null_direction,
+    orthonormal_rows,
+    right_singular,
+)
 from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
 
 
@@ -94,3 +100,38 @@ def test_one_column_and_fewer_rows_than_columns():
     x, smallest, second, largest = null_direction(np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]))
     np.testing.assert_allclose(np.abs(x), [0, 0, 1])
     assert (smallest, second, largest) == pytest.approx((0.0, 1.0, 2.0))
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_rows_are_made_orthonormal_and_the_bound_is_one(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 7))
+    A = rng.normal(size=(n, 16)) * 10.0 ** rng.uniform(-3, 0, n)[:, None]
+    Q, W = np.empty((n, 16)), np.empty((n, n))
+    bound = orthonormal_rows(A, Q, W)
+    values = np.linalg.svd(A, compute_uv=False)
+    assert values[-1] / values[0] / n <= bound * (1 + 1e-9)
+    assert bound <= values[-1] / values[0] * (1 + 1e-9)
+    np.testing.assert_allclose(Q @ Q.T, np.eye(n), atol=1e-15 / bound)
+    np.testing.assert_allclose(W.T @ A, Q, atol=1e-15 / bound)
+    A[0] = 0.0
+    assert orthonormal_rows(A, Q, W) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_left_null_direction_is_lapacks_where_its_bounds_tell(seed):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(6, 8))
+    A[5] = rng.normal(size=5) @ A[:5] + 10.0 ** rng.uniform(-17, -1) * rng.normal(size=8)
+    A = np.ascontiguousarray(A[rng.permutation(6)])
+    y, *truth = null_direction_reference(A.T)
+    x = np.empty(6)
+    smallest, second, largest = left_null_direction(A.copy(), x)
+    assert truth[0] <= smallest + 1e-14
+    assert largest >= truth[2] * (1 - 1e-12)
+    assert 0.0 < second <= truth[1] * (1 + 1e-12)
+    np.testing.assert_allclose(x * np.sign(x @ y), y, atol=1e-10)
+    A[1] = 2.0 * A[0] - A[2]  # two directions are null, or nearly: not told
+    A[4] = A[3]
+    smallest, second, largest = left_null_direction(A, x)
+    assert second <= 1e-14 * largest

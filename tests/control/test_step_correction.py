@@ -56,9 +56,12 @@ def test_step_operators_are_the_derivative(virtual, composition):
     H = displacement(operators, composition, step)
     turned = reference.step_operators(operators, composition, step)
     found, H_found = np.empty((6, 4, 4)), np.empty((4, 4))
-    kernels.step_into(operators, int(composition), step, H_found, found, np.empty((5, 4, 4)))
+    screws = kernels.joint_screws(operators)
+    kernels.step_into(screws, int(composition), step, H_found, found, np.empty((5, 4, 4)))
     np.testing.assert_allclose(H_found, H, atol=1e-12)
     np.testing.assert_allclose(found, turned, atol=1e-10)
+    kernels.displacement_into(screws, int(composition), step, H_found, np.empty((5, 4, 4)))
+    np.testing.assert_allclose(H_found, H, atol=1e-12)
     h = 1e-6
     for j in range(6):
         nudge = h * np.eye(6)[j]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import signal
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit, note
-from stereoservo.daemon.ipc_messages import COMMISSIONING_SPEED, RunPlan
-from stereoservo.daemon.supervisor import run_cell
+from stereoservo.messages.servo_state import COMMISSIONING_SPEED
+
+if TYPE_CHECKING:
+    from stereoservo.daemon.ipc_messages import RunPlan
 
 
 def run(
@@ -30,6 +32,7 @@ def run(
     json: JsonOption = False,
 ) -> None:
     """Run a cell until SIGTERM or Ctrl-C; either ends it with the arm stopped."""
+    from stereoservo.daemon.supervisor import run_cell
 
     def ready(plan: RunPlan) -> None:
         mode = " (dry run: nothing is written to the drives)" if dry_run else ""

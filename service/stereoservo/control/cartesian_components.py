@@ -10,17 +10,19 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.control.primitives_kernel import (
-    apply,
-    apply_transposed,
+    Freedoms,
     as_rotation,
     complement,
     dot,
+    drop_primitive,
     minors,
     norm,
     primitive,
+    product,
     scale_primitive,
-    set_plane_rows,
-    set_point_rows,
+    set_plane_columns,
+    set_point_columns,
+    transposed_product,
     unit,
 )
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -72,82 +74,89 @@ class Components(NamedTuple):
 
 
 @kernel
-def decompose(operators: FloatArray, basis: FloatArray, task: FaceTask) -> Components:
-    """The components of a motion. ``basis`` (n, r) of the arm's freedoms."""
+def decompose(freedoms: Freedoms, task: FaceTask) -> Components:
+    """The components of a motion, of an arm of such freedoms."""
     points, targets, centre = task.points, task.targets, task.centre
-    n = operators.shape[0]
+    n, rank = freedoms.basis.shape
     found = Components(np.zeros((3, n)), np.zeros((3, 4, 4)), np.zeros(3), np.full(3, DONE))
-    system = np.zeros((8, n))
+    system = np.empty((rank, 8))
     unit_centre = unit(centre)
-    _translation(operators, basis, task, unit_centre, system, found)
+    _translation(freedoms, task, unit_centre, system, found)
     A_c = _shifted(points, centre)
     A_r = _shifted(targets, centre)
     a = unit(minors(A_c[0], A_c[1], A_c[2]))
     a_t = unit(minors(A_r[0], A_r[1], A_r[2]))
-    _hinge(operators, basis, centre, unit_centre, a, a_t, A_c, A_r, system, found)
-    set_plane_rows(operators, a, system, 0)
-    set_point_rows(operators, unit_centre, system, 4)
+    _hinge(freedoms, centre, unit_centre, a, a_t, A_c, A_r, system, found)
+    set_plane_columns(freedoms.motions, a, system, 0)
+    set_point_columns(freedoms.motions, unit_centre, system, 4)
     found.status[2] = NOT_REACHABLE
-    screw, H = np.zeros(n), np.zeros((4, 4))
-    if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
+    screw, H = found.screws[2], found.generators[2]
+    if primitive(freedoms, system, screw, H) and as_rotation(screw, H):
         theta = _planar_angle(H, A_c, A_r)
         if theta < 0.0:
             scale_primitive(screw, H, -1.0)
             theta = -theta
         found.amount[2] = theta
-        _keep(screw, H, 2, found)
+        found.status[2] = MOVES
+    else:
+        drop_primitive(screw, H)
     return found
 
 
 @kernel
 def _translation(
-    operators: FloatArray, basis: FloatArray, task: FaceTask, unit_centre: FloatArray, system: FloatArray,
-    found: Components,
-) -> None:  # fmt: skip
-    """The centre's translation into the first of the components; ``system`` (8, n): scratch."""
+    freedoms: Freedoms, task: FaceTask, unit_centre: FloatArray, system: FloatArray, found: Components
+) -> None:
+    """The centre's translation into the first of the components; ``system`` (r, 8): scratch."""
     centre, centre_target = task.centre, task.centre_target
-    n = operators.shape[0]
     displacement = np.empty(4)
     for k in range(4):
         displacement[k] = centre_target[k] - centre[k]
     tau = norm(displacement)
-    if tau > COINCIDENT * norm(centre):
-        found.amount[0] = tau
-        found.status[0] = NOT_REACHABLE
-        direction = unit(displacement)
-        a1, a2 = complement(unit_centre, direction)
-        set_plane_rows(operators, a1, system, 0)
-        set_plane_rows(operators, a2, system, 4)
-        screw, H = np.zeros(n), np.zeros((4, 4))
-        if primitive(operators, basis, system, screw, H):
-            step = apply(H, centre)
-            scale = math.copysign(norm(step), dot(step, direction))
-            if abs(scale) > DEGENERATE_RATIO * norm(centre):
-                scale_primitive(screw, H, 1.0 / scale)
-                found.amount[0] = dot(displacement, apply(H, centre))
-                _keep(screw, H, 0, found)
+    if not tau > COINCIDENT * norm(centre):
+        return
+    found.amount[0] = tau
+    found.status[0] = NOT_REACHABLE
+    direction = unit(displacement)
+    a1, a2 = complement(unit_centre, direction)
+    set_plane_columns(freedoms.motions, a1, system, 0)
+    set_plane_columns(freedoms.motions, a2, system, 4)
+    screw, H = found.screws[0], found.generators[0]
+    if primitive(freedoms, system, screw, H):
+        x, y, z, w = product(H, centre[0], centre[1], centre[2], centre[3])
+        scale = math.copysign(
+            math.sqrt(x * x + y * y + z * z + w * w),
+            x * direction[0] + y * direction[1] + z * direction[2] + w * direction[3],
+        )
+        if abs(scale) > DEGENERATE_RATIO * norm(centre):
+            scale_primitive(screw, H, 1.0 / scale)
+            x, y, z, w = product(H, centre[0], centre[1], centre[2], centre[3])
+            found.amount[0] = (
+                displacement[0] * x + displacement[1] * y + displacement[2] * z + displacement[3] * w
+            )
+            found.status[0] = MOVES
+            return
+    drop_primitive(screw, H)
 
 
 @kernel
 def _hinge(
-    operators: FloatArray, basis: FloatArray, centre: FloatArray, unit_centre: FloatArray, a: FloatArray,
-    a_t: FloatArray, A_c: FloatArray, A_r: FloatArray, system: FloatArray, found: Components,
+    freedoms: Freedoms, centre: FloatArray, unit_centre: FloatArray, a: FloatArray, a_t: FloatArray,
+    A_c: FloatArray, A_r: FloatArray, system: FloatArray, found: Components,
 ) -> None:  # fmt: skip
     """The hinge of the face's plane ``a`` (4,) to ``a_t`` into the second of the components.
 
     The face's points at the goal, ``A_r`` (3, 4), are turned back by it; ``A_c`` (3, 4): those now.
     """
-    n = operators.shape[0]
     together = dot(a, a_t)
     difference = np.empty(4)
     for k in range(4):
         difference[k] = a_t[k] - together * a[k]
-    hinged = True
     axis_point = np.empty(4)
     if norm(difference) > COINCIDENT:
         axis_point = minors(a, unit(difference), unit_centre)
     elif together > 0.0:
-        hinged = False
+        return
     else:
         longest = -1.0
         for i in range(3):
@@ -156,45 +165,37 @@ def _hinge(
                 longest = length
                 for k in range(4):
                     axis_point[k] = A_c[i, k]
-    if hinged:
-        found.amount[1] = math.acos(min(1.0, max(-1.0, together)))
-        found.status[1] = NOT_REACHABLE
-        along = dot(axis_point, unit_centre)
-        second_point = np.empty(4)
-        for k in range(4):
-            second_point[k] = axis_point[k] - along * unit_centre[k]
-        set_point_rows(operators, unit_centre, system, 0)
-        set_point_rows(operators, unit(second_point), system, 4)
-        screw, H = np.zeros(n), np.zeros((4, 4))
-        if primitive(operators, basis, system, screw, H) and as_rotation(screw, H):
-            theta = _hinge_angle(H, a, a_t)
-            if theta < 0.0:
-                scale_primitive(screw, H, -1.0)
-                theta = -theta
-            found.amount[1] = theta
-            _keep(screw, H, 1, found)
-            sine, versine = math.sin(-theta), 2.0 * math.sin(0.5 * theta) ** 2
-            for i in range(3):
-                once = apply(H, A_r[i])
-                twice = apply(H, once)
-                for k in range(4):
-                    A_r[i, k] += sine * once[k] + versine * twice[k]
-
-
-@kernel
-def _keep(screw: FloatArray, H: FloatArray, i: int, found: Components) -> None:
-    found.status[i] = MOVES
-    for j in range(screw.shape[0]):
-        found.screws[i, j] = screw[j]
+    found.amount[1] = math.acos(min(1.0, max(-1.0, together)))
+    found.status[1] = NOT_REACHABLE
+    along = dot(axis_point, unit_centre)
     for k in range(4):
-        for m in range(4):
-            found.generators[i, k, m] = H[k, m]
+        axis_point[k] -= along * unit_centre[k]
+    set_point_columns(freedoms.motions, unit_centre, system, 0)
+    set_point_columns(freedoms.motions, unit(axis_point), system, 4)
+    screw, H = found.screws[1], found.generators[1]
+    if not (primitive(freedoms, system, screw, H) and as_rotation(screw, H)):
+        drop_primitive(screw, H)
+        return
+    theta = _hinge_angle(H, a, a_t)
+    if theta < 0.0:
+        scale_primitive(screw, H, -1.0)
+        theta = -theta
+    found.amount[1] = theta
+    found.status[1] = MOVES
+    sine, versine = math.sin(-theta), 2.0 * math.sin(0.5 * theta) ** 2
+    for i in range(3):
+        x, y, z, w = product(H, A_r[i, 0], A_r[i, 1], A_r[i, 2], A_r[i, 3])
+        xx, yy, zz, ww = product(H, x, y, z, w)
+        A_r[i, 0] += sine * x + versine * xx
+        A_r[i, 1] += sine * y + versine * yy
+        A_r[i, 2] += sine * z + versine * zz
+        A_r[i, 3] += sine * w + versine * ww
 
 
 @kernel
 def _hinge_angle(H: FloatArray, a: FloatArray, a_t: FloatArray) -> float:
-    u = apply_transposed(H, a)
-    v = apply_transposed(H, u)
+    u = transposed_product(H, a[0], a[1], a[2], a[3])
+    v = transposed_product(H, u[0], u[1], u[2], u[3])
     uu, vv, uv, ur, vr = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(4):
         right = a_t[k] - a[k] - v[k]
@@ -210,8 +211,8 @@ def _hinge_angle(H: FloatArray, a: FloatArray, a_t: FloatArray) -> float:
 def _planar_angle(H: FloatArray, A: FloatArray, A_r: FloatArray) -> float:
     uu, vv, uv, ur, vr = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(A.shape[0]):
-        u = apply(H, A[i])
-        v = apply(H, u)
+        u = product(H, A[i, 0], A[i, 1], A[i, 2], A[i, 3])
+        v = product(H, u[0], u[1], u[2], u[3])
         for k in range(4):
             right = A_r[i, k] - A[i, k] - v[k]
             uu += u[k] * u[k]

@@ -71,6 +71,8 @@ def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
 
     Their way cannot be the face's front; what they see of the markers stays.
     """
+    if all(choice.kept.tolist()):
+        return scene
     operators, composition, matrices, centres, points, pixels, weights = scene
     return Scene(operators, composition, matrices, _kept_rows(centres, choice.kept), points, pixels, weights)
 

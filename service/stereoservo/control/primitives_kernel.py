@@ -7,12 +7,18 @@ Names, order and thresholds are those of the reference; read that first. No BLAS
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import null_direction, right_singular
+from stereoservo.numerics.linear import (
+    left_null_direction,
+    null_direction,
+    orthonormal_rows,
+    right_singular,
+)
 from stereoservo.planning.primitives import (
     DEGENERATE_RATIO,
     NOISE_RATIO,
@@ -51,21 +57,27 @@ def unit(x: FloatArray) -> FloatArray:
 
 
 @kernel
-def apply(H: FloatArray, x: FloatArray) -> FloatArray:
-    """``H x`` (4,)."""
-    y = np.empty(4)
-    for i in range(4):
-        y[i] = H[i, 0] * x[0] + H[i, 1] * x[1] + H[i, 2] * x[2] + H[i, 3] * x[3]
-    return y
+def product(H: FloatArray, x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+    """``H (x, y, z, w)ᵀ``."""
+    return (
+        H[0, 0] * x + H[0, 1] * y + H[0, 2] * z + H[0, 3] * w,
+        H[1, 0] * x + H[1, 1] * y + H[1, 2] * z + H[1, 3] * w,
+        H[2, 0] * x + H[2, 1] * y + H[2, 2] * z + H[2, 3] * w,
+        H[3, 0] * x + H[3, 1] * y + H[3, 2] * z + H[3, 3] * w,
+    )
 
 
 @kernel
-def apply_transposed(H: FloatArray, x: FloatArray) -> FloatArray:
-    """``Hᵀ x`` (4,)."""
-    y = np.empty(4)
-    for i in range(4):
-        y[i] = H[0, i] * x[0] + H[1, i] * x[1] + H[2, i] * x[2] + H[3, i] * x[3]
-    return y
+def transposed_product(
+    H: FloatArray, x: float, y: float, z: float, w: float
+) -> tuple[float, float, float, float]:
+    """``Hᵀ (x, y, z, w)ᵀ``."""
+    return (
+        H[0, 0] * x + H[1, 0] * y + H[2, 0] * z + H[3, 0] * w,
+        H[0, 1] * x + H[1, 1] * y + H[2, 1] * z + H[3, 1] * w,
+        H[0, 2] * x + H[1, 2] * y + H[2, 2] * z + H[3, 2] * w,
+        H[0, 3] * x + H[1, 3] * y + H[2, 3] * z + H[3, 3] * w,
+    )
 
 
 @kernel
@@ -102,40 +114,43 @@ def complement(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return first, unit(minors(x, u, first))
 
 
-@kernel
-def primitive(
-    operators: FloatArray, basis: FloatArray, system: FloatArray, screw: FloatArray, H: FloatArray
-) -> bool:
-    """Kernel of an (8, n) system in the arm's freedoms (n, r): joint screw and operator; False: not
-    reachable.
+class Freedoms(NamedTuple):
+    """What an arm can make now: orthonormal ``motions`` (r, 4, 4), and the joint screws ``basis`` (n, r) that make
+    them.
     """
+
+    motions: FloatArray
+    basis: FloatArray
+
+
+@kernel
+def primitive(freedoms: Freedoms, system: FloatArray, screw: FloatArray, H: FloatArray) -> bool:
+    """The motion that an (r, 8) ``system`` leaves, a row a freedom: its joint screw (n,) and operator (4, 4); False:
+    not reachable.
+    """
+    motions, basis = freedoms
     n, rank = basis.shape
     if rank == 0:
         return False
-    reduced = np.zeros((8, rank))
-    for i in range(8):
-        for k in range(rank):
-            s = 0.0
-            for j in range(n):
-                s += system[i, j] * basis[j, k]
-            reduced[i, k] = s
-    x, smallest, second, largest = null_direction(reduced)
-    if rank == 1:
-        second = 1.0
     threshold = NOISE_RATIO if rank == RIGID_FREEDOMS else REACH_RATIO
-    if second <= DEGENERATE_RATIO * largest or smallest > threshold * second:
-        return False
-    for i in range(4):
-        for k in range(4):
-            H[i, k] = 0.0
-    for j in range(n):
-        s = 0.0
-        for k in range(rank):
-            s += basis[j, k] * x[k]
-        screw[j] = s
+    x = np.empty(rank)
+    known = False
+    if rank > 1:
+        smallest, second, largest = left_null_direction(system.copy(), x)
+        known = second > DEGENERATE_RATIO * largest and smallest <= threshold * second
+    if not known:  # the bounds do not tell: by the singular values themselves
+        x, smallest, second, largest = null_direction(np.ascontiguousarray(system.T))
+        if rank == 1:
+            second = 1.0
+        if second <= DEGENERATE_RATIO * largest or smallest > threshold * second:
+            return False
+    drop_primitive(screw, H)
+    for h in range(rank):
+        for j in range(n):
+            screw[j] += basis[j, h] * x[h]
         for i in range(4):
             for k in range(4):
-                H[i, k] += s * operators[j, i, k]
+                H[i, k] += x[h] * motions[h, i, k]
     return True
 
 
@@ -147,6 +162,16 @@ def scale_primitive(screw: FloatArray, H: FloatArray, factor: float) -> None:
     for i in range(4):
         for k in range(4):
             H[i, k] *= factor
+
+
+@kernel
+def drop_primitive(screw: FloatArray, H: FloatArray) -> None:
+    """No screw (n,), and no operator (4, 4)."""
+    for j in range(screw.shape[0]):
+        screw[j] = 0.0
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = 0.0
 
 
 @kernel
@@ -165,21 +190,21 @@ def as_rotation(screw: FloatArray, H: FloatArray) -> bool:
 
 
 @kernel
-def set_point_rows(operators: FloatArray, A: FloatArray, system: FloatArray, row: int) -> None:
-    """``Ĥ_j A`` into rows ``row`` to ``row + 3``."""
-    for j in range(operators.shape[0]):
-        velocity = apply(operators[j], A)
+def set_point_columns(motions: FloatArray, A: FloatArray, system: FloatArray, column: int) -> None:
+    """``Ĥ_k A`` of the motions (r, 4, 4) into columns ``column`` to ``column + 3`` of the system (r, 8)."""
+    for k in range(motions.shape[0]):
+        H = motions[k]
         for i in range(4):
-            system[row + i, j] = velocity[i]
+            system[k, column + i] = H[i, 0] * A[0] + H[i, 1] * A[1] + H[i, 2] * A[2] + H[i, 3] * A[3]
 
 
 @kernel
-def set_plane_rows(operators: FloatArray, a: FloatArray, system: FloatArray, row: int) -> None:
-    """``Ĥ_jᵀ a`` into rows ``row`` to ``row + 3``."""
-    for j in range(operators.shape[0]):
-        velocity = apply_transposed(operators[j], a)
+def set_plane_columns(motions: FloatArray, a: FloatArray, system: FloatArray, column: int) -> None:
+    """``Ĥ_kᵀ a`` of the motions (r, 4, 4) into columns ``column`` to ``column + 3`` of the system (r, 8)."""
+    for k in range(motions.shape[0]):
+        H = motions[k]
         for i in range(4):
-            system[row + i, j] = velocity[i]
+            system[k, column + i] = H[0, i] * a[0] + H[1, i] * a[1] + H[2, i] * a[2] + H[3, i] * a[3]
 
 
 @kernel
@@ -196,17 +221,33 @@ def stacked_singular(operators: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @kernel
-def freedoms_of(V: FloatArray, values: FloatArray) -> FloatArray:
-    """`primitives.arm_freedoms`: the basis (n, r), from `stacked_singular`."""
+def regular_freedoms(operators: FloatArray, least: float) -> tuple[Freedoms, bool]:
+    """The freedoms of an arm of six joints at most, if its stacked operators (n, 4, 4) surely have no singular value
+    below ``least`` times the largest; whether they have none.
+    """
+    n = operators.shape[0]
+    found = Freedoms(np.empty((n, 4, 4)), np.empty((n, n)))
+    regular = n <= RIGID_FREEDOMS and (
+        orthonormal_rows(operators.reshape(n, 16), found.motions.reshape(n, 16), found.basis) > least
+    )
+    return found, regular
+
+
+@kernel
+def singular_freedoms(operators: FloatArray, V: FloatArray, values: FloatArray) -> Freedoms:
+    """`primitives.arm_freedoms`, from `stacked_singular`."""
     n = V.shape[0]
     rank = 0
     while rank < min(n, RIGID_FREEDOMS) and values[rank] > RANK_RATIO * values[0]:
         rank += 1
-    basis = np.empty((n, rank))
-    for j in range(n):
-        for k in range(rank):
-            basis[j, k] = V[j, k] / values[k]
-    return basis
+    basis, motions = np.empty((n, rank)), np.zeros((rank, 4, 4))
+    for h in range(rank):
+        for j in range(n):
+            basis[j, h] = V[j, h] / values[h]
+            for i in range(4):
+                for k in range(4):
+                    motions[h, i, k] += basis[j, h] * operators[j, i, k]
+    return Freedoms(motions, basis)
 
 
 @kernel

@@ -11,17 +11,21 @@ Near a singularity of the arm that step does not exist, or is far too large; `da
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.control.primitives_kernel import product
 from stereoservo.kinematics.kernels import exp_twist, multiply4_into, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import add_equation, damped_solve
+from stereoservo.numerics.linear import add_equation, damped_solve, factor_solve
 
 ITERATIONS = 6
 CONVERGED = 1e-12
-"""Of the joints' step: below it another iteration changes nothing."""
+"""Of the joints' step: what another iteration would change, below which there is none."""
+STEEP = 1e-2
+"""Share of the change before, below which a change tells that the Jacobian is good enough for another round."""
 SLACK = 1.0 + 1e-9
 """What the squared error may grow by: near its least value it does not tell steps apart."""
 BRACKETS = 6
@@ -35,13 +39,31 @@ SIMULTANEOUS = 2
 TIP_FIRST = 1
 
 
-@kernel
-def exponential_into(
-    G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray
-) -> None:
-    """``exp(amount G)`` into (4, 4): in closed form of a revolution or translation (4.27, 3.21), else the series.
+class JointScrews(NamedTuple):
+    """``operators`` (n, 4, 4) of joints, their ``squares`` (n, 4, 4), and ``rates`` (n,): that of a revolution's
+    angle, 0 for a translation, NaN for a general screw.
+    """
 
-    ``square``, ``cube`` (4, 4): scratch.
+    operators: FloatArray
+    squares: FloatArray
+    rates: FloatArray
+
+
+@kernel
+def joint_screws(operators: FloatArray) -> JointScrews:
+    """The operators (n, 4, 4) with what their exponentials are made of."""
+    n = operators.shape[0]
+    found = JointScrews(operators, np.empty((n, 4, 4)), np.empty(n))
+    cube = np.empty((4, 4))
+    for j in range(n):
+        found.rates[j] = _square_into(operators[j], found.squares[j], cube)
+    return found
+
+
+@kernel
+def _square_into(G: FloatArray, square: FloatArray, cube: FloatArray) -> float:
+    """``G²`` into ``square`` (4, 4); the rate of the revolution ``G³ = −rate² G``, 0 for a translation, NaN where ``G``
+    is neither. ``cube`` (4, 4): scratch.
     """
     multiply4_into(G, G, square)
     multiply4_into(G, square, cube)
@@ -51,27 +73,95 @@ def exponential_into(
         for k in range(4):
             size += G[i, k] * G[i, k]
             rest += (cube[i, k] + c * G[i, k]) ** 2
-    if rest <= STRUCTURE * size**3 and c >= 0.0:
-        rate = math.sqrt(c)
-        if rate * abs(amount) > 1e-8:
-            half = math.sin(0.5 * rate * amount)
-            first, second = math.sin(rate * amount) / rate, 2.0 * half * half / c
-        else:
-            first, second = amount, 0.5 * amount * amount
+    return math.sqrt(c) if rest <= STRUCTURE * size**3 and c >= 0.0 else math.nan
+
+
+@kernel
+def _closed_form(rate: float, amount: float) -> tuple[float, float]:
+    """``exp(amount G) = 1 + first G + second G²``: both factors (4.27, 3.21)."""
+    if rate * abs(amount) > 1e-8:
+        half = math.sin(0.5 * rate * amount)
+        return math.sin(rate * amount) / rate, 2.0 * half * half / (rate * rate)
+    return amount, 0.5 * amount * amount
+
+
+@kernel
+def exponential_into(
+    G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray
+) -> None:
+    """``exp(amount G)`` into (4, 4): in closed form of a revolution or translation (4.27, 3.21), else the series.
+
+    ``square``, ``cube`` (4, 4): scratch.
+    """
+    rate = _square_into(G, square, cube)
+    if math.isnan(rate):
+        whole = exp_twist(amount * G)
         for i in range(4):
             for k in range(4):
-                H[i, k] = first * G[i, k] + second * square[i, k]
-            H[i, i] += 1.0
+                H[i, k] = whole[i, k]
         return
-    whole = exp_twist(amount * G)
+    first, second = _closed_form(rate, amount)
     for i in range(4):
         for k in range(4):
-            H[i, k] = whole[i, k]
+            H[i, k] = first * G[i, k] + second * square[i, k]
+        H[i, i] += 1.0
+
+
+@kernel
+def _exponential_pair_into(
+    screws: JointScrews, j: int, amount: float, H: FloatArray, inverse: FloatArray
+) -> None:
+    """``exp(amount Ĥ_j)`` and its inverse, into (4, 4) each."""
+    rate = screws.rates[j]
+    if math.isnan(rate):
+        whole, back = exp_twist(amount * screws.operators[j]), exp_twist(-amount * screws.operators[j])
+        for i in range(4):
+            for k in range(4):
+                H[i, k], inverse[i, k] = whole[i, k], back[i, k]
+        return
+    first, second = _closed_form(rate, amount)
+    G, square = screws.operators[j], screws.squares[j]
+    for i in range(4):
+        for k in range(4):
+            odd, even = first * G[i, k], second * square[i, k]
+            H[i, k], inverse[i, k] = even + odd, even - odd
+        H[i, i] += 1.0
+        inverse[i, i] += 1.0
+
+
+@kernel
+def displacement_into(
+    screws: JointScrews, composition: int, step: FloatArray, H: FloatArray, work: FloatArray
+) -> None:
+    """The displacement by ``step`` into ``H`` (4, 4); ``work`` (5, 4, 4): scratch, whose last (4, 4) is left with the
+    sum of operators that move at once.
+    """
+    n = step.shape[0]
+    first, second, total = work[0], work[1], work[4]
+    if composition == SIMULTANEOUS:
+        for i in range(4):
+            for k in range(4):
+                s = 0.0
+                for j in range(n):
+                    s += step[j] * screws.operators[j, i, k]
+                total[i, k] = s
+        exponential_into(total, 1.0, first, second, H)
+        return
+    for i in range(4):
+        for k in range(4):
+            H[i, k] = 1.0 if i == k else 0.0
+    for nth in range(n):
+        j = n - 1 - nth if composition == TIP_FIRST else nth
+        _exponential_pair_into(screws, j, step[j], first, second)
+        multiply4_into(H, first, total)
+        for i in range(4):
+            for k in range(4):
+                H[i, k] = total[i, k]
 
 
 @kernel
 def step_into(
-    operators: FloatArray,
+    screws: JointScrews,
     composition: int,
     step: FloatArray,
     H: FloatArray,
@@ -82,16 +172,11 @@ def step_into(
 
     ``work`` (5, 4, 4): scratch.
     """
+    operators = screws.operators
     n = step.shape[0]
     first, second, factor, inverse, total = work[0], work[1], work[2], work[3], work[4]
     if composition == SIMULTANEOUS:
-        for i in range(4):
-            for k in range(4):
-                s = 0.0
-                for j in range(n):
-                    s += step[j] * operators[j, i, k]
-                total[i, k] = s
-        exponential_into(total, 1.0, first, second, H)
+        displacement_into(screws, composition, step, H, work)
         for j in range(n):
             for i in range(4):
                 for k in range(4):
@@ -111,39 +196,41 @@ def step_into(
             inverse[i, k] = H[i, k]
     for nth in range(n):
         j = n - 1 - nth if composition == TIP_FIRST else nth
-        G = operators[j]
-        multiply4_into(H, G, total)
+        multiply4_into(H, operators[j], total)
         multiply4_into(total, inverse, turned[j])
-        exponential_into(G, step[j], first, second, factor)
-        multiply4_into(H, factor, total)
+        _exponential_pair_into(screws, j, step[j], first, second)
+        multiply4_into(H, first, total)
+        multiply4_into(second, inverse, factor)
         for i in range(4):
             for k in range(4):
-                H[i, k] = total[i, k]
-        exponential_into(G, -step[j], first, second, factor)
-        multiply4_into(factor, inverse, total)
-        for i in range(4):
-            for k in range(4):
-                inverse[i, k] = total[i, k]
+                H[i, k], inverse[i, k] = total[i, k], factor[i, k]
 
 
 @kernel
 def corrected_step(
     operators: FloatArray, composition: int, points: FloatArray, wanted: FloatArray, step: FloatArray
 ) -> FloatArray:
-    """Joint step (n,) that displaces ``points`` (m, 4) to ``wanted`` (m, 4), by Newton's method from ``step`` (n,)."""
+    """Joint step (n,) that displaces ``points`` (m, 4) to ``wanted`` (m, 4), by Newton's method from ``step`` (n,).
+
+    The Jacobian is taken anew only in rounds after one that did not bring the change down by `STEEP`. It ends where
+    another round would change less than `CONVERGED`: changes fall by the ratio of the last two at least.
+    """
     n, count = step.shape[0], points.shape[0]
     found, best = step.copy(), step.copy()
-    H = np.empty((4, 4))
-    turned = np.empty((n, 4, 4))
-    work = np.empty((5, 4, 4))
-    N = np.empty((n, n))
-    b = np.empty(n)
-    change = np.empty(n)
-    rows = np.empty((4, n))
+    H, turned, work = np.empty((4, 4)), np.empty((n, 4, 4)), np.empty((5, 4, 4))
+    N, b, change = np.empty((n, n)), np.empty(n), np.empty(n)
+    rows = np.empty((count, 4, n))
     moved = np.empty((count, 4))
-    before = math.inf
-    for _ in range(ITERATIONS):
-        step_into(operators, composition, found, H, turned, work)
+    screws = joint_screws(operators)
+    before, last = math.inf, 0.0
+    for j in range(n):
+        last = max(last, abs(step[j]))
+    anew = True
+    for round_ in range(ITERATIONS):
+        if anew:
+            step_into(screws, composition, found, H, turned, work)
+        else:
+            displacement_into(screws, composition, found, H, work)
         transform_points_into(H, points, moved)
         error = 0.0
         for p in range(count):
@@ -155,26 +242,35 @@ def corrected_step(
         for j in range(n):
             best[j] = found[j]
             b[j] = 0.0
-            for k in range(n):
-                N[j, k] = 0.0
-        for p in range(count):
+        if anew:
             for j in range(n):
+                for k in range(n):
+                    N[j, k] = 0.0
+            for p in range(count):
+                for j in range(n):
+                    velocity = product(turned[j], moved[p, 0], moved[p, 1], moved[p, 2], moved[p, 3])
+                    for i in range(4):
+                        rows[p, i, j] = velocity[i]
                 for i in range(4):
-                    s = 0.0
-                    for k in range(4):
-                        s += turned[j, i, k] * moved[p, k]
-                    rows[i, j] = s
-            for i in range(4):
-                add_equation(rows[i], wanted[p, i] - moved[p, i], 1.0, N, b)
-        damped_solve(N, b, DAMPING, change)
+                    add_equation(rows[p, i], wanted[p, i] - moved[p, i], 1.0, N, b)
+            damped_solve(N, b, DAMPING, change)
+        else:
+            for p in range(count):
+                for i in range(4):
+                    residual = wanted[p, i] - moved[p, i]
+                    for j in range(n):
+                        b[j] += rows[p, i, j] * residual
+            factor_solve(N, b, change)
         most = 0.0
         for j in range(n):
             found[j] += change[j]
             most = max(most, abs(change[j]))
-        if most < CONVERGED:
+        if most < CONVERGED or (round_ > 0 and most * min(1.0, most / last) < CONVERGED):
             for j in range(n):
                 best[j] = found[j]
             break
+        anew = not most < STEEP * last
+        last = most
     return best
 
 

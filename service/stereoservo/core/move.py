@@ -190,7 +190,7 @@ def move(context: StepContext) -> SourceOutput:
 def _foreseen(output: SourceOutput, context: StepContext) -> SourceOutput:
     """The output; the safety stage is told where late drives will have their joints before they obey it."""
     delays = context.state.block.delays
-    if delays.delay_s.any():
+    if any(delays.delay_s.tolist()):
         towards = np.where(output.velocity != 0.0, output.velocity, context.state.block.command)
         ahead = context.q + delays.under_way
         context.outermost = np.where(

@@ -285,31 +285,31 @@ def _expected(
     seen_ns: IntArray, unseen_px: FloatArray, lens: FloatArray, pixels: FloatArray, speed: FloatArray,
     covariance: FloatArray, seen: BoolArray,
 ) -> bool:  # fmt: skip
-    """Into the last four: `expected_sights` as the camera's lens shows them, and which of them (m,) lie within its
+    """Into the last four: `expected_sights_into` as the camera's lens shows them, and which of them (m,) lie within its
     fold; whether all do.
     """
-    found = expected_sights(predicted, jacobian, velocities, innovation, now_ns - seen_ns, seen_ns, unseen_px)
+    expected_sights_into(
+        predicted, jacobian, velocities, innovation, now_ns, seen_ns, unseen_px, pixels, speed, covariance
+    )
     if lens.size == 4 and lens[0] == 0.0:
-        pixels[:], speed[:], covariance[:] = found
         return True
-    pixels[:], speed[:], covariance[:], seen[:] = distort_expected(lens, *found)
+    pixels[:], speed[:], covariance[:], seen[:] = distort_expected(lens, pixels, speed, covariance)
     return bool(seen.all())
 
 
 @kernel
-def expected_sights(
-    predicted: FloatArray, jacobian: FloatArray, velocities: FloatArray, innovation: FloatArray,
-    age_ns: IntArray, seen_ns: IntArray, unseen_px: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+def expected_sights_into(
+    predicted: FloatArray, jacobian: FloatArray, velocities: FloatArray, innovation: FloatArray, now_ns: int,
+    seen_ns: IntArray, unseen_px: FloatArray, pixels: FloatArray, speed: FloatArray, covariance: FloatArray,
+) -> None:  # fmt: skip
     """Pixels (m, 2), their velocities (m, 2) and covariances (m, 2, 2) that a camera is expected to have.
 
     ``predicted`` (m, 2) with its ``jacobian`` (m, 2, n), plus the ``innovation`` (m, 2) of markers seen of late, at
-    ``seen_ns`` (m,), ``age_ns`` (m,) ago; ``unseen_px`` (m,): deviation of the others.
+    ``seen_ns`` (m,); ``unseen_px`` (m,): deviation of the others.
     """
     m, n = jacobian.shape[0], jacobian.shape[2]
-    pixels, speed, covariance = np.empty((m, 2)), np.empty((m, 2)), np.zeros((m, 2, 2))
     for i in range(m):
-        fresh = age_ns[i] <= SEEN_LATELY_NS and seen_ns[i] > 0
+        fresh = now_ns - seen_ns[i] <= SEEN_LATELY_NS and seen_ns[i] > 0
         fastest = 0.0
         for a in range(2):
             along = 0.0
@@ -320,7 +320,7 @@ def expected_sights(
             pixels[i, a] = predicted[i, a] + (innovation[i, a] if fresh else 0.0)
         sigma = (1.0 if fresh else unseen_px[i]) + TIMING_SIGMA_S * fastest
         covariance[i, 0, 0] = covariance[i, 1, 1] = sigma * sigma
-    return pixels, speed, covariance
+        covariance[i, 0, 1] = covariance[i, 1, 0] = 0.0
 
 
 SEEN_LATELY_NS = 1_000_000_000

@@ -18,7 +18,7 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.messages.goals import Request
 from stereoservo.messages.recording_request import RecordedImages
-from stereoservo.messages.servo_state import MAX_PLAN_BYTES, LoopStatistics, plan_path
+from stereoservo.messages.servo_state import COMMISSIONING_SPEED, MAX_PLAN_BYTES, LoopStatistics, plan_path
 from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
@@ -34,8 +34,6 @@ PRIOR_LAYOUT = "Prior.1"
 OBSERVATION_CAPACITY = 1 << 16
 PRIOR_CAPACITY = 1 << 16
 STATE_CAPACITY = 1 << 16
-
-COMMISSIONING_SPEED = 0.05
 
 
 class RunPlan(msgspec.Struct, frozen=True):

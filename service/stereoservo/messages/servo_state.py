@@ -21,6 +21,8 @@ from stereoservo.messages.wire import LoopInfo, StateMessage
 STATE_LAYOUT = "ServoState.1"
 """Of the records of `daemon.ipc_messages.ServoState` in their slot."""
 MAX_PLAN_BYTES = 1 << 24
+COMMISSIONING_SPEED = 0.05
+"""Share of the cell's speed that `run --commissioning` leaves."""
 
 
 class Numbers:

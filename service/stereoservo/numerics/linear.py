@@ -1,5 +1,5 @@
 """Numba kernels of small dense linear algebra without BLAS, LAPACK or fastmath: Cholesky, normal equations, damped
-least squares, singular vectors.
+least squares, orthonormal rows, null directions, singular vectors.
 
 Explicit loops in a fixed order: the same input gives the same bits on one machine. Arrays are float64.
 """
@@ -58,18 +58,25 @@ def cholesky_solve(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
         for i in range(n):
             x[i] = 0.0
         return 0.0
+    factor_solve(N, b, x)
+    return smallest / largest
+
+
+@kernel
+def factor_solve(L: FloatArray, b: FloatArray, x: FloatArray) -> None:
+    """Solve ``L Lᵀ x = b`` for the Cholesky factor ``L`` (n, n) of `cholesky_solve`."""
+    n = b.shape[0]
     for i in range(n):
         s = b[i]
         for k in range(i):
-            s -= N[i, k] * x[k]
-        x[i] = s / N[i, i]
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
     for back in range(n):
         i = n - 1 - back
         s = x[i]
         for k in range(i + 1, n):
-            s -= N[k, i] * x[k]
-        x[i] = s / N[i, i]
-    return smallest / largest
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
 
 
 @kernel
@@ -209,3 +216,169 @@ def null_direction(A: FloatArray) -> tuple[FloatArray, float, float, float]:
     for i in range(n):
         x[i] = V[i, n - 1]
     return x, values[n - 1], values[max(n - 2, 0)], values[0]
+
+
+# -- by orthogonalisation, where bounds on the singular values are enough ---------------------------------------
+
+INVERSE_ITERATIONS = 8
+SETTLED = 1e-16
+"""Of a null direction: what another round of inverse iteration would change."""
+
+
+@kernel
+def dot_of_rows(A: FloatArray, i: int, B: FloatArray, k: int) -> float:
+    """``A[i]·B[k]`` of rows whose length is a multiple of four, as four sums."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    for c in range(0, A.shape[1], 4):
+        s0 += A[i, c] * B[k, c]
+        s1 += A[i, c + 1] * B[k, c + 1]
+        s2 += A[i, c + 2] * B[k, c + 2]
+        s3 += A[i, c + 3] * B[k, c + 3]
+    return (s0 + s1) + (s2 + s3)
+
+
+@kernel
+def invert_upper(R: FloatArray, n: int, W: FloatArray) -> float:
+    """Inverse of the leading (n, n) of an upper triangular ``R`` into ``W``, zeros below; its squared Frobenius norm,
+    infinite where ``R`` has no inverse.
+    """
+    size = 0.0
+    for k in range(n):
+        for i in range(k + 1, n):
+            W[i, k] = 0.0
+        if R[k, k] == 0.0:
+            return math.inf
+        W[k, k] = 1.0 / R[k, k]
+        size += W[k, k] * W[k, k]
+        for back in range(k):
+            i = k - 1 - back
+            s = 0.0
+            for h in range(i + 1, k + 1):
+                s += R[i, h] * W[h, k]
+            W[i, k] = -s / R[i, i]
+            size += W[i, k] * W[i, k]
+    return size
+
+
+@kernel
+def orthonormal_rows(A: FloatArray, Q: FloatArray, W: FloatArray) -> float:
+    """Orthonormal ``Q = Wᵀ A`` (n, m) of the rows of ``A`` (n, m), ``W`` (n, n) upper triangular, by Gram and Schmidt;
+    a lower bound, within a factor n, of the smallest over the largest singular value of ``A``: 0 where rows depend on
+    one another.
+
+    ``m`` is a multiple of four. ``Q`` is orthonormal to rounding over the bound.
+    """
+    n, m = A.shape
+    R = np.zeros((n, n))
+    size = 0.0
+    for i in range(n):
+        for c in range(m):
+            Q[i, c] = A[i, c]
+        for h in range(i):
+            along = dot_of_rows(Q, h, Q, i)
+            R[h, i] = along
+            size += along * along
+            for c in range(m):
+                Q[i, c] -= along * Q[h, c]
+        square = dot_of_rows(Q, i, Q, i)
+        if not (square > 0.0 and math.isfinite(square)):
+            return 0.0
+        length = math.sqrt(square)
+        R[i, i] = length
+        size += square
+        for c in range(m):
+            Q[i, c] /= length
+    return 1.0 / math.sqrt(size * invert_upper(R, n, W))
+
+
+@kernel
+def left_null_direction(A: FloatArray, x: FloatArray) -> tuple[float, float, float]:
+    """Unit ``x`` (n,) of least ``|xᵀ A|`` for ``A`` (n, m), n >= 2, which is overwritten; bounds of its singular
+    values: the smallest is at most the first, the second-smallest at least the second, the largest at most the third.
+
+    By Gram and Schmidt with pivoting, then inverse iteration. The second is 0, and ``x`` unknown, where that does not
+    tell the direction: several are null, or nearly. ``m`` is a multiple of four.
+    """
+    n, m = A.shape
+    R, W = np.zeros((n, n)), np.empty((n, n))
+    order = np.arange(n)
+    size = 0.0
+    for i in range(n):
+        best, longest = i, -1.0
+        for k in range(i, n):
+            square = dot_of_rows(A, k, A, k)
+            if square > longest:
+                best, longest = k, square
+        if best != i:
+            order[i], order[best] = order[best], order[i]
+            for c in range(m):
+                A[i, c], A[best, c] = A[best, c], A[i, c]
+            for h in range(i):
+                R[h, i], R[h, best] = R[h, best], R[h, i]
+        if not math.isfinite(longest):
+            return 0.0, 0.0, 0.0
+        R[i, i] = math.sqrt(max(longest, 0.0))
+        size += longest
+        if i == n - 1 or not longest > 0.0:
+            break
+        for c in range(m):
+            A[i, c] /= R[i, i]
+        for k in range(i + 1, n):
+            along = dot_of_rows(A, i, A, k)
+            R[i, k] = along
+            size += along * along
+            for c in range(m):
+                A[k, c] -= along * A[i, c]
+    last = n - 1
+    second = 1.0 / math.sqrt(invert_upper(R, last, W))
+    if not second > 0.0:
+        return 0.0, 0.0, 0.0
+    y = W[last]
+    square = 1.0
+    y[last] = 1.0
+    for i in range(last):
+        s = 0.0
+        for k in range(i, last):
+            s -= W[i, k] * R[k, last]
+        y[i] = s
+        square += s * s
+    smallest = R[last, last] / math.sqrt(square)
+    for i in range(n):
+        y[i] /= math.sqrt(square)
+    if not _by_inverse_iteration(R, y, smallest / second):
+        return smallest, 0.0, math.sqrt(size)
+    for i in range(n):
+        x[order[i]] = y[i]
+    return smallest, second, math.sqrt(size)
+
+
+@kernel
+def _by_inverse_iteration(R: FloatArray, y: FloatArray, ratio: float) -> bool:
+    """Refine the unit ``y`` (n,) of least ``|R y|``; ``ratio``: a bound of the smallest singular value over the second.
+    False where that takes too long.
+    """
+    n = y.shape[0]
+    if ratio <= SETTLED:
+        return True
+    z = np.empty(n)
+    for _ in range(INVERSE_ITERATIONS):
+        for i in range(n):
+            s = y[i]
+            for k in range(i):
+                s -= R[k, i] * z[k]
+            z[i] = s / R[i, i]
+        square = 0.0
+        for back in range(n):
+            i = n - 1 - back
+            s = z[i]
+            for k in range(i + 1, n):
+                s -= R[i, k] * z[k]
+            z[i] = s / R[i, i]
+            square += z[i] * z[i]
+        change, length = 0.0, math.sqrt(square)
+        for i in range(n):
+            change = max(change, abs(z[i] / length - y[i]))
+            y[i] = z[i] / length
+        if change * ratio * ratio <= SETTLED:
+            return True
+    return False

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import msgspec
 import typer
@@ -17,7 +17,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.demonstration.emulated import (
@@ -25,19 +24,14 @@ from stereoservo_sim.demonstration.emulated import (
     has_emulated_drives,
     with_mechanics,
 )
-from stereoservo_sim.demonstration.results import summary
-from stereoservo_sim.demonstration.runner import (
-    DemoFailedError,
-    DemonstrationProgress,
-    conduct_live,
-    conduct_lockstep,
-)
-from stereoservo_sim.demonstration.scenario import shown_goals
-from stereoservo_sim.demonstration.truth import true_cell
-from stereoservo_sim.world.mechanics import PRESETS
-from stereoservo_sim.world.simulated_cell import SimulatedCell
+from stereoservo_sim.demonstration.progress import DemoFailedError, DemonstrationProgress
+from stereoservo_sim.world.presets import MechanicsPreset
 
-MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in PRESETS})  # type: ignore[misc]
+if TYPE_CHECKING:
+    from stereoservo_sim.world.simulated_cell import SimulatedCell
+
+# By their names alone: --help imports nothing numerical.
+MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in get_args(MechanicsPreset)})  # type: ignore[misc]
 
 
 def demo(
@@ -72,6 +66,11 @@ def demo(
     ] = None,
 ) -> None:
     """Calibrate an uncalibrated simulated cell through its rendered images, show it goals, and reach them."""
+    from stereoservo.control.law_registry import LAWS, UnknownLawError
+    from stereoservo_sim.demonstration.results import summary
+    from stereoservo_sim.demonstration.runner import conduct_live, conduct_lockstep
+    from stereoservo_sim.demonstration.scenario import shown_goals
+
     try:
         path = Path(cell) if cell.endswith(".toml") else shipped_cell_path(cell)
         truth = _checked(load_cell_file(path), path.parent, lockstep)
@@ -105,6 +104,8 @@ def demo(
 
 def _checked(cell: CellFile, folder: Path, lockstep: bool) -> SimulatedCell:
     """The simulation behind a cell that can be demonstrated, and judged by it. Raises ValueError."""
+    from stereoservo_sim.demonstration.truth import true_cell
+
     truth = true_cell(cell, folder)
     emulated = has_emulated_drives(cell)
     streams = [camera.name for camera in cell.camera if camera.driver == "video"]

@@ -7,25 +7,25 @@ import os
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from stereoservo.control.law_registry import LAWS
 from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo.ports import plugins
 from stereoservo_sim.progress import progress_bar
-from stereoservo_sim.tasks.calibrations import FRAMES, STOPS
-from stereoservo_sim.tasks.campaign import SettingsError, default_jobs, run_campaign
-from stereoservo_sim.tasks.closed_loop import LoopSettings
-from stereoservo_sim.tasks.setting import DEFAULT_GAIN, DEFAULT_RATE_HZ
-from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks
-from stereoservo_sim.world.mechanics import PRESETS, MechanicsPreset
+from stereoservo_sim.tasks.options import DEFAULT_GAIN, DEFAULT_RATE_HZ, FRAMES, STOPS, SettingsError
+from stereoservo_sim.world.presets import MechanicsPreset
 
-LawOption = StrEnum("LawOption", {name: name for name in LAWS})  # type: ignore[misc]
+if TYPE_CHECKING:
+    from stereoservo_sim.tasks.task_file import AlignmentTask
+
+# By their names alone: --help imports no law, and nothing numerical.
+LawOption = StrEnum("LawOption", {name: name for name in plugins.names(plugins.LAWS)})  # type: ignore[misc]
 LAW = LawOption(DEFAULT_LAW)
-MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in PRESETS})  # type: ignore[misc]
+MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in get_args(MechanicsPreset)})  # type: ignore[misc]
 
 
 class ArmOption(StrEnum):
@@ -113,6 +113,13 @@ def simulate(
     """
     # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo.control.law_registry import LAWS
+    from stereoservo_sim.tasks.campaign import default_jobs, run_campaign
+    from stereoservo_sim.tasks.closed_loop import LoopSettings
+    from stereoservo_sim.tasks.task_file import read_tasks
+
+    if law.value not in LAWS:  # installed, and broken
+        raise SettingsError(f"--law: {LAWS.unknown(law.value)}")
     settings = LoopSettings(
         law=law.value,
         arm=arm.value,

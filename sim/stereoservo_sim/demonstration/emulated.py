@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 
 from stereoservo.messages.cell_file import CellFile
-from stereoservo_sim.world.mechanics import MechanicsPreset
+from stereoservo_sim.world.presets import MechanicsPreset
 
 HEADING = re.compile(r"^\[", re.MULTILINE)
 SOURCE = re.compile(r"^(\s*source\s*=\s*)\"http://127\.0\.0\.1:\d+/", re.MULTILINE)

@@ -27,23 +27,12 @@ from stereoservo_sim.demonstration.emulated import (
 )
 from stereoservo_sim.demonstration.live_demonstrator import LiveDemonstrator
 from stereoservo_sim.demonstration.lockstep_demonstrator import LockstepDemonstrator
+from stereoservo_sim.demonstration.progress import DemoFailedError, DemonstrationProgress
 from stereoservo_sim.demonstration.scenario import Calibrated, ShownGoal, perform, shown_goals
 from stereoservo_sim.demonstration.truth import TruthLog, shown_positions, true_cell
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell
-
-
-class DemoFailedError(Exception):
-    """The demonstration did not succeed."""
-
-
-@dataclass(frozen=True)
-class DemonstrationProgress:
-    """Protocol of a progress reporter: lines of text, and a fraction of the present work."""
-
-    tell: Callable[[str], None]
-    progress: Callable[[float], None]
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from stereoservo_sim.tasks.setting import (
 )
 from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
 from stereoservo_sim.world.mechanical_trials import synthetic_load
-from stereoservo_sim.world.mechanics import Mechanics, MechanicsPreset, Transmission, preset, quantised
+from stereoservo_sim.world.mechanics import Mechanics, Transmission, preset, quantised
+from stereoservo_sim.world.presets import MechanicsPreset
 from stereoservo_sim.world.synthetic import (
     RX90_ROWS,
     SyntheticCell,

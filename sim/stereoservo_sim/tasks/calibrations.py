@@ -26,6 +26,7 @@ from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, Reach, free_cell, mechanics_of, rx90_cell
+from stereoservo_sim.tasks.options import FRAMES, STOPS
 from stereoservo_sim.tasks.setting import (
     FOCAL_ERROR,
     HAND_EYE_ERROR_DEG,
@@ -36,12 +37,11 @@ from stereoservo_sim.tasks.setting import (
 from stereoservo_sim.tasks.task_file import AlignmentTask
 from stereoservo_sim.world.exact_model import exact_model, twists
 from stereoservo_sim.world.mechanical_trials import mechanical_trials
-from stereoservo_sim.world.mechanics import MechanicsPreset
+from stereoservo_sim.world.presets import MechanicsPreset
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 CalibrationName = Literal["self", "exact", "coarse"]
 
-STOPS, FRAMES = 41, 25
 """Of a joint's trial motion, and averaged at a stop."""
 LEAST_SIGMA_PX = 1e-3
 """Noise of the trials' averages where the images have none: a fit weighs by it."""

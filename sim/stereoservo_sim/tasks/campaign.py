@@ -26,12 +26,6 @@ CHUNK = 4
 _worker: tuple[TaskCalibration, LoopSettings] | None = None
 
 
-class SettingsError(Exception):
-    """Invalid settings of a campaign. The text states what would be valid."""
-
-    code = "settings"
-
-
 def run_campaign(
     tasks: Sequence[AlignmentTask], settings: LoopSettings, jobs: int, tell: Tell = lambda done, total: None
 ) -> dict[str, Any]:

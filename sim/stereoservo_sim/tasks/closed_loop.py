@@ -34,17 +34,16 @@ from stereoservo_sim.tasks.ground_truth import (
     sight,
 )
 from stereoservo_sim.tasks.marker_estimate import MarkerEstimate, PointsName
+from stereoservo_sim.tasks.options import DEFAULT_GAIN, DEFAULT_RATE_HZ
 from stereoservo_sim.tasks.planned_path import LOOK_S, NoPathError, PlannedPath, plan_task_path
 from stereoservo_sim.tasks.setting import (
-    DEFAULT_GAIN,
-    DEFAULT_RATE_HZ,
     FACE,
     MAX_ITERATIONS,
     MIN_DEPTH,
     SUCCESS_PX,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
-from stereoservo_sim.world.mechanics import MechanicsPreset
+from stereoservo_sim.world.presets import MechanicsPreset
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50

@@ -25,7 +25,6 @@ MIN_DEPTH = 0.01
 """A marker nearer to a camera's plane than this is behind it [m]."""
 SUCCESS_PX = 0.5
 MAX_ITERATIONS = 2000
-DEFAULT_RATE_HZ, DEFAULT_GAIN = 25.0, 0.5
 FOCAL_ERROR, HAND_EYE_ERROR_DEG = 0.1, 5.0
 """Of the coarse calibration: share of the focal length, angle about the task's own axis."""
 

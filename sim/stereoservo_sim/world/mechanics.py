@@ -24,6 +24,7 @@ import numpy as np
 from msgspec import Meta
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo_sim.world.presets import MechanicsPreset
 from stereoservo_sim.world.robots import Robot, joint_frames
 
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -66,9 +67,6 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     lag_s: NonNegative = 0.0
     delay_s: NonNegative = 0.0
 
-
-MechanicsPreset = Literal["strain_wave", "planetary_qdd", "serial_servo"]
-"""Names of shipped mechanics."""
 
 PRESETS: dict[MechanicsPreset, Mechanics] = {
     # Makers' catalogues: accuracy of 0.5 to 1.5 arcmin, two periods a turn of the wave generator, ratios 50 to 160;

@@ -18,13 +18,16 @@ from stereoservo.control.cartesian_components import Components, FaceTask, decom
 from stereoservo.control.face_visibility import APPROACH, way_in_sight
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.primitives_kernel import (
-    apply,
+    Freedoms,
     dot,
-    freedoms_of,
+    drop_primitive,
     minors,
     norm,
     normal_frame,
+    product,
+    regular_freedoms,
     scale_primitive,
+    singular_freedoms,
     stacked_singular,
 )
 from stereoservo.control.step_correction import (
@@ -35,7 +38,7 @@ from stereoservo.control.step_correction import (
     exponential_into,
     rigid_motions,
 )
-from stereoservo.kinematics.kernels import multiply4_into, transform_points
+from stereoservo.kinematics.kernels import multiply4_into, transform_points, transform_points_into
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
@@ -59,15 +62,17 @@ LONGEST_STEP = 1.0
 """[rad or m] Of a joint while a velocity is held: near a singularity a small motion of the body takes more."""
 STEP_OF_BOUND = 0.9
 """Of the way to a visibility bound, how much one step may make."""
+NO_MATRIX, NO_VALUES = np.zeros((0, 0)), np.zeros(0)
 BLOCKED = 1e-3
 """Share of what is left below which a component that waits stands."""
 
 
 @kernel
 def _one_rotation(
-    operators: FloatArray, basis: FloatArray, parts: Components, screw: FloatArray, V: FloatArray
+    freedoms: Freedoms, parts: Components, screw: FloatArray, V: FloatArray
 ) -> tuple[float, int]:
     """Angle and status of hinge and planar turn as one rotation (8.50 to 8.52); its screw and generator ``V``."""
+    motions, basis = freedoms
     n, rank = basis.shape
     generators, amount, status = parts.generators, parts.amount, parts.status
     found = MOVES
@@ -90,11 +95,7 @@ def _one_rotation(
         for k in range(4):
             square -= 0.5 * V[i, k] * V[k, i]
     if not square > 0.0:
-        for j in range(n):
-            screw[j] = 0.0
-        for i in range(4):
-            for k in range(4):
-                V[i, k] = 0.0
+        drop_primitive(screw, V)
         return 0.0, DONE if found == MOVES else found
     sine = math.sqrt(square)
     factor = 1.0 / sine if cosine >= 0.0 else -1.0 / sine
@@ -103,39 +104,25 @@ def _one_rotation(
         for k in range(4):
             V[i, k] *= factor
             size += V[i, k] * V[i, k]
-    products = np.empty(n)
+            first[i, k] = V[i, k]
     for j in range(n):
         screw[j] = 0.0
-        products[j] = 0.0
-        for i in range(4):
-            for k in range(4):
-                products[j] += operators[j, i, k] * V[i, k]
     for r in range(rank):
         share = 0.0
-        for j in range(n):
-            share += basis[j, r] * products[j]
+        for i in range(4):
+            for k in range(4):
+                share += motions[r, i, k] * V[i, k]
         for j in range(n):
             screw[j] += share * basis[j, r]
+        for i in range(4):
+            for k in range(4):
+                first[i, k] -= share * motions[r, i, k]
     for i in range(4):
         for k in range(4):
-            s = -V[i, k]
-            for j in range(n):
-                s += screw[j] * operators[j, i, k]
-            left += s * s
+            left += first[i, k] * first[i, k]
     if left > REACH_RATIO * REACH_RATIO * size:
         found = NOT_REACHABLE
     return 2.0 * math.atan2(sine, abs(cosine)), found
-
-
-@kernel
-def _moved_into(G: FloatArray, amount: float, points: FloatArray, work: FloatArray) -> None:
-    """Points (k, 4) displaced by ``exp(amount G)``, in place; ``work`` (3, 4, 4): scratch."""
-    H = work[2]
-    exponential_into(G, amount, work[0], work[1], H)
-    for p in range(points.shape[0]):
-        x, y, z, w = points[p, 0], points[p, 1], points[p, 2], points[p, 3]
-        for i in range(4):
-            points[p, i] = H[i, 0] * x + H[i, 1] * y + H[i, 2] * z + H[i, 3] * w
 
 
 class Pace(NamedTuple):
@@ -188,14 +175,17 @@ def cartesian_step(
         centres += abs(centre[k]) + abs(centre_target[k])
     if is_flat(points, face) or is_flat(targets, target_face) or not math.isfinite(centres):
         return velocity, errors, allowed, shown
-    V, values = stacked_singular(operators)
-    driven, basis, singular = operators, freedoms_of(V, values), False
-    if n >= FREEDOMS and not values[FREEDOMS - 1] > SINGULAR * values[0]:
-        rigid, singular = rigid_motions(operators, V, values)
-        if singular:
-            driven, basis = rigid, np.eye(FREEDOMS)
-    parts = decompose(driven, basis, task)
-    sight = _kept_in_view(driven, basis, task, face, target_face, camera_centres, single, parts)
+    freedoms, regular = regular_freedoms(operators, SINGULAR)
+    V, values, singular = NO_MATRIX, NO_VALUES, False
+    if not regular:
+        V, values = stacked_singular(operators)
+        freedoms = singular_freedoms(operators, V, values)
+        if n >= FREEDOMS and not values[FREEDOMS - 1] > SINGULAR * values[0]:
+            rigid, singular = rigid_motions(operators, V, values)
+            if singular:
+                freedoms = Freedoms(rigid, np.eye(FREEDOMS))
+    parts = decompose(freedoms, task)
+    sight = _kept_in_view(freedoms, task, face, target_face, camera_centres, single, parts)
     steps = _paced(parts, sight, pace, errors, allowed, shown)
     if singular:
         wanted = np.zeros((4, 4))
@@ -252,57 +242,72 @@ def _exact_into(
     for i in range(4):
         for k in range(4):
             wanted[i, k] = held[i, k]
-    work = np.empty((3, 4, 4))
+    H, square, cube = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     for back in range(count):
         i = count - 1 - back
         if steps[i] != 0.0:
-            _moved_into(parts.generators[i], share * steps[i], wanted, work)
+            exponential_into(parts.generators[i], share * steps[i], square, cube, H)
+            for p in range(4):
+                wanted[p, 0], wanted[p, 1], wanted[p, 2], wanted[p, 3] = product(
+                    H, wanted[p, 0], wanted[p, 1], wanted[p, 2], wanted[p, 3]
+                )
     step = corrected_step(operators, composition, held, wanted, velocity)
     for j in range(n):
         velocity[j] = step[j] / dt_s
 
 
 @kernel
-def normalised_step(
-    operators: FloatArray,
-    composition: int,
-    task: FaceTask,
-    camera_centres: FloatArray,
-    pace: Pace,
-    single: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+def _normalised_step_into(
+    operators: FloatArray, composition: int, marker_points: FloatArray, target_points: FloatArray, corners: IntArray,
+    centre: FloatArray, centre_target: FloatArray, eyes: FloatArray, options: tuple[float, float, float, float],
+    velocity: FloatArray, components: FloatArray, shown: IntArray,
+) -> None:  # fmt: skip
     """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
     the task error are those of the frame that the arguments are in.
+
+    Into the last three: joint velocity (n,), task error and allowed (2, k), status (k,). ``corners`` (3,): markers of
+    the face; ``options``: gain, ``dt_s``, both rates of `control.law.Options`.
     """
-    n = operators.shape[0]
-    change, back = normal_frame(task.points, camera_centres)
+    gain, dt_s, rotation_rate, translation_rate = options
+    n, count = operators.shape[0], shown.shape[0]
+    points, targets = np.empty((3, 4)), np.empty((3, 4))
+    for p in range(3):
+        for k in range(4):
+            points[p, k] = marker_points[corners[p], k]
+            targets[p, k] = target_points[corners[p], k]
+    change, back = normal_frame(points, eyes)
     turned, work = np.empty((n, 4, 4)), np.empty((4, 4))
     for j in range(n):
         multiply4_into(change, operators[j], work)
         multiply4_into(work, back, turned[j])
-    inner = FaceTask(
-        transform_points(change, task.points), transform_points(change, task.targets), apply(change, task.centre),
-        apply(change, task.centre_target),
+    centres, inner = np.empty((2, 4)), np.empty((2, 4))
+    for k in range(4):
+        centres[0, k], centres[1, k] = centre[k], centre_target[k]
+    transform_points_into(change, centres, inner)
+    before = norm(centres[1] - centres[0])
+    ratio = norm(inner[1] - inner[0]) / before if before > 0.0 else 1.0
+    found = cartesian_step(
+        turned, composition,
+        FaceTask(transform_points(change, points), transform_points(change, targets), inner[0], inner[1]),
+        transform_points(change, eyes),
+        Pace(np.full(count, gain), dt_s, rotation_rate, ratio * translation_rate), count == 2,
     )  # fmt: skip
-    before = norm(task.centre_target - task.centre)
-    ratio = norm(inner.centre_target - inner.centre) / before if before > 0.0 else 1.0
-    inner_pace = Pace(pace.gains, pace.dt_s, pace.rotation_rate, ratio * pace.translation_rate)
-    velocity, errors, allowed, shown = cartesian_step(
-        turned, composition, inner, transform_points(change, camera_centres), inner_pace, single
-    )
-    errors[0] /= ratio
-    allowed[0] /= ratio
-    return velocity, errors, allowed, shown
+    for j in range(n):
+        velocity[j] = found[0][j]
+    for i in range(count):
+        unit_length = ratio if i == 0 else 1.0
+        components[0, i], components[1, i] = found[1][i] / unit_length, found[2][i] / unit_length
+        shown[i] = found[3][i]
 
 
 @kernel
 def _kept_in_view(
-    operators: FloatArray, basis: FloatArray, task: FaceTask, face: FloatArray, target_face: FloatArray,
-    camera_centres: FloatArray, single: bool, parts: Components,
+    freedoms: Freedoms, task: FaceTask, face: FloatArray, target_face: FloatArray, camera_centres: FloatArray,
+    single: bool, parts: Components,
 ) -> Sight:  # fmt: skip
     """How far the components may go with the face in view; the rotation, in its sense, goes into ``parts``."""
     centre, centre_target = task.centre, task.centre_target
-    n, cameras = operators.shape[0], camera_centres.shape[0]
+    n, cameras = freedoms.basis.shape[0], camera_centres.shape[0]
     screws, generators, amount, status = parts
     side = 1.0
     if cameras > 0:
@@ -320,7 +325,7 @@ def _kept_in_view(
     whole = 0.0
     if single:
         screw, V = np.empty(n), np.empty((4, 4))
-        whole, found = _one_rotation(operators, basis, parts, screw, V)
+        whole, found = _one_rotation(freedoms, parts, screw, V)
         angle, share, turn, clear = way_in_sight(face, V, displacement, camera_centres, side, whole)
         if not clear and status[1] == MOVES:
             other = way_in_sight(face, generators[1], displacement, camera_centres, side, amount[1])
@@ -392,10 +397,14 @@ def cartesian3_step(
 
 def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:
     """The step of a law with ``count`` components, 3 or 2, each at the gain of ``options``."""
-    face = FaceTask(scene.points[task.face], task.target_points[task.face], task.centre, task.centre_target)
-    pace = Pace(np.full(count, options.gain), options.dt_s, options.rotation_rate, options.translation_rate)
-    step = normalised_step(scene.operators, scene.composition, face, scene.camera_centres, pace, count == 2)
-    return LawStep(*step, 1.0)
+    velocity, components = np.empty(len(scene.operators)), np.empty((2, count))
+    status = np.empty(count, np.int64)
+    rates = (options.gain, options.dt_s, options.rotation_rate, options.translation_rate)
+    _normalised_step_into(
+        scene.operators, scene.composition, scene.points, task.target_points, task.face, task.centre,
+        task.centre_target, scene.camera_centres, rates, velocity, components, status,
+    )  # fmt: skip
+    return LawStep(velocity, components[0], components[1], status, 1.0)
 
 
 def cartesian_reasons(

@@ -11,7 +11,7 @@ import numpy as np
 
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.laws.stereo import Body, View, image_equations_into, image_reasons, limited
-from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, step_into
+from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, joint_screws, step_into
 from stereoservo.kinematics.kernels import project_points, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
@@ -99,9 +99,10 @@ def _refine(
     H, turned, work = np.empty((4, 4)), np.empty((n, 4, 4)), np.empty((5, 4, 4))
     change, moved = np.empty(n), np.empty((markers, 4))
     no_rates = np.zeros((cameras, markers, 2))
+    screws = joint_screws(operators)
     before = math.inf
     for _ in range(ITERATIONS):
-        step_into(operators, composition, found, H, turned, work)
+        step_into(screws, composition, found, H, turned, work)
         transform_points_into(H, points, moved)
         seen, _ = project_points(matrices, moved)
         error = 0.0

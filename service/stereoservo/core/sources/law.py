@@ -238,6 +238,8 @@ def gain_at(curve: GainCurve, error_px: float | None) -> float:
 
     What is not known, or no number, takes the smaller of the two gains.
     """
+    if curve.near == curve.far:
+        return curve.near
     return adaptive_gain(curve.near, curve.far, curve.slope, math.nan if error_px is None else error_px)
 
 

@@ -20,7 +20,8 @@ from stereoservo_sim.experiments.arms.imperfect_arms import DRAWS, SHARE, model_
 from stereoservo_sim.experiments.experiment import draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.tasks.driven_cell import RATE_HZ, DrivenCell, Imperfections
-from stereoservo_sim.world.mechanics import PRESETS, MechanicsPreset, preset
+from stereoservo_sim.world.mechanics import PRESETS, preset
+from stereoservo_sim.world.presets import MechanicsPreset
 from stereoservo_sim.world.random_cells import random_case
 
 MINUTES = 10.0

@@ -21,7 +21,8 @@ from stereoservo_sim.experiments.laws.goal_sketches import Drive
 from stereoservo_sim.experiments.laws.laws_compared import ComparedRun, LawComparison
 from stereoservo_sim.tasks.calibrations import TaskCalibration, calibrate
 from stereoservo_sim.tasks.ground_truth import sight
-from stereoservo_sim.tasks.setting import DEFAULT_RATE_HZ, HEIGHT, WIDTH
+from stereoservo_sim.tasks.options import DEFAULT_RATE_HZ
+from stereoservo_sim.tasks.setting import HEIGHT, WIDTH
 
 DPI = 100
 COLOURS_KEPT = 160

@@ -26,8 +26,9 @@ from stereoservo_sim.tasks.arms import rx90_cell, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, calibrate
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, Trace, run_task
 from stereoservo_sim.tasks.hard_tasks import straight_path_margins
+from stereoservo_sim.tasks.options import DEFAULT_RATE_HZ
 from stereoservo_sim.tasks.random_tasks import random_ends, unit, visible
-from stereoservo_sim.tasks.setting import DEFAULT_RATE_HZ, FOCAL_ERROR, HAND_EYE_ERROR_DEG, HEIGHT, WIDTH
+from stereoservo_sim.tasks.setting import FOCAL_ERROR, HAND_EYE_ERROR_DEG, HEIGHT, WIDTH
 from stereoservo_sim.tasks.task_file import AlignmentTask
 
 DRAWN = {"A": (40.0, 0.15), "B": (100.0, 0.10), "C": (60.0, 0.25)}
