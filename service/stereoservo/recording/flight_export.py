@@ -37,7 +37,7 @@ from stereoservo.recording.foxglove_channels import (
     stamp,
 )
 from stereoservo.recording.replay import RecordingError, ReplayResult, recorded_messages, replay
-from stereoservo.recording.step_records import decode_step
+from stereoservo.recording.step_layout import decode_step
 
 STATE_EVERY_NS = 50_000_000
 SCENE_EVERY_NS = 200_000_000
