@@ -20,6 +20,7 @@ from stereoservo_sim.tasks.options import DEFAULT_GAIN, DEFAULT_RATE_HZ, FRAMES,
 from stereoservo_sim.world.presets import MechanicsPreset
 
 if TYPE_CHECKING:
+    from stereoservo_sim.tasks.closed_loop import LoopSettings
     from stereoservo_sim.tasks.task_file import AlignmentTask
 
 # By their names alone: --help imports no law, and nothing numerical.
@@ -113,15 +114,10 @@ def simulate(
     """
     # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo.control.law_registry import LAWS
-    from stereoservo_sim.tasks.campaign import default_jobs, run_campaign
     from stereoservo_sim.tasks.closed_loop import LoopSettings
-    from stereoservo_sim.tasks.task_file import read_tasks
 
-    if law.value not in LAWS:  # installed, and broken
-        raise SettingsError(f"--law: {LAWS.unknown(law.value)}")
     settings = LoopSettings(
-        law=law.value,
+        law=_usable(law),
         arm=arm.value,
         calibration=calibration.value,
         jacobian=jacobian.value,
@@ -135,16 +131,36 @@ def simulate(
         mechanics=_mechanics(mechanics, arm),
         core=_by_core(arm, law_only, calibration, centre),
     )
+    answer = _answer(tasks, limit, ids, settings, jobs)
+    if as_json:
+        sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
+    else:
+        _show(answer, Console(markup=False, highlight=False))
+
+
+def _answer(
+    tasks: Path, limit: int | None, ids: str | None, settings: LoopSettings, jobs: int
+) -> dict[str, Any]:
+    """What the tasks came to."""
+    from stereoservo_sim.tasks.campaign import default_jobs, run_campaign
+    from stereoservo_sim.tasks.task_file import read_tasks
+
     chosen = _chosen(read_tasks(tasks), limit, ids)
     with progress_bar() as progress:
         answer = run_campaign(
             chosen, settings, jobs or default_jobs(), lambda done, total: progress("tasks", done, total)
         )
-    answer = {"file": str(tasks), **answer}
-    if as_json:
-        sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
-    else:
-        _show(answer, Console(markup=False, highlight=False))
+    return {"file": str(tasks), **answer}
+
+
+def _usable(law: LawOption) -> str:
+    """The name of a law that is installed, and not broken."""
+    from stereoservo.control.law_registry import LAWS
+
+    name = str(law.value)
+    if name not in LAWS:
+        raise SettingsError(f"--law: {LAWS.unknown(name)}")
+    return name
 
 
 def _mechanics(chosen: MechanicsChoice | None, arm: ArmOption) -> MechanicsPreset | None:
