@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from stereoservo.client import Client
+from stereoservo.daemon.plant_driver import PLANT_STATE_LAYOUT
+from stereoservo.daemon.seqlock import SlotReader
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
@@ -43,9 +45,9 @@ def test_a_killed_plant_is_a_fault_that_is_named_and_comes_back_where_it_was(
         eventually("the fault", lambda: told("fault", "the process of the simulated drives ended"))
         eventually("the report", lambda: told("process_ended", "plant ended by signal SIGKILL"))
         assert client.status().lifecycle == "fault"
-        eventually(
-            "a new plant", lambda: processes(directories).get("plant", found["plant"]) != found["plant"]
-        )
+        with SlotReader(directories.plant_state_slot, PLANT_STATE_LAYOUT) as slot:
+            eventually("a new plant", lambda: slot.writer_pid != found["plant"], 60.0)
+        assert processes(directories)["plant"] != found["plant"]
         assert processes(directories)["servo"] == found["servo"]
         stopped = TrueJointHistory.open(directories.runtime / FILE_NAME).newest()
         assert stopped is not None
