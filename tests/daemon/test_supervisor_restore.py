@@ -55,7 +55,7 @@ def test_a_child_finds_all_that_it_needs_again(plan: RunPlan, tmp_path: Path) ->
     with pytest.raises(PlanError):
         load_plan(tmp_path)
     told = restore(plan)
-    assert len(told) == 9  # the plan, the stop slot, the state, four heartbeats, an observation, a prior
+    assert len(told) == 10  # plan, stop slot, state, ring of steps, four heartbeats, an observation, a prior
     assert load_plan(tmp_path).boot == "boot"
     assert StopSlot(plan.directories.stop_slot).raise_stop()
     SlotReader(plan.directories.state_slot, STATE_LAYOUT).close()

@@ -14,7 +14,7 @@ from stereoservo.recording.step_layout import form_of
 
 LARGEST = 64 << 20
 """Bytes of a block or checkpoint, at most: a stated size beyond it is damage, and is not allocated."""
-LEVEL = 3
+LEVEL = 9
 COUNT = struct.Struct("<II")
 """Of a block: records, and forms of them."""
 ZERO, REPEATED = 64, 65

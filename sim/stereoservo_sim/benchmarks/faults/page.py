@@ -14,6 +14,7 @@ PAGE = """# Reliability: what happens when something fails
 
 Made by `stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.faults.page`; nothing on this page
 is written by hand. What the service does against each of these, and why: [safety.md](safety.md).
+How long things take: [performance.md](performance.md).
 
 Times are from the fault to the last motion of any axis, by the emulated arm's true joints, in milliseconds: median /
 max. They hold the ramp to rest. Machine: {machine}. Trials of the service in real time: {service} each; of the drives:
