@@ -16,11 +16,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
-import numpy as np
-
 from stereoservo.core.cycle import check_observation, encode
-from stereoservo.daemon.camera_setup import make_camera
+from stereoservo.daemon.camera_setup import make_camera, rounded
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
@@ -64,8 +61,6 @@ SILENT_CAMERA_S = 2.0
 QUIET_PERIODS = 0.6
 """Of a camera, after a frame, in which nobody looks for the next one: one that is so early is taken a little later."""
 PRIOR_MAX_AGE_S = 0.5
-PIXEL_STEP = 2.0**-12
-"""Of detected pixels; it adds a noise of 0.00007 px."""
 EXIT_SETUP = 3
 
 
@@ -210,23 +205,6 @@ class CameraPipeline:
         if prior is None or (self._clock.now_ns() - prior.t_ns) * 1e-9 > PRIOR_MAX_AGE_S:
             return None
         return prior
-
-
-def rounded(observation: CameraObservation) -> CameraObservation:
-    """The observation with no more digits than a detector knows: a hundredth of a pixel's noise takes half of a
-    number's bits, and every one of them is recorded.
-
-    Pixels in steps of ``PIXEL_STEP``. Variances upwards by a 32nd at most, correlations towards zero by a 32nd at most,
-    so that a covariance stays one, and states no less noise.
-    """
-    covariances = observation.covariances.copy()
-    variances = covariances[:, (0, 1), (0, 1)]
-    mantissa, exponent = np.frexp(variances)
-    covariances[:, (0, 1), (0, 1)] = np.ldexp(np.ceil(64.0 * mantissa) / 64.0, exponent)
-    step = np.ldexp(1.0 / 64.0, exponent.sum(axis=1) // 2)[:, None]
-    covariances[:, (0, 1), (1, 0)] = np.trunc(covariances[:, (0, 1), (1, 0)] / step) * step
-    pixels = np.round(observation.pixels / PIXEL_STEP) * PIXEL_STEP
-    return msgspec.structs.replace(observation, pixels=pixels, covariances=covariances)
 
 
 def poll_interval_s(rate_hz: float) -> float:
