@@ -118,6 +118,15 @@ def edited(cell: Path, old: str, new: str) -> str:
     return str(cell)
 
 
+def test_doctor_takes_the_name_of_a_shipped_cell_and_lists_them(run: Run) -> None:
+    code, result, _ = run("doctor", "gantry", "--seconds", "0")
+    assert code == 0
+    assert "gantry.toml is valid" in next(c["message"] for c in result["checks"] if c["name"] == "cell file")
+    code, _, err = run("doctor", "gantri")
+    assert code != 0
+    assert "no cell 'gantri' is shipped; there are demo, " in " ".join(err.split())
+
+
 @pytest.mark.parametrize("command", ["doctor", "run"])
 def test_an_unknown_key_is_named_with_the_known_ones(command: str, run: Run, cell: Path) -> None:
     code, result, err = run(command, edited(cell, "[servo]", "[servo]\nspeed = 3"))

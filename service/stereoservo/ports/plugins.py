@@ -13,6 +13,8 @@ CAMERA_DRIVERS = "stereoservo.camera_drivers"
 DETECTORS = "stereoservo.detectors"
 LAWS = "stereoservo.laws"
 COMMANDS = "stereoservo.commands"
+CELLS = "stereoservo.cells"
+"""Functions from the name of a cell file that a distribution ships to its path; they raise ValueError."""
 GROUPS = (JOINT_DRIVERS, CAMERA_DRIVERS, DETECTORS, LAWS, COMMANDS)
 
 EXTRAS = {

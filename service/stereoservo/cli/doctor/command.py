@@ -26,13 +26,16 @@ from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import holder
+from stereoservo.ports import plugins
 from stereoservo.ports.devices import ExaminationFinding
 
 LOW_DISK_BYTES = 500_000_000
 
 
 def doctor(
-    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Path of a cell file.")],
+    cell: Annotated[
+        str, typer.Argument(metavar="NAME|PATH", help="A cell file (.toml), or the name of a shipped one.")
+    ],
     jog: Annotated[
         bool,
         typer.Option("--jog", help="Also turn each joint by one degree, once allowed: checks its units."),
@@ -56,11 +59,12 @@ def doctor(
     ``--jog``; drives and cameras are asked only while no daemon has them.
     """
     may_move = permission(jog, yes)
-    loaded = load_cell_file(cell)
-    findings = [ExaminationFinding("cell file", True, f"{cell} is valid")]
+    path = _path_of(cell)
+    loaded = load_cell_file(path)
+    findings = [ExaminationFinding("cell file", True, f"{path} is valid")]
     directories = cell_directories(loaded.cell.name)
     create_directories(directories)
-    plan = make_plan(cell.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
+    plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
     findings.append(ExaminationFinding("drivers", True, _drivers(plan)))
     findings += [check(plan, directories) for check in CHECKS]
     signal.signal(
@@ -83,6 +87,19 @@ def doctor(
             checks=tree,
         )
     emit({"checks": findings}, text, json)
+
+
+def _path_of(cell: str) -> Path:
+    """Path of a cell file, or of the shipped one of that name. Raises BadParameter, PluginError."""
+    if cell.endswith(".toml") or Path(cell).exists():
+        return Path(cell)
+    found: list[str] = []
+    for provider in plugins.names(plugins.CELLS):
+        try:
+            return Path(plugins.load(plugins.CELLS, provider)(cell))
+        except ValueError as error:
+            found.append(str(error))
+    raise typer.BadParameter("; ".join(found) or f"{cell!r} is no .toml file", param_hint="CELL")
 
 
 def _line(finding: ExaminationFinding) -> str:
