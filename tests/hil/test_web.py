@@ -202,7 +202,9 @@ def test_in_a_browser_the_cell_is_calibrated_and_dragged_goals_are_reached(demo:
             for width in (1280, 390):
                 size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
                 browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-                assert value("document.documentElement.scrollWidth") == width
+                assert value("document.documentElement.scrollWidth") <= width, (
+                    "nothing is cut off at the side"
+                )
                 assert browser.find_element(By.ID, "stop").is_displayed()
                 browser.save_screenshot(str(tmp_path / f"page-{width}.png"))
             browser.execute_script("dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")

@@ -172,9 +172,9 @@ function showEvent(event) {
   item.textContent = `${new Date(1000 * event.t_wall).toLocaleTimeString()} ${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)} ${event.message}`;
   $("events").prepend(item);
   while ($("events").childElementCount > 200) $("events").lastChild.remove();
-  stats.events.push([event.kind, event.id, event.error_px]);
+  stats.events.push([event.kind, event.id, event.error_px, [event.message, ...event.reasons.map((r) => `${r.code}: ${r.hint}`)].join("\n")]);
   const done = event.progress === null ? "" : ` (${Math.round(100 * event.progress)} %)`;
-  if (/^(calibrat|fit_|check|trial|zeros)/.test(event.kind)) {
+  if (event.kind !== "calibration_report" && /^(calibrat|fit_|check|trial|zeros)/.test(event.kind)) {
     const c = event.calibration;
     $("calibration").textContent = c
       ? `Calibrated: ${c.verdict}\nrms ${c.rms_px.toFixed(3)} px, ${c.images} images of ${c.joints} joints, stratum ${c.stratum}, grade ${c.grade}\n` +
