@@ -25,7 +25,8 @@ from stereoservo.ports.devices import Frame
 from stereoservo.ports.image_files import ImageWriter
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.replay import recorded_messages, replay
-from stereoservo.recording.step_records import encode_step, fingerprint
+from stereoservo.recording.step_layout import StepEncoder
+from stereoservo.recording.step_records import fingerprint
 
 for needed in ("foxglove", "google.protobuf", "jsonschema"):
     pytest.importorskip(needed, reason=f"{needed} is of the extra `test`")
@@ -53,6 +54,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("flight")
     flight, file = folder / "flight.mcap", folder / "flight.foxglove.mcap"
     bench = make_bench(0, 0.02, k1=-0.1).ready()
+    encoder = StepEncoder()
     target = FeatureTarget(bench.features(bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])))
     images_directory(flight).mkdir()
     pictures = ImageWriter(images_directory(flight) / "left.avi", "left", (64, 48), 30.0, driver="fake")
@@ -61,7 +63,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
         for k in range(STEPS):
             outputs = bench.step(*([RunGoal(Goal(str(uuid.UUID(int=1)), target))] if k == 5 else []))
             inputs = bench.log[-1][0]
-            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
+            recorder.step(encoder.encode(inputs, outputs), inputs.now_ns)
             if k % 100 == 0:
                 image = np.full((48, 64), k // 4, dtype=np.uint8)
                 pictures.append(Frame("left", k, inputs.now_ns, inputs.now_ns, image))
