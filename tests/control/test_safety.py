@@ -423,8 +423,10 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
             outermost=step.positions if late else None,
             state=SimpleNamespace(
                 cameras=accepted,
-                command=step.previous,
-                last_joints_ns=now_ns - ages_ns[2] // 4,
+                block=SimpleNamespace(
+                    command=step.previous.copy(),
+                    numbers=SimpleNamespace(last_joints_ns=now_ns - ages_ns[2] // 4),
+                ),
                 lifecycle=lifecycle,
             ),
             q=step.positions + (0.7 if late else 0.0),
