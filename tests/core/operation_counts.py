@@ -119,7 +119,10 @@ def counts(path: Path) -> dict[str, tuple[int, int]]:
         settings = msgspec.msgpack.decode(step.settings, type=CoreSettings, dec_hook=decode_array)
         inputs = msgspec.msgpack.decode(step.inputs, type=StepInputs, dec_hook=decode_array)
         core = ServoCore(settings, decode_state(step.state))
-        for owner in (core.state.block, core._derived.room):  # whose elements kernels as Python part by attribute
+        for owner in (
+            core.state.block,
+            core._derived.room,
+        ):  # whose elements kernels as Python part by attribute
             vars(owner)["record"] = owner.record.view(np.recarray)
         lines = [0, 0]
 

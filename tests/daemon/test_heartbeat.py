@@ -111,6 +111,8 @@ def test_a_gateway_has_its_longer_limit_while_it_serves_a_request_and_no_longer(
         "state_queries",
         "info_queries",
         "schema_queries",
+        "any_command_queries",
+        "model_queries",
     ):
         getattr(gateway, f"_{source}").try_recv.side_effect = lambda: None
     gateway._queries = lambda: Gateway._queries(gateway)

@@ -55,7 +55,8 @@ def test_a_child_finds_all_that_it_needs_again(plan: RunPlan, tmp_path: Path) ->
     with pytest.raises(PlanError):
         load_plan(tmp_path)
     told = restore(plan)
-    assert len(told) == 10  # plan, stop slot, state, ring of steps, four heartbeats, an observation, a prior
+    # plan, stop slot, state, ring of steps, four heartbeats; four of the camera: observation, prior, preview, who asks
+    assert len(told) == 12
     assert load_plan(tmp_path).boot == "boot"
     assert StopSlot(plan.directories.stop_slot).raise_stop()
     SlotReader(plan.directories.state_slot, STATE_LAYOUT).close()

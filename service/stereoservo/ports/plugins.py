@@ -18,9 +18,21 @@ CELLS = "stereoservo.cells"
 GROUPS = (JOINT_DRIVERS, CAMERA_DRIVERS, DETECTORS, LAWS, COMMANDS)
 
 EXTRAS = {
-    "cell": ("numpy", "scipy", "cv2", "numba", "can", "canopen", "serial", "mcap", "foxglove", "matplotlib"),
+    "cell": (
+        "numpy",
+        "scipy",
+        "cv2",
+        "numba",
+        "can",
+        "canopen",
+        "serial",
+        "mcap",
+        "zstandard",
+        "foxglove",
+        "matplotlib",
+    ),
     "sim": ("pybullet", "pybullet_data"),
-    "web": ("nicegui",),
+    "web": ("websockets",),
     "watch": ("rerun",),
 }
 """Top-level modules that each extra of the distribution installs, as in pyproject.toml."""
