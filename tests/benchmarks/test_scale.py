@@ -50,4 +50,4 @@ def test_the_cells_have_their_sizes_and_take_goals(cell: SyntheticCell, sizes: t
     assert (np.abs(pixels - (320.0, 240.0)) < 600.0).all()
     loop = CoreLoop(cell, 1)
     drive(loop, "stereo", 25)
-    assert np.any(loop.core.state.command)
+    assert np.any(loop.core.state.block.command)
