@@ -7,6 +7,7 @@ import threading
 import time
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from stereoservo.messages.goals import AuxiliarySpec
@@ -194,6 +195,98 @@ class BlockingRead(Driver):
         return super().read_state()
 
 
+class StopsOnlyByReading(Driver):
+    """Behind it a device that goes on for ever: it stands still while somebody reads."""
+
+    forever = True
+    commanded_ns = 0
+
+    def write_velocity(self, qd: Any) -> CommandReport:
+        self.commanded_ns = self.context.clock.now_ns()
+        return super().write_velocity(qd)
+
+    def read_state(self) -> JointState:
+        if self.commanded_ns and self.context.clock.now_ns() - self.commanded_ns > TIMEOUT_S * 1e9:
+            self.stop()
+        return super().read_state()
+
+
+class WatchdogFedByReads(Driver):
+    """A device whose watchdog every packet feeds, as those of servos on a bus."""
+
+    def read_state(self) -> JointState:
+        state = super().read_state()
+        assert self.device is not None
+        self.device.until_ns = self.context.clock.now_ns() + round(TIMEOUT_S * 1e9)
+        return state
+
+
+class DeadAfterATrip(Driver):
+    """Once the device has tripped it takes commands and does nothing; so it does with the next driver, too."""
+
+    def sent(self, velocities: Any) -> Any:
+        assert self.device is not None
+        now_ns = self.context.clock.now_ns()
+        self.tripped = getattr(self, "tripped", False) or bool(self.writes and now_ns > self.device.until_ns)
+        return 0.0 * velocities if self.tripped else velocities
+
+
+class SlowRead(Driver):
+    """15 ms in a cycle of 4 ms."""
+
+    def read_state(self) -> JointState:
+        time.sleep(0.015)
+        return super().read_state()
+
+
+class SlowWrite(Driver):
+    def sent(self, velocities: Any) -> Any:
+        time.sleep(0.003)
+        return velocities
+
+
+class SlowAndStated(Driver):
+    """What it states it keeps, but no cycle has room for it."""
+
+    def describe(self) -> JointDriverDescription:
+        return msgspec.structs.replace(super().describe(), call_budget_us=50_000.0)
+
+    def read_state(self) -> JointState:
+        time.sleep(0.005)
+        return super().read_state()
+
+
+class NearlyStale(Driver):
+    """Younger than `safety.joint_timeout_s`, until the next cycle comes."""
+
+    def stamp(self) -> int:
+        return self.context.clock.now_ns() - 95_000_000
+
+
+class OldPositionsFreshStamps(Driver):
+    """Positions of 0.1 s ago, as of a buffer that is read from its wrong end."""
+
+    def told(self, positions: Any) -> Any:
+        self.past = [*getattr(self, "past", []), positions][-25:]
+        return self.past[0]
+
+
+class DeactivatedWithoutStop(Driver):
+    def deactivate(self) -> None:
+        if self.life.state is ACTIVE:
+            self.life.state = CONFIGURED
+
+
+class MovesWhenConfigured(Driver):
+    """The device stays where it was left."""
+
+    def configure(self) -> None:
+        super().configure()
+        assert self.device is not None
+        place = self.context.services.get("place", np.zeros(2)) + 0.02
+        self.device.positions = self.context.services["place"] = place
+
+
 class Degrees(Driver):
     def told(self, positions: Any) -> Any:
         return np.degrees(positions)
@@ -322,6 +415,16 @@ FAULTY = {
     IgnoredStop: "stops",
     RaisingStop: "stop raises nothing unconnected",
     BlockingRead: "answers in time",
+    StopsOnlyByReading: "stops when commands cease",
+    WatchdogFedByReads: "stops when commands cease",
+    DeadAfterATrip: "stops when commands cease",
+    SlowRead: "answers in time",
+    SlowWrite: "answers in time",
+    SlowAndStated: "answers in time",
+    NearlyStale: "numbers and stamps its samples",
+    OldPositionsFreshStamps: "moves as told",
+    DeactivatedWithoutStop: "stops",
+    MovesWhenConfigured: "stands when activated",
     Degrees: "moves as told",
     DegreesCommanded: "moves as told",
     SignFlipped: "moves as told",
@@ -359,3 +462,10 @@ class SmallSetup(JointDriverSetup):
 
     def device_writes(self, driver: Any) -> int:
         return driver.device.writes
+
+    def true_positions(self, driver: Any) -> Any:
+        device = driver.device
+        if device.gone:
+            return device.positions
+        device.exchange()
+        return device.positions.copy()
