@@ -211,8 +211,10 @@ class StopsOnlyByReading(Driver):
         return super().read_state()
 
 
-class WatchdogFedByReads(Driver):
-    """A device whose watchdog every packet feeds, as those of servos on a bus."""
+class ReadsFeedTheWatchdog(StopsOnlyByReading):
+    """A correct one: any packet feeds the device's watchdog, as of servos on a bus; the driver stops while it reads."""
+
+    forever = False
 
     def read_state(self) -> JointState:
         state = super().read_state()
@@ -220,15 +222,34 @@ class WatchdogFedByReads(Driver):
         self.device.until_ns = self.context.clock.now_ns() + round(TIMEOUT_S * 1e9)
         return state
 
+    def has_tripped(self) -> bool:
+        assert self.device is not None
+        return bool(self.writes) and self.context.clock.now_ns() > self.device.until_ns
 
-class DeadAfterATrip(Driver):
-    """Once the device has tripped it takes commands and does nothing; so it does with the next driver, too."""
+
+class RefusesAfterATrip(ReadsFeedTheWatchdog):
+    """Correct, too."""
+
+    dead = False
+
+    def read_state(self) -> JointState:
+        self.dead = self.dead or self.has_tripped()
+        return super().read_state()
+
+    def verify(self, asked: Any) -> None:
+        super().verify(asked)
+        if self.dead:
+            raise DriverError("tripped", "the watchdog has tripped; activate again")
+
+
+class DeadAfterATrip(RefusesAfterATrip):
+    """Once the watchdog has tripped, commands are taken, and nothing moves."""
+
+    def verify(self, asked: Any) -> None:
+        Driver.verify(self, asked)
 
     def sent(self, velocities: Any) -> Any:
-        assert self.device is not None
-        now_ns = self.context.clock.now_ns()
-        self.tripped = getattr(self, "tripped", False) or bool(self.writes and now_ns > self.device.until_ns)
-        return 0.0 * velocities if self.tripped else velocities
+        return 0.0 * velocities if self.dead else velocities
 
 
 class SlowRead(Driver):
@@ -408,6 +429,38 @@ class GripperOfAnArmThatIsOff(Driver):
         self.beside.order(values, self.context.clock.now_ns())
 
 
+class ConfigureFails(Driver):
+    def configure(self) -> None:
+        raise DriverError("servo", "servo 1 is in mode 3")
+
+
+class ReadFailsInConfigure(Driver):
+    def configure(self) -> None:
+        super().configure()
+        self.read_state()
+
+    def told(self, positions: Any) -> Any:
+        raise KeyError("servo 1")
+
+
+class StopFailsWhileConnected(Driver):
+    def stop(self) -> None:
+        if self.life.state is ACTIVE:
+            raise OSError("write failed")
+        super().stop()
+
+
+class OptionsRefused(Driver):
+    def __init__(self, options: Any, context: Any) -> None:
+        raise DriverError("option", "driver 'small': servo is missing")
+
+
+class LimitsInDegrees(Driver):
+    def describe(self) -> JointDriverDescription:
+        joints = (JointSpec("a", "revolute", -150.0, 150.0, 90.0, 10.0),)
+        return msgspec.structs.replace(super().describe(), joints=joints)
+
+
 FAULTY = {
     StaleStamps: "numbers and stamps its samples",
     FrozenStamps: "numbers and stamps its samples",
@@ -416,7 +469,6 @@ FAULTY = {
     RaisingStop: "stop raises nothing unconnected",
     BlockingRead: "answers in time",
     StopsOnlyByReading: "stops when commands cease",
-    WatchdogFedByReads: "stops when commands cease",
     DeadAfterATrip: "stops when commands cease",
     SlowRead: "answers in time",
     SlowWrite: "answers in time",
