@@ -29,8 +29,9 @@ SLACK = 1e-3
 LONGEST_DRIVE_S = 12.0
 REACT_S = 0.02
 """How much later than stop() a call may take effect."""
-SILENCE_S = 0.2
-"""How much longer than it may move the arm is left alone, at least."""
+SILENCE_S, LONGER_S = 0.2, 0.6
+"""How much longer than it may move the arm is left alone, at least, and added to it at most for joints that are slow.
+"""
 CALLS = 50
 
 
@@ -214,7 +215,8 @@ def _travel_in_silence(
     before, start = bench.read(driver), bench.setup.true_positions(driver)
     bench.write(driver, velocity)
     elapsed = (bench.now_ns() - before.t_ns) * 1e-9
-    silence = 2.0 * timeout + brake + SILENCE_S + 2.0 * float((slack / speed).max())
+    slowest = min(2.0 * float((slack / speed).max()), LONGER_S)
+    silence = 2.0 * timeout + brake + SILENCE_S + slowest
     bench.wait(silence)
     truth = bench.setup.true_positions(driver)
     after = _settled(bench, driver)

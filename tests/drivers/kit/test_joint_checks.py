@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
@@ -28,6 +29,14 @@ from .faulty_drivers import (
     StopFailsWhileConnected,
     TimeOutNotKept,
 )
+
+CELL = """
+schema = 1
+cell.name = "small"
+joints = { driver = "fake", options = { rate_hz = 100.0 } }
+safety.joint_timeout_s = 0.25
+camera = [{ name = "left", driver = "fake" }, { name = "right", driver = "fake" }]
+"""
 
 
 @pytest.mark.parametrize("check", JOINT_CHECKS, ids=lambda check: check.name)
@@ -149,6 +158,7 @@ def test_a_setup_brings_its_own_cable_and_counter_and_a_driver_class_does_withou
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ([], "--cell"),
         (["no_such_module:Driver"], "ModuleNotFoundError"),
         (["json:loads"], "a driver class"),
         (["nobody"], "there are:"),
@@ -171,6 +181,43 @@ def test_hardware_is_moved_only_after_a_yes():
     result = CliRunner().invoke(app, ["faulty_drivers:Driver", "--hardware"], input="n\n")
     assert result.exit_code == 1
     assert "nothing was done" in str(result.exception)
+
+
+@pytest.mark.usefixtures("here")
+def test_the_end_of_the_input_is_no_yes_and_is_told():
+    app = typer.Typer()
+    app.command()(driver_check)
+    result = CliRunner().invoke(app, ["faulty_drivers:Driver", "--hardware"], input="")
+    assert result.exit_code == 1
+    assert "--yes begins without asking" in str(result.exception)
+    assert "the input has ended" in result.stderr
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(("wanted", "verdict"), [(True, "passed"), (None, "not run")])
+def test_a_setup_says_whether_its_hardware_is_driven_to_its_limits(wanted, verdict, monkeypatch):
+    (check,) = (check for check in JOINT_CHECKS if check.name == "keeps position limits")
+    monkeypatch.setattr("stereoservo_drivers.commands.driver_check.JOINT_CHECKS", (check,))
+    monkeypatch.setattr(importlib.import_module("faulty_drivers").SmallSetup, "whole_range", wanted)
+    monkeypatch.setattr(importlib.import_module("faulty_drivers").SmallSetup, "speed", 0.5)
+    code, report = command("faulty_drivers:SmallSetup", "--hardware", "--yes")
+    assert (code, report["checks"][0]["verdict"]) == (0, verdict)
+
+
+def test_a_cell_names_driver_options_and_the_age_of_samples(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "stereoservo_drivers.commands.driver_check._results", lambda *given: setups.append(given[0]) or []
+    )
+    setups = []
+    cell = tmp_path / "cell.toml"
+    cell.write_text(CELL)
+    command("--cell", str(cell))
+    (setup,) = setups
+    assert (setup.driver.__name__, setup.options, setup.joint_timeout_s) == (
+        "FakeJointDriver",
+        {"rate_hz": 100.0},
+        0.25,
+    )
 
 
 @pytest.mark.usefixtures("here")
