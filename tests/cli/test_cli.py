@@ -90,12 +90,12 @@ def test_init_passes_options_on_to_the_driver_and_into_the_file(tmp_path: Path, 
     path = tmp_path / "x.toml"
     joints = 'joints=[{name="pan"}, {name="tilt", max=1.0}]'
     code, _, _ = run(
-        "init", str(path), "--option", joints, "--option", "rate_hz=100.0", "--option", "history=a/b"
+        "init", str(path), "--option", joints, "--option", "rate_hz=100.0", "--option", "mechanics=none"
     )
     assert code == 0
     loaded = load_cell_file(path)
     assert loaded.joints.options["rate_hz"] == 100.0
-    assert loaded.joints.options["history"] == "a/b"  # no TOML: a text
+    assert loaded.joints.options["mechanics"] == "none"  # no TOML: a text
     assert [(limit.joint, limit.max) for limit in loaded.safety.limit] == [("pan", 3.0), ("tilt", 1.0)]
     for option in ("rate_hz", "=3", "a b=3"):
         code, result, _ = run("init", str(tmp_path / "y.toml"), "--option", option)

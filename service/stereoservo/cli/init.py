@@ -55,7 +55,7 @@ def init(
             tomllib.loads(options), context
         ).describe()
     except DriverError as error:
-        if error.code != "option":
+        if error.code != "option" or options:
             raise
         raise CommandError(
             "option",
