@@ -10,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoservo.ports.devices import JointDriver, JointSpec
+from stereoservo.ports.devices import DriverError, JointDriver, JointSpec
 from stereoservo_drivers.kit.bench import (
     FRESH_SHARE,
+    CheckFailedError,
     CheckNotRunError,
     JointBench,
     call_stop,
     refused,
     require,
     resolutions,
+    told,
     zero,
 )
 
@@ -110,16 +112,23 @@ def keeps_its_description(bench: JointBench) -> str:
 
 
 def refuses_unless_active(bench: JointBench) -> str:
-    """Commands are refused before activate() and after deactivate()."""
+    """Commands are refused before activate() and after deactivate(); then it is configured and activated again."""
     driver = bench.configured()
     codes = [refused(lambda: driver.write_velocity(zero(driver)), "write_velocity() before activate()")]
     driver.activate()
     driver.deactivate()
     driver.deactivate()
     codes.append(refused(lambda: driver.write_velocity(zero(driver)), "write_velocity() after deactivate()"))
+    try:
+        bench.setup.configure(driver)
+    except DriverError as error:
+        raise CheckFailedError(
+            f"configure() after deactivate(), as the command `reset` calls it, raised {told(error)}",
+            'DriverLifecycle.require("configure()", CREATED, CONFIGURED): connected already, it checks the device anew',
+        ) from error
     driver.activate()
     bench.drive(driver, zero(driver), 0.05)
-    return f"{codes[0]}, {codes[1]}; activated again"
+    return f"{codes[0]}, {codes[1]}; configured and activated again"
 
 
 def refuses_once_closed(bench: JointBench) -> str:
@@ -227,14 +236,14 @@ def agrees_with_its_velocities(bench: JointBench) -> str:
     elapsed = (states[-1].t_ns - states[0].t_ns) * 1e-9
     require(elapsed > 0.0, "stamps stand still while the arm moves")
     travelled = (states[-1].positions - states[0].positions) / elapsed
-    told = np.mean([state.velocities for state in states], axis=0)
+    speeds = np.mean([state.velocities for state in states], axis=0)
     steps = resolutions(driver)
-    error = np.abs(told - travelled)
+    error = np.abs(speeds - travelled)
     allowed = 0.3 * np.abs(travelled) + 2.0 * steps / elapsed + bench.setup.rest_velocity
     worst = int(np.argmax(error / allowed))
     require(
         bool(error[worst] <= allowed[worst]),
-        f"joint {worst}: velocities say {told[worst]:.4g}, positions {travelled[worst]:.4g} rad/s or m/s",
+        f"joint {worst}: velocities say {speeds[worst]:.4g}, positions {travelled[worst]:.4g} rad/s or m/s",
     )
     return f"velocities within {float(error.max()):.2g} rad/s or m/s of the positions' change"
 

@@ -71,8 +71,8 @@ class Driver:
         return JointDriverDescription("small", joints, 250.0, "clock", TIMEOUT_S, 500.0, auxiliary=AUXILIARY)
 
     def configure(self) -> None:
-        self.life.require("configure()", CREATED)
-        self.device = Device(self.context.clock, self.forever)
+        self.life.require("configure()", CREATED, CONFIGURED)
+        self.device = self.device or Device(self.context.clock, self.forever)
         self.life.state = CONFIGURED
 
     def activate(self) -> None:
@@ -298,6 +298,14 @@ class DeactivatedWithoutStop(Driver):
             self.life.state = CONFIGURED
 
 
+class ConfiguredOnce(Driver):
+    """A fault of the arm is never reset."""
+
+    def configure(self) -> None:
+        self.life.require("configure()", CREATED)
+        super().configure()
+
+
 class MovesWhenConfigured(Driver):
     """The device stays where it was left."""
 
@@ -476,6 +484,7 @@ FAULTY = {
     NearlyStale: "numbers and stamps its samples",
     OldPositionsFreshStamps: "moves as told",
     DeactivatedWithoutStop: "stops",
+    ConfiguredOnce: "refuses commands unless active",
     MovesWhenConfigured: "stands when activated",
     Degrees: "moves as told",
     DegreesCommanded: "moves as told",
