@@ -86,6 +86,22 @@ def test_init_does_not_overwrite_and_refuses_names_that_cannot_be_cells(
     assert run("init", str(cell), "--force")[0] == 0
 
 
+def test_init_passes_options_on_to_the_driver_and_into_the_file(tmp_path: Path, run: Run) -> None:
+    path = tmp_path / "x.toml"
+    joints = 'joints=[{name="pan"}, {name="tilt", max=1.0}]'
+    code, _, _ = run(
+        "init", str(path), "--option", joints, "--option", "rate_hz=100.0", "--option", "mechanics=none"
+    )
+    assert code == 0
+    loaded = load_cell_file(path)
+    assert loaded.joints.options["rate_hz"] == 100.0
+    assert loaded.joints.options["mechanics"] == "none"  # no TOML: a text
+    assert [(limit.joint, limit.max) for limit in loaded.safety.limit] == [("pan", 3.0), ("tilt", 1.0)]
+    for option in ("rate_hz", "=3", "a b=3"):
+        code, result, _ = run("init", str(tmp_path / "y.toml"), "--option", option)
+        assert (code, result["error"]["code"]) == (1, "argument")
+
+
 def test_init_with_an_unknown_driver_lists_those_there_are(tmp_path: Path, run: Run) -> None:
     code, result, _ = run("init", str(tmp_path / "x.toml"), "--joint-driver", "kuka")
     assert code == 1

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor import command
 from stereoservo.cli.doctor import joints as examination_module
+from stereoservo.daemon.cell_preparation import make_plan
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.plant_driver import make_driver
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
-from stereoservo.ports.devices import Clock, DriverError, ExaminationFinding
+from stereoservo.ports.devices import Clock, DriverError, ExaminationFinding, JointState
 from stereoservo_drivers.fake import FakeJointDriver
 
 Doctor = Callable[..., tuple[int, list[dict[str, Any]]]]
@@ -142,6 +145,79 @@ def test_a_driver_error_is_a_failed_check(doctor: Doctor, examination: Examinati
     assert code == 1
     assert checks[-1]["message"] == "no adapter at /dev/ttyACM0"
     assert checks[-1]["ok"] is False
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What the fake arm does where it is taken for a real one that cannot examine itself: calls, positions, age."""
+    told: dict[str, Any] = {"calls": [], "shift": 0.0, "age_ns": 0, "refusal": None}
+
+    class Plain(FakeJointDriver):
+        def configure(self) -> None:
+            told["calls"].append("configure")
+            if told["refusal"] is not None:
+                raise told["refusal"]
+            super().configure()
+
+        def activate(self) -> None:
+            told["calls"].append("activate")
+
+        def read_state(self) -> JointState:
+            state = super().read_state()
+            return msgspec.structs.replace(
+                state, positions=state.positions + told["shift"], t_ns=state.t_ns - told["age_ns"]
+            )
+
+        def close(self) -> None:
+            told["calls"].append("close")
+            super().close()
+
+    def make(plan: RunPlan, clock: Clock) -> FakeJointDriver:
+        driver = make_driver(plan, clock)
+        driver.__class__ = Plain
+        return driver
+
+    def real(*given: Any) -> RunPlan:
+        plan = make_plan(*given)
+        return msgspec.structs.replace(plan, joints=msgspec.structs.replace(plan.joints, simulated=False))
+
+    monkeypatch.setattr(examination_module, "make_driver", make)
+    monkeypatch.setattr(command, "make_plan", real)
+    return told
+
+
+@pytest.mark.parametrize(
+    ("change", "failed", "word"),
+    [
+        ({}, None, "not looked at"),
+        ({"shift": 10.0}, "joint positions", "its limits are"),
+        ({"shift": math.nan}, "joint positions", "finite ones are needed"),
+        ({"age_ns": 150_000_000}, "joint samples", "the arm stops at 100 ms"),
+        ({"refusal": DriverError("servo", "servo 1 is in mode 3")}, "drives", "servo 1 is in mode 3"),
+    ],
+)
+def test_an_arm_whose_driver_cannot_examine_it_is_read_and_closed_and_not_moved(
+    cell: Path,
+    plain: dict[str, Any],
+    capfd: pytest.CaptureFixture[str],
+    change: dict[str, Any],
+    failed: str | None,
+    word: str,
+) -> None:
+    plain |= change
+    capfd.readouterr()
+    code = cli.invoke(["doctor", str(cell), "--seconds", "0", "--json"])
+    result = json.loads(capfd.readouterr().out)
+    checks = (result["error"] if code else result)["checks"]
+    assert [check["name"] for check in checks if check["ok"] is False] == ([failed] if failed else [])
+    assert any(word in check["message"] for check in checks)
+    assert plain["calls"] == ["configure", "close"]
+
+
+def test_a_simulated_arm_is_told_not_to_have_been_connected(doctor: Doctor) -> None:
+    code, (check,) = doctor("--seconds", "0")
+    assert (code, check["ok"]) == (0, None)
+    assert "'fake' simulates them" in check["message"]
 
 
 def test_a_cell_with_one_camera_fails(cell: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.ports import plugins
 from stereoservo.ports.devices import DriverContext, JointDriver
 from stereoservo_drivers.kit.bench import JointDriverSetup
@@ -56,7 +56,7 @@ class GivenDriver(JointDriverSetup):
 
     def plug_in(self, driver: JointDriver) -> None:
         if self.pull:
-            typer.confirm("Plug it in again. Done?", default=True, err=True)
+            _confirmed("Plug it in again. Done?", True)
 
 
 def driver_check(
@@ -64,12 +64,17 @@ def driver_check(
         str,
         typer.Argument(
             metavar="DRIVER",
-            help="my_package:Driver, an installed driver's name, or my_package:Setup (a JointDriverSetup).",
+            help="my_package:Driver, an installed driver's name, or my_package:Setup (a JointDriverSetup). Default: "
+            "that of --cell.",
         ),
-    ],
+    ] = "",
     options: Annotated[str, typer.Option(metavar="JSON", help="The driver's options.")] = "{}",
     cell: Annotated[
-        Path | None, typer.Option(metavar="CELL.toml", help="Take the options of this cell's [joints].")
+        Path | None,
+        typer.Option(
+            metavar="CELL.toml",
+            help="Take driver and options of this cell's [joints], and its safety.joint_timeout_s.",
+        ),
     ] = None,
     hardware: Annotated[
         bool, typer.Option("--hardware", help="Connect to the device and MOVE THE ARM, slowly.")
@@ -92,15 +97,32 @@ def driver_check(
         raise DriverCheckError("argument", "--hardware and --simulated exclude each other")
     if (whole_range or pull) and not hardware:
         raise DriverCheckError("argument", "--whole-range and --pull need --hardware")
+    loaded = None if cell is None else load_cell_file(cell)
+    driver = driver or (loaded.joints.driver if loaded else "")
+    if not driver:
+        raise DriverCheckError("argument", "say which: DRIVER, or the --cell that names it")
     folder = Path.cwd() if cell is None else cell.absolute().parent
-    setup = _setup(driver, _options(options, cell), pull, folder)
+    setup = _setup(driver, _options(options, loaded), pull, folder)
+    if loaded is not None:
+        setup.joint_timeout_s = loaded.safety.joint_timeout_s
     if hardware:
         setup.real_time = True
-        setup.whole_range = whole_range
-        far = ", and to its limits" if whole_range else ""
-        if not yes and not typer.confirm(WARNING.format(far=far), err=True):
-            raise DriverCheckError("refused", "nothing was done")
+        setup.whole_range = whole_range or bool(setup.whole_range)
+        far = ", and to its limits" if setup.whole_range else ""
+        if not yes and not _confirmed(WARNING.format(far=far), False):
+            raise DriverCheckError("refused", "nothing was done; --yes begins without asking")
     _report(driver, _results(setup, hardware or simulated, hardware), as_json)
+
+
+def _confirmed(question: str, default: bool) -> bool:
+    """The answer to a question; ``default`` where the input has ended. Raises KeyboardInterrupt."""
+    try:
+        return typer.confirm(question, default=default, err=True)
+    except typer.Abort as abort:  # an interrupt, or the end of the input
+        if not isinstance(abort.__context__, EOFError):
+            raise KeyboardInterrupt from abort
+        print("\nno answer: the input has ended", file=sys.stderr, flush=True)
+        return default
 
 
 def _results(setup: JointDriverSetup, connected: bool, hardware: bool) -> list[CheckResult]:
@@ -120,11 +142,11 @@ def _results(setup: JointDriverSetup, connected: bool, hardware: bool) -> list[C
     return results
 
 
-def _options(text: str, cell: Path | None) -> dict[str, Any]:
+def _options(text: str, cell: CellFile | None) -> dict[str, Any]:
     if cell is not None:
         if text != "{}":
             raise DriverCheckError("argument", "--options and --cell exclude each other")
-        return dict(load_cell_file(cell).joints.options)
+        return dict(cell.joints.options)
     try:
         found = json.loads(text)
     except ValueError as error:

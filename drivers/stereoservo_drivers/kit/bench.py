@@ -9,18 +9,39 @@ from typing import Any
 
 import numpy as np
 
+from stereoservo.messages.cell_file import SafetySection
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import MonotonicClock, VirtualClock
-from stereoservo.ports.devices import CommandReport, DriverContext, JointDriver, JointState
+from stereoservo.ports.devices import CommandReport, DriverContext, DriverError, JointDriver, JointState
 
 RUNAWAY, RUNAWAY_TIMES = 0.03, 3.0
 """[rad or m], and times the commanded travel: an arm that goes farther is stopped."""
 FUTURE_NS = 1_000_000
 """Several reads at one time of a virtual clock may carry growing stamps."""
+FRESH_SHARE = 0.5
+"""Of ``safety.joint_timeout_s``: the age at which samples may be read; the rest is for a cycle and for stalls."""
+RAISED = {
+    "describe": "describe() tells the joints before anything connects",
+    "configure": "mend what it tells of the device: power, cable, ids, modes, options",
+    "activate": "mend what it tells of the device: supply, faults, emergency stop, brakes",
+    "read_state": "mend what it tells; answers that are lost now and then give the sample before once more (Freshness)",
+    "write_velocity": "mend what it tells; finite commands while active are carried out, cut at the limits",
+    "stop": "stop() raises nothing, in any state: catch there whatever the device raises",
+    "deactivate": "deactivate() may be called in any state, twice, too",
+    "close": "close() raises nothing, in any state: catch there whatever the device raises",
+}
+"""Call -> what to do where it raises."""
 
 
 class CheckFailedError(Exception):
-    """A check has failed; the text has what was found and what is required."""
+    """A check has failed; the text has what was found and what is required.
+
+    ``remedy``: what to do, where it is not that of the check.
+    """
+
+    def __init__(self, message: str, remedy: str = "") -> None:
+        super().__init__(message)
+        self.remedy = remedy
 
 
 class CheckNotRunError(Exception):
@@ -56,7 +77,9 @@ class JointDriverSetup(Paced):
     rest_velocity = 1e-3
     """Below this [rad/s or m/s] the arm counts as at rest."""
     brake_s = 1.0
-    """Time in which the arm must come to rest from ``speed``."""
+    """Time [s] in which the arm must come to rest from ``speed``."""
+    joint_timeout_s = SafetySection().joint_timeout_s
+    """``safety.joint_timeout_s`` of the cells that the driver is for: older samples stop the arm."""
     enforces_timeout = True
     """Whether the device stops by itself when commands cease. Every device should; set False only with a
     reason.
@@ -85,6 +108,10 @@ class JointDriverSetup(Paced):
         """How many writes the device has received so far; None where nobody counts them."""
         return None
 
+    def true_positions(self, driver: JointDriver) -> FloatArray | None:
+        """Where the joints are now (n,), not by the driver's word; None where nobody else measures them."""
+        return None
+
 
 class JointBench:
     """Drivers under check, whose answers are verified with every call. ``close`` closes them."""
@@ -97,7 +124,13 @@ class JointBench:
 
     def new(self) -> JointDriver:
         """A driver that is connected to nothing."""
-        driver = self.setup.make_driver(self.context)
+        try:
+            driver = self.setup.make_driver(self.context)
+        except Exception as error:  # whatever a third party's constructor raises
+            raise CheckFailedError(
+                f"the driver cannot be made: {told(error)}",
+                "its options: `--options`, `--cell`, make_driver()",
+            ) from error
         self._drivers.append(driver)
         return driver
 
@@ -114,10 +147,31 @@ class JointBench:
         return driver
 
     def close(self) -> None:
-        """Close all drivers."""
+        """Close all drivers. Raises CheckFailedError, once all are closed, where close() raises."""
+        raised: list[Exception] = []
         for driver in self._drivers:
-            driver.close()
-        self._drivers.clear()
+            try:
+                driver.close()
+            except Exception as error:  # the others must be closed, too
+                raised.append(error)
+        try:
+            if raised:
+                raise self.failure(raised[0]) from raised[0]
+        finally:
+            self._drivers.clear()
+
+    def failure(self, error: Exception) -> CheckFailedError:
+        """The failure that an exception of a driver's call is, by the calls that it came through."""
+        calls, trace = [], error.__traceback__
+        while trace is not None:
+            frame, trace = trace.tb_frame, trace.tb_next
+            name = frame.f_code.co_name
+            if name in RAISED and any(frame.f_locals.get("self") is driver for driver in self._drivers):
+                calls.append(name)
+        if not calls:
+            return CheckFailedError(f"raised {told(error)}")
+        through = f", which {calls[0]}() calls," if calls[0] != calls[-1] else ""
+        return CheckFailedError(f"{calls[-1]}(){through} raised {told(error)}", RAISED[calls[-1]])
 
     def now_ns(self) -> int:
         """Time of the driver's clock."""
@@ -217,10 +271,46 @@ class JointBench:
         )
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: bool, message: str, remedy: str = "") -> None:
     """Raise CheckFailedError unless ``condition``."""
     if not condition:
-        raise CheckFailedError(message)
+        raise CheckFailedError(message, remedy)
+
+
+def told(error: Exception) -> str:
+    """Kind, code and text of an exception."""
+    code = f" ({error.code})" if isinstance(error, DriverError) else ""
+    return f"{type(error).__name__}{code}: {error}"
+
+
+def refused(call: Callable[[], Any], what: str) -> str:
+    """Code of the DriverError that ``call`` must raise. Raises CheckFailedError where it does not."""
+    try:
+        call()
+    except DriverError as error:
+        require(bool(error.code and str(error)), f"{what} is refused without a code or text")
+        return error.code
+    except Exception as error:
+        raise CheckFailedError(f"{what} raises {told(error)}; DriverError is needed") from error
+    raise CheckFailedError(f"{what} is not refused")
+
+
+def call_stop(driver: JointDriver, when: str) -> None:
+    """Call stop(). Raises CheckFailedError where it raises."""
+    try:
+        driver.stop()
+    except Exception as error:
+        raise CheckFailedError(f"stop() {when} raised {told(error)}", RAISED["stop"]) from error
+
+
+def zero(driver: JointDriver) -> FloatArray:
+    """Velocity zero of every joint (n,)."""
+    return np.zeros(len(driver.describe().joints))
+
+
+def resolutions(driver: JointDriver) -> FloatArray:
+    """Stated encoder steps (n,)."""
+    return np.array([joint.resolution for joint in driver.describe().joints])
 
 
 def call_times_us(calls: int, call: Callable[[], Any], before: Callable[[], Any]) -> FloatArray:

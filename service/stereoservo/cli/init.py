@@ -4,6 +4,9 @@ driver reports.
 
 from __future__ import annotations
 
+import re
+import tomllib
+from json import dumps as json_text
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +20,8 @@ from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import CameraDescription, DriverContext, DriverError, JointDriverDescription
 
+OPTION_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
 
 def init(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The cell file to write, e.g. cell.toml.")],
@@ -25,6 +30,12 @@ def init(
     camera_driver: Annotated[str, typer.Option(help="See `stereoservo drivers`.")] = "fake",
     detector: Annotated[str, typer.Option(help="For camera drivers that deliver images.")] = "dots",
     camera: Annotated[list[str] | None, typer.Option(help="Camera names (default: left, right).")] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUE", help="An option of the joint driver, its value as in TOML; repeatable."
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -37,18 +48,20 @@ def init(
     if file.exists() and not force:
         raise CommandError("exists", f"{file} exists already; --force writes over it")
     cameras = camera or ["left", "right"]
+    options = _options(option or [])
     context = DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent)
     try:
         joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, joint_driver)(
-            {}, context
+            tomllib.loads(options), context
         ).describe()
     except DriverError as error:
-        if error.code != "option":
+        if error.code != "option" or options:
             raise
         raise CommandError(
             "option",
-            f"{error}. Driver {joint_driver!r} tells its joints only once it knows [joints.options]: copy a cell file "
-            "that uses it (deploy/cells/ in the source, e.g. hil-can.toml for 'canopen') and change it",
+            f"{error}. Driver {joint_driver!r} tells its joints only once it knows [joints.options]: give them "
+            "(--option 'servo=[{name=\"j1\", id=1}]' --option port=/dev/ttyUSB0), or copy a cell file that uses it "
+            "(deploy/cells/ in the source, e.g. hil-can.toml for 'canopen') and change it",
         ) from error
     described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
         {},
@@ -58,16 +71,37 @@ def init(
     ).describe()
     detector_name = detector if described.delivers == "frames" else ""
     try:
-        file.write_text(_text(cell, joint_driver, joints, camera_driver, detector_name, cameras))
+        file.write_text(_text(cell, joint_driver, options, joints, camera_driver, detector_name, cameras))
     except OSError as error:
         raise CommandError("file", f"{file}: {error.strerror}") from error
     check_joints(load_cell_file(file), tuple(joint.name for joint in joints.joints), file)
     emit({"cell": cell, "file": str(file)}, f"wrote {file}; next: stereoservo doctor {file}", json)
 
 
+def _options(given: list[str]) -> str:
+    """Lines of ``[joints.options]``; a value that is no TOML is a string. Raises CommandError."""
+    lines = []
+    for text in given:
+        key, found, value = text.partition("=")
+        line = f"{key} = {value}"
+        try:
+            tomllib.loads(line)
+        except tomllib.TOMLDecodeError:
+            line = f"{key} = {json_text(value)}"
+        if not found or not OPTION_KEY.fullmatch(key):
+            raise CommandError("argument", f"--option {text!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0")
+        lines.append(line)
+    try:
+        tomllib.loads("\n".join(lines))
+    except tomllib.TOMLDecodeError as error:
+        raise CommandError("argument", f"--option: {error}; each key once is valid") from error
+    return "\n".join(lines)
+
+
 def _text(
     cell: str,
     driver: str,
+    options: str,
     joints: JointDriverDescription,
     camera_driver: str,
     detector: str,
@@ -81,7 +115,11 @@ def _text(
         "",
         "[joints]",
         f'driver = "{driver}"',
-        "# [joints.options]              # what the driver wants to know",
+        *(
+            ["[joints.options]", options]
+            if options
+            else ["# [joints.options]              # what the driver wants to know"]
+        ),
         "# [joints.home]                 # home position by joint [rad or m]; default: calibration.base",
         "",
     ]

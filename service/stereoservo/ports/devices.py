@@ -216,7 +216,9 @@ class JointDriver(Protocol):
         ...
 
     def configure(self) -> None:
-        """Connect and check the machine. Raises DriverError. Nothing moves."""
+        """Connect and check the machine; connected already (after deactivate), check it anew and clear what faults are
+        cleared. Raises DriverError. Nothing moves.
+        """
         ...
 
     def activate(self) -> None:
@@ -236,7 +238,9 @@ class JointDriver(Protocol):
         ...
 
     def deactivate(self) -> None:
-        """Stop, then power off. Idempotent."""
+        """Stop, then power off, but for an arm without brakes that would fall: its motors hold it on. Commands are
+        refused from now on. Idempotent.
+        """
         ...
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from stereoservo.messages.goals import AuxiliarySpec
@@ -70,8 +71,8 @@ class Driver:
         return JointDriverDescription("small", joints, 250.0, "clock", TIMEOUT_S, 500.0, auxiliary=AUXILIARY)
 
     def configure(self) -> None:
-        self.life.require("configure()", CREATED)
-        self.device = Device(self.context.clock, self.forever)
+        self.life.require("configure()", CREATED, CONFIGURED)
+        self.device = self.device or Device(self.context.clock, self.forever)
         self.life.state = CONFIGURED
 
     def activate(self) -> None:
@@ -192,6 +193,127 @@ class BlockingRead(Driver):
     def read_state(self) -> JointState:
         time.sleep(0.03)
         return super().read_state()
+
+
+class StopsOnlyByReading(Driver):
+    """Behind it a device that goes on for ever: it stands still while somebody reads."""
+
+    forever = True
+    commanded_ns = 0
+
+    def write_velocity(self, qd: Any) -> CommandReport:
+        self.commanded_ns = self.context.clock.now_ns()
+        return super().write_velocity(qd)
+
+    def read_state(self) -> JointState:
+        if self.commanded_ns and self.context.clock.now_ns() - self.commanded_ns > TIMEOUT_S * 1e9:
+            self.stop()
+        return super().read_state()
+
+
+class ReadsFeedTheWatchdog(StopsOnlyByReading):
+    """A correct one: any packet feeds the device's watchdog, as of servos on a bus; the driver stops while it reads."""
+
+    forever = False
+
+    def read_state(self) -> JointState:
+        state = super().read_state()
+        assert self.device is not None
+        self.device.until_ns = self.context.clock.now_ns() + round(TIMEOUT_S * 1e9)
+        return state
+
+    def has_tripped(self) -> bool:
+        assert self.device is not None
+        return bool(self.writes) and self.context.clock.now_ns() > self.device.until_ns
+
+
+class RefusesAfterATrip(ReadsFeedTheWatchdog):
+    """Correct, too."""
+
+    dead = False
+
+    def read_state(self) -> JointState:
+        self.dead = self.dead or self.has_tripped()
+        return super().read_state()
+
+    def verify(self, asked: Any) -> None:
+        super().verify(asked)
+        if self.dead:
+            raise DriverError("tripped", "the watchdog has tripped; activate again")
+
+
+class DeadAfterATrip(RefusesAfterATrip):
+    """Once the watchdog has tripped, commands are taken, and nothing moves."""
+
+    def verify(self, asked: Any) -> None:
+        Driver.verify(self, asked)
+
+    def sent(self, velocities: Any) -> Any:
+        return 0.0 * velocities if self.dead else velocities
+
+
+class SlowRead(Driver):
+    """15 ms in a cycle of 4 ms."""
+
+    def read_state(self) -> JointState:
+        time.sleep(0.015)
+        return super().read_state()
+
+
+class SlowWrite(Driver):
+    def sent(self, velocities: Any) -> Any:
+        time.sleep(0.003)
+        return velocities
+
+
+class SlowAndStated(Driver):
+    """What it states it keeps, but no cycle has room for it."""
+
+    def describe(self) -> JointDriverDescription:
+        return msgspec.structs.replace(super().describe(), call_budget_us=50_000.0)
+
+    def read_state(self) -> JointState:
+        time.sleep(0.005)
+        return super().read_state()
+
+
+class NearlyStale(Driver):
+    """Younger than `safety.joint_timeout_s`, until the next cycle comes."""
+
+    def stamp(self) -> int:
+        return self.context.clock.now_ns() - 95_000_000
+
+
+class OldPositionsFreshStamps(Driver):
+    """Positions of 0.1 s ago, as of a buffer that is read from its wrong end."""
+
+    def told(self, positions: Any) -> Any:
+        self.past = [*getattr(self, "past", []), positions][-25:]
+        return self.past[0]
+
+
+class DeactivatedWithoutStop(Driver):
+    def deactivate(self) -> None:
+        if self.life.state is ACTIVE:
+            self.life.state = CONFIGURED
+
+
+class ConfiguredOnce(Driver):
+    """A fault of the arm is never reset."""
+
+    def configure(self) -> None:
+        self.life.require("configure()", CREATED)
+        super().configure()
+
+
+class MovesWhenConfigured(Driver):
+    """The device stays where it was left."""
+
+    def configure(self) -> None:
+        super().configure()
+        assert self.device is not None
+        place = self.context.services.get("place", np.zeros(2)) + 0.02
+        self.device.positions = self.context.services["place"] = place
 
 
 class Degrees(Driver):
@@ -315,6 +437,38 @@ class GripperOfAnArmThatIsOff(Driver):
         self.beside.order(values, self.context.clock.now_ns())
 
 
+class ConfigureFails(Driver):
+    def configure(self) -> None:
+        raise DriverError("servo", "servo 1 is in mode 3")
+
+
+class ReadFailsInConfigure(Driver):
+    def configure(self) -> None:
+        super().configure()
+        self.read_state()
+
+    def told(self, positions: Any) -> Any:
+        raise KeyError("servo 1")
+
+
+class StopFailsWhileConnected(Driver):
+    def stop(self) -> None:
+        if self.life.state is ACTIVE:
+            raise OSError("write failed")
+        super().stop()
+
+
+class OptionsRefused(Driver):
+    def __init__(self, options: Any, context: Any) -> None:
+        raise DriverError("option", "driver 'small': servo is missing")
+
+
+class LimitsInDegrees(Driver):
+    def describe(self) -> JointDriverDescription:
+        joints = (JointSpec("a", "revolute", -150.0, 150.0, 90.0, 10.0),)
+        return msgspec.structs.replace(super().describe(), joints=joints)
+
+
 FAULTY = {
     StaleStamps: "numbers and stamps its samples",
     FrozenStamps: "numbers and stamps its samples",
@@ -322,6 +476,16 @@ FAULTY = {
     IgnoredStop: "stops",
     RaisingStop: "stop raises nothing unconnected",
     BlockingRead: "answers in time",
+    StopsOnlyByReading: "stops when commands cease",
+    DeadAfterATrip: "stops when commands cease",
+    SlowRead: "answers in time",
+    SlowWrite: "answers in time",
+    SlowAndStated: "answers in time",
+    NearlyStale: "numbers and stamps its samples",
+    OldPositionsFreshStamps: "moves as told",
+    DeactivatedWithoutStop: "stops",
+    ConfiguredOnce: "refuses commands unless active",
+    MovesWhenConfigured: "stands when activated",
     Degrees: "moves as told",
     DegreesCommanded: "moves as told",
     SignFlipped: "moves as told",
@@ -359,3 +523,10 @@ class SmallSetup(JointDriverSetup):
 
     def device_writes(self, driver: Any) -> int:
         return driver.device.writes
+
+    def true_positions(self, driver: Any) -> Any:
+        device = driver.device
+        if device.gone:
+            return device.positions
+        device.exchange()
+        return device.positions.copy()

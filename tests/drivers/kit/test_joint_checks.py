@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
@@ -15,7 +16,27 @@ from stereoservo_drivers.kit.bench import CheckFailedError, JointBench
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
 from stereoservo_drivers.kit.watchdog import CommandWatchdog
 
-from .faulty_drivers import FAULTY, Driver, SmallSetup, TimeOutNotKept
+from .faulty_drivers import (
+    FAULTY,
+    ConfigureFails,
+    Driver,
+    LimitsInDegrees,
+    OptionsRefused,
+    ReadFailsInConfigure,
+    ReadsFeedTheWatchdog,
+    RefusesAfterATrip,
+    SmallSetup,
+    StopFailsWhileConnected,
+    TimeOutNotKept,
+)
+
+CELL = """
+schema = 1
+cell.name = "small"
+joints = { driver = "fake", options = { rate_hz = 100.0 } }
+safety.joint_timeout_s = 0.25
+camera = [{ name = "left", driver = "fake" }, { name = "right", driver = "fake" }]
+"""
 
 
 @pytest.mark.parametrize("check", JOINT_CHECKS, ids=lambda check: check.name)
@@ -34,7 +55,58 @@ def test_a_planted_fault_is_caught_by_its_check_with_a_remedy(faulty, name, tmp_
     result = run_check(check, setup, tmp_path)
     assert result.verdict == "failed", result
     assert result.measured
-    assert result.remedy == check.remedy
+    assert result.remedy
+
+
+def run(driver, name, folder):
+    setup = SmallSetup()
+    setup.driver = driver
+    (check,) = (check for check in JOINT_CHECKS if check.name == name)
+    return run_check(check, setup, folder)
+
+
+@pytest.mark.parametrize(
+    ("driver", "after"),
+    [(ReadsFeedTheWatchdog, "moves it again"), (RefusesAfterATrip, "is refused (tripped) after silence")],
+)
+def test_after_a_trip_a_command_moves_the_arm_again_or_is_refused(driver, after, tmp_path):
+    result = run(driver, "stops when commands cease", tmp_path)
+    assert result.verdict == "passed", result
+    assert result.measured.endswith(after)
+
+
+@pytest.mark.parametrize(
+    ("driver", "measured", "remedy"),
+    [
+        (ConfigureFails, "configure() raised DriverError (servo): servo 1 is in mode 3", "modes"),
+        (
+            ReadFailsInConfigure,
+            "read_state(), which configure() calls, raised KeyError: 'servo 1'",
+            "answers",
+        ),
+        (StopFailsWhileConnected, "stop(), which close() calls, raised OSError: write failed", "catch"),
+        (
+            OptionsRefused,
+            "the driver cannot be made: DriverError (option): driver 'small': servo",
+            "--options",
+        ),
+    ],
+)
+def test_an_exception_is_told_by_the_call_that_raised_it_with_what_to_do_there(
+    driver, measured, remedy, tmp_path
+):
+    result = run(driver, "keeps its description", tmp_path)
+    assert result.verdict == "failed"
+    assert result.measured.startswith(measured)
+    assert remedy in result.remedy
+
+
+def test_limits_that_look_like_degrees_are_told(tmp_path):
+    result = run(LimitsInDegrees, "describes itself", tmp_path)
+    assert (result.verdict, result.measured.partition("WARNING: ")[2]) == (
+        "passed",
+        "a goes from -150 to 150 rad at 90 rad/s: degrees?",
+    )
 
 
 def test_outputs_are_left_as_they_were_found(tmp_path):
@@ -71,7 +143,7 @@ def test_without_a_device_nothing_is_connected_and_the_rest_is_told_as_not_run()
     code, report = command("faulty_drivers:RaisingStop")
     assert (code, report["error"]["message"]) == (1, "stop raises nothing unconnected")
     (failed,) = (check for check in report["checks"] if check["verdict"] == "failed")
-    assert failed["remedy"] == "stop() must do nothing there"
+    assert "raises nothing, in any state" in failed["remedy"]
 
 
 @pytest.mark.usefixtures("here")
@@ -86,6 +158,7 @@ def test_a_setup_brings_its_own_cable_and_counter_and_a_driver_class_does_withou
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        ([], "--cell"),
         (["no_such_module:Driver"], "ModuleNotFoundError"),
         (["json:loads"], "a driver class"),
         (["nobody"], "there are:"),
@@ -108,6 +181,43 @@ def test_hardware_is_moved_only_after_a_yes():
     result = CliRunner().invoke(app, ["faulty_drivers:Driver", "--hardware"], input="n\n")
     assert result.exit_code == 1
     assert "nothing was done" in str(result.exception)
+
+
+@pytest.mark.usefixtures("here")
+def test_the_end_of_the_input_is_no_yes_and_is_told():
+    app = typer.Typer()
+    app.command()(driver_check)
+    result = CliRunner().invoke(app, ["faulty_drivers:Driver", "--hardware"], input="")
+    assert result.exit_code == 1
+    assert "--yes begins without asking" in str(result.exception)
+    assert "the input has ended" in result.stderr
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(("wanted", "verdict"), [(True, "passed"), (None, "not run")])
+def test_a_setup_says_whether_its_hardware_is_driven_to_its_limits(wanted, verdict, monkeypatch):
+    (check,) = (check for check in JOINT_CHECKS if check.name == "keeps position limits")
+    monkeypatch.setattr("stereoservo_drivers.commands.driver_check.JOINT_CHECKS", (check,))
+    monkeypatch.setattr(importlib.import_module("faulty_drivers").SmallSetup, "whole_range", wanted)
+    monkeypatch.setattr(importlib.import_module("faulty_drivers").SmallSetup, "speed", 0.5)
+    code, report = command("faulty_drivers:SmallSetup", "--hardware", "--yes")
+    assert (code, report["checks"][0]["verdict"]) == (0, verdict)
+
+
+def test_a_cell_names_driver_options_and_the_age_of_samples(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "stereoservo_drivers.commands.driver_check._results", lambda *given: setups.append(given[0]) or []
+    )
+    setups = []
+    cell = tmp_path / "cell.toml"
+    cell.write_text(CELL)
+    command("--cell", str(cell))
+    (setup,) = setups
+    assert (setup.driver.__name__, setup.options, setup.joint_timeout_s) == (
+        "FakeJointDriver",
+        {"rate_hz": 100.0},
+        0.25,
+    )
 
 
 @pytest.mark.usefixtures("here")

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 
 import typer
 
+from stereoservo.cli.doctor.sampled_arm import examine_samples
 from stereoservo.cli.output import CommandError
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.pacing import realtime_for_a_while
@@ -41,12 +42,11 @@ def permission(jog: bool, yes: bool) -> MayMove:
 
 
 def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFinding]:
-    """Findings on the cell's arm; none where its driver cannot examine it. Nothing is accessed while another
-    process has the hardware.
+    """Findings on the cell's arm: by its driver where that can examine it, else on its samples. Nothing is accessed
+    while another process has the hardware.
     """
-    driver = make_driver(plan, MonotonicClock())
-    if not isinstance(driver, ExaminableJointDriver):
-        return
+    clock = MonotonicClock()
+    driver = make_driver(plan, clock)
     directories = plan.directories
     pid = holder(directories.daemon_lock)
     if pid is not None:
@@ -69,6 +69,9 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFind
         # the check "scheduling" says so.
         locks.enter_context(realtime_for_a_while(plan.cell.servo.priority))
         try:
-            yield from driver.examine(may_move)
+            if isinstance(driver, ExaminableJointDriver):
+                yield from driver.examine(may_move)
+            else:
+                yield from examine_samples(plan, driver, clock)
         except DriverError as error:
             yield ExaminationFinding("drives", False, str(error))
