@@ -227,3 +227,13 @@ def test_a_process_number_that_is_another_users_by_now_is_no_plant(
     with pytest.raises(DriverError) as caught:
         cell.driver.read_state()
     assert caught.value.code == "plant_ended"
+
+
+def test_a_stop_after_close_is_no_error(cell: Cell) -> None:
+    cell.driver.activate()
+    cell.driver.close()
+    cell.driver.stop()
+    cell.driver.stop_auxiliary()
+    cell.driver.close()
+    cell.run(0.01)
+    assert cell.fake._life.state == "configured"

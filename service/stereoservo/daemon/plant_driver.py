@@ -147,6 +147,7 @@ class PlantDriver:
         )
         self._state: PlantState | None = None
         self._failures = 0
+        self._closed = False
         self._encoded_remarks, self._remarks = b"", Remarks()
 
     def describe(self) -> JointDriverDescription:
@@ -190,6 +191,7 @@ class PlantDriver:
     def close(self) -> None:
         """Stop, power off, release. Idempotent; never raises."""
         self.deactivate()
+        self._closed = True
         self._reader.close()
         self._writer.close()
 
@@ -277,7 +279,8 @@ class PlantDriver:
 
     def _send(self, **changes: Any) -> None:
         self._orders = self._orders._replace(**changes)
-        self._writer.write(self._orders.encoded())
+        if not self._closed:  # a stop may come later than that; there is no power then
+            self._writer.write(self._orders.encoded())
 
     def _look(self) -> PlantState | None:
         """The newest state of any plant; None before the first."""
