@@ -18,7 +18,7 @@ from stereoservo.cli import main as cli
 from stereoservo.core.cycle import decode_array, encode
 from stereoservo.core.state_encoding import encode_state
 from stereoservo.recording import flight_recorder
-from stereoservo.recording.compression import Checkpoints, StepBlocks
+from stereoservo.recording.compression import COUNT, ZERO, Checkpoints, StepBlocks
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, recorded_messages, replay
@@ -128,6 +128,25 @@ def test_a_length_that_lies_is_refused_before_anything_is_allocated(small: Path,
     for restore in (StepBlocks().restore, Checkpoints().restore):
         with pytest.raises((ValueError, zstandard.ZstdError)):
             restore(frame)
+
+
+def hostile_block(forms: list[int], kinds: list[int], tail: bytes) -> bytes:
+    """A block that states records of these ``kinds``, of forms of so many bytes."""
+    head = COUNT.pack(len(kinds), len(forms)) + np.array([[n, 0] for n in forms], "<u4").tobytes()
+    return zstandard.ZstdCompressor().compress(head + np.array(kinds, "<u2").tobytes() + tail)
+
+
+def test_a_block_of_few_bytes_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    zero = bytes([ZERO])
+    assert StepBlocks().restore(hostile_block([16], [0], 2 * zero)) == [bytes(16)]
+    for forms, kinds in (([16, 8 * 10**6], [0]), ([16], [0, 1]), ([16] * 65536, [0])):
+        with pytest.raises(ValueError, match="forms that no record has, or records of no form"):
+            StepBlocks().restore(hostile_block(forms, kinds, 10**6 * zero))
+    monkeypatch.setattr("stereoservo.recording.compression.MOST_KEPT", 10**5)
+    blocks = StepBlocks()
+    assert blocks.restore(hostile_block([48_000], [0], 6000 * zero))
+    with pytest.raises(ValueError, match="more forms"):
+        blocks.restore(hostile_block([56_000], [0], 7000 * zero))
 
 
 @pytest.mark.parametrize("length", [2**40, 2**63, 2**64 - 1, 2**31])

@@ -175,3 +175,65 @@ def test_a_gripper_goes_where_it_is_ordered_and_stands_at_a_stop(cell: Cell) -> 
     assert cell.driver.read_auxiliary()["gripper"] == pytest.approx(0.02, abs=2e-3)
     with pytest.raises(DriverError, match="there are: gripper"):
         cell.driver.write_auxiliary({"claw": 0.0})
+
+
+def test_what_was_ordered_of_a_plant_that_ended_is_not_done_by_its_successor(cell: Cell) -> None:
+    cell.driver.activate()
+    cell.driver.write_auxiliary({"gripper": 0.05})
+    cell.run(1.0)
+    cell.driver.read_state()
+    assert cell.driver.read_auxiliary()["gripper"] == pytest.approx(0.05)
+    cell.plant.close()
+    cell.plant = cell.started()
+    cell.run(0.01)
+    cell.driver.configure()  # orders of before would be refused by drives without power, and fail this call
+    cell.driver.activate()
+    cell.run(1.0)
+    cell.driver.read_state()
+    assert cell.driver.read_auxiliary()["gripper"] == 0.0
+
+
+def test_an_order_that_is_refused_is_not_carried_out_with_the_next(cell: Cell) -> None:
+    cell.driver.activate()
+    with pytest.raises(DriverError, match="there are: gripper"):
+        cell.driver.write_auxiliary({"gripper": 0.05, "claw": 0.0})
+    cell.driver.write_auxiliary({})
+    cell.run(1.0)
+    cell.driver.read_state()
+    assert cell.driver.read_auxiliary()["gripper"] == 0.0
+
+
+def test_a_servo_process_started_anew_has_its_calls_carried_out(cell: Cell) -> None:
+    calls: list[str] = []
+    configure = cell.fake.configure
+    cell.fake.configure = lambda: (calls.append("configure"), configure())
+    for _ in range(2):  # the first call of each
+        cell.driver.close()
+        cell.driver = PlantDriver(
+            cell.plant.driver.describe(), cell.directories, cell.clock, sleep=lambda seconds: cell.run(0.001)
+        )
+        cell.driver.configure()
+    assert calls == ["configure", "configure"]
+
+
+def test_a_process_number_that_is_another_users_by_now_is_no_plant(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(pid: int, number: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("stereoservo.daemon.plant_driver.os.kill", refused)
+    cell.clock.sleep(1.0)
+    with pytest.raises(DriverError) as caught:
+        cell.driver.read_state()
+    assert caught.value.code == "plant_ended"
+
+
+def test_a_stop_after_close_is_no_error(cell: Cell) -> None:
+    cell.driver.activate()
+    cell.driver.close()
+    cell.driver.stop()
+    cell.driver.stop_auxiliary()
+    cell.driver.close()
+    cell.run(0.01)
+    assert cell.fake._life.state == "configured"

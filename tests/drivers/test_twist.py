@@ -132,3 +132,22 @@ def test_the_controller_stops_by_itself_and_after_a_reset_the_way_back_is_free(t
     assert driver.read_state().positions[5] < at - 0.1
     with pytest.raises(DriverError, match="near a singularity of the arm; reset"):
         drive([0.15, 0.0, 0.15, 0.0, 0.0, 0.0], 800)
+
+
+def test_a_robot_that_tells_no_numbers_is_not_driven_by_them_and_nothing_of_them_stays(
+    tmp_path: Path,
+) -> None:
+    driver, _ = driven(tmp_path, OPTIONS | {"arm": "fake"})
+    arm = driver._arm
+    read, written = arm.read, []
+    arm.write = lambda v, w: written.append((v, w)) or (v, w)  # type: ignore[method-assign]
+    for broken in ("pose", "v", "w"):
+        arm.read = lambda broken=broken: read()._replace(**{broken: np.nan * getattr(read(), broken)})  # type: ignore[method-assign, misc]
+        for call in (driver.read_state, lambda: driver.write_velocity(np.full(6, 0.01))):
+            with pytest.raises(DriverError, match="no numbers"):
+                call()
+    assert not written
+    arm.read = read  # type: ignore[method-assign]
+    assert np.isfinite(driver.read_state().positions).all()
+    driver.write_velocity(np.full(6, 0.01))
+    assert np.isfinite(written).all()

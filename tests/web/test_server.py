@@ -16,12 +16,14 @@ pytest.importorskip("websockets", reason="the page's server needs websockets (ex
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from stereoservo.messages.goals import Goal
+from stereoservo.client import Client, ClientError
+from stereoservo.messages.goals import Goal, TaughtTarget
 from stereoservo.messages.wire import Reply
 from stereoservo.web.cell_link import CellLink
 from stereoservo.web.requests import PageRequest
 from stereoservo.web.server import PageServer
 
+EXAMPLE = Client.make_goal(TaughtTarget("a"))
 VERBS = [kind.__struct_config__.tag for kind in PageRequest.__args__]
 
 
@@ -170,6 +172,49 @@ def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
                     break
             assert answer(other, {"do": "hold"}, 500)["ok"]
             assert link.ended >= 1
+
+
+def test_a_stop_waits_for_nothing_that_a_page_has_asked_for() -> None:
+    free = Event()
+    with serving("ann") as (port, calls, tokens, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
+        assert answer(page, {"do": "take", "token": tokens[0]}, 1)["ok"]
+        link.client.hold = lambda: free.wait(20) and Reply(True, "held")
+        try:
+            for n in range(100, 130):
+                page.send(msgspec.json.encode({"do": "hold", "n": n}).decode())
+            assert answer(page, {"do": "stop"}, 2)["ok"]
+            assert calls == ["stop"]
+            assert not free.is_set()
+        finally:
+            free.set()
+
+
+def test_a_goal_is_not_sent_where_another_was_asked_for_while_it_was_checked() -> None:
+    checking, free = Event(), Event()
+
+    def slow(goal: Goal) -> Reply:
+        checking.set()
+        free.wait(20)
+        return Reply(True, "a path")
+
+    def refused(goal: Goal) -> Reply:
+        raise ClientError("no path")
+
+    with serving("ann") as (port, calls, tokens, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
+        assert answer(page, {"do": "take", "token": tokens[0]}, 1)["ok"]
+        link.client.check = slow
+        link.taught_goal = lambda name: EXAMPLE
+        try:
+            page.send(msgspec.json.encode({"do": "check", "name": "a", "n": 2}).decode())
+            assert checking.wait(10)
+            link.client.check = refused
+            assert not answer(page, {"do": "check", "name": "b"}, 3)["ok"]
+        finally:
+            free.set()
+        while msgspec.json.decode(page.recv(timeout=10)).get("answer", {}).get("n") != 2:
+            pass
+        assert "check the goal first" in answer(page, {"do": "go"}, 4)["message"]
+        assert "send" not in calls
 
 
 def test_other_hosts_origins_and_paths_get_nothing() -> None:

@@ -154,6 +154,14 @@ class CartesianJointDriver:
         self._life.state = LifecycleState.CLOSED
 
     def _follow(self, told: CartesianState) -> None:
+        """Take what the robot tells. Raises DriverError, and keeps what is known, where that is no pose or twist."""
+        if not all(np.isfinite(part).all() for part in (told.pose, told.v, told.w)):
+            raise DriverError(
+                "pose",
+                "the robot's interface tells a pose or a twist with entries that are no numbers; nothing is commanded "
+                "by it: see the robot's own panel, then reset",
+                retry=True,
+            )
         self._positions = positions_of(told.pose, self._attitude, self._positions)
         self._pose = told.pose
 

@@ -114,9 +114,9 @@ class PlantProcess:
                     self._remarks = Remarks(reasons=reasons)
             if orders.auxiliary_number != done.auxiliary_number and self._auxiliary is not None:
                 values = dict(zip(self._names, orders.auxiliary.tolist(), strict=True))
-                self._auxiliary.write_auxiliary(
-                    {name: value for name, value in values.items() if value == value}
-                )
+                asked = {name: value for name, value in values.items() if value == value}
+                if asked:
+                    self._auxiliary.write_auxiliary(asked)
 
     def _change(self, *, active: bool) -> None:
         if active:

@@ -141,9 +141,13 @@ class PlantDriver:
         self._reader = SlotReader(directories.plant_state_slot, PLANT_STATE_LAYOUT)
         self._writer = SlotWriter(directories.plant_orders_slot, PLANT_CAPACITY, PLANT_ORDERS_LAYOUT)
         joints = len(description.joints)
-        self._orders = Orders(0, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan))
+        first = clock.now_ns()  # so that no number is one that a servo process before this one has used
+        self._orders = Orders(
+            0, first, False, first, 0, 0, first, np.zeros(joints), np.full(len(self._names), np.nan)
+        )
         self._state: PlantState | None = None
         self._failures = 0
+        self._closed = False
         self._encoded_remarks, self._remarks = b"", Remarks()
 
     def describe(self) -> JointDriverDescription:
@@ -187,15 +191,18 @@ class PlantDriver:
     def close(self) -> None:
         """Stop, power off, release. Idempotent; never raises."""
         self.deactivate()
+        self._closed = True
         self._reader.close()
         self._writer.close()
 
     def _call(self, *, active: bool, session: int) -> None:
-        """Order a lifecycle call and wait for its answer. Raises DriverError: what the drives say, or a plant that
-        ended or does not answer.
+        """Order a lifecycle call, and nothing of what was ordered before, and wait for its answer. Raises DriverError:
+        what the drives say, or a plant that ended or does not answer.
         """
-        still = np.zeros_like(self._orders.velocities)
-        self._send(active=active, session=session, call=self._orders.call + 1, velocities=still)
+        self._send(
+            active=active, session=session, call=self._orders.call + 1,
+            velocities=np.zeros_like(self._orders.velocities), auxiliary=np.full(len(self._names), np.nan),
+        )  # fmt: skip
         until_ns = self._clock.now_ns() + round(CALL_S * 1e9)
         while True:
             state = self._state_of_session()
@@ -237,23 +244,23 @@ class PlantDriver:
 
     def stop(self) -> None:
         """Order the drives to brake. Any state; never raises."""
-        self._orders.auxiliary[:] = np.nan
         self._send(
             stops=self._orders.stops + 1, auxiliary_stops=self._orders.auxiliary_stops + 1,
-            velocities=np.zeros_like(self._orders.velocities),
+            velocities=np.zeros_like(self._orders.velocities), auxiliary=np.full(len(self._names), np.nan),
         )  # fmt: skip
 
     # -- auxiliary joints -----------------------------------------------------------------------------------
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
         """Order auxiliary joints and outputs. Raises DriverError: there is no such name, or the plant ended."""
+        asked = self._orders.auxiliary.copy()
         for name, value in values.items():
             if name not in self._names:
                 known = ", ".join(self._names) or "none"
                 raise DriverError("auxiliary", f"no auxiliary joint or output {name!r}; there are: {known}")
-            self._orders.auxiliary[self._names.index(name)] = value
+            asked[self._names.index(name)] = value
         self._raise_failure(self._state_of_session())
-        self._send(auxiliary_number=self._orders.auxiliary_number + 1)
+        self._send(auxiliary_number=self._orders.auxiliary_number + 1, auxiliary=asked)
 
     def read_auxiliary(self) -> dict[str, float]:
         """The newest known values by name."""
@@ -264,14 +271,16 @@ class PlantDriver:
 
     def stop_auxiliary(self) -> None:
         """Order auxiliary joints to stand where they are. Never raises."""
-        self._orders.auxiliary[:] = np.nan
-        self._send(auxiliary_stops=self._orders.auxiliary_stops + 1)
+        self._send(
+            auxiliary_stops=self._orders.auxiliary_stops + 1, auxiliary=np.full(len(self._names), np.nan)
+        )
 
     # -- records --------------------------------------------------------------------------------------------
 
     def _send(self, **changes: Any) -> None:
         self._orders = self._orders._replace(**changes)
-        self._writer.write(self._orders.encoded())
+        if not self._closed:  # a stop may come later than that; there is no power then
+            self._writer.write(self._orders.encoded())
 
     def _look(self) -> PlantState | None:
         """The newest state of any plant; None before the first."""
@@ -301,7 +310,7 @@ class PlantDriver:
             return True
         try:
             os.kill(self._reader.writer_pid, 0)
-        except ProcessLookupError:
+        except (ProcessLookupError, PermissionError):  # its number may be another user's by now
             return False
         return True
 

@@ -14,6 +14,8 @@ from stereoservo.recording.step_layout import form_of
 
 LARGEST = 64 << 20
 """Bytes of a block or checkpoint, at most: a stated size beyond it is damage, and is not allocated."""
+MOST_KEPT = 8 * LARGEST
+"""Bytes of rows that are kept from one block to the next, at most."""
 LEVEL = 9
 COUNT = struct.Struct("<II")
 """Of a block: records, and forms of them."""
@@ -73,23 +75,30 @@ class StepBlocks:
         return [kinds.tobytes(), folded.view(np.uint8).reshape(-1, count, 8).transpose(2, 0, 1).tobytes()]
 
     def restore(self, block: bytes) -> list[bytes]:
-        """The records of a block, in their order. Raises anything on damaged bytes, before more than ``LARGEST`` bytes
-        are allocated.
+        """The records of a block, in their order. Raises anything on damaged bytes, before more than a few times
+        ``LARGEST`` bytes are allocated, or more than ``MOST_KEPT`` are kept for the next block.
         """
         data = _decompressed(self._decompressor, block)
         count, groups = COUNT.unpack_from(data)
+        if 8 * count > LARGEST:
+            raise ValueError(f"a block that states {count} records")
         forms = np.frombuffer(data, "<u4", 2 * groups, COUNT.size).reshape(-1, 2).tolist()
         at = COUNT.size + 8 * groups
         kinds = np.frombuffer(data, "<u2", count, at)
         at += 2 * count
-        places = [np.flatnonzero(kinds == k) for k in range(groups)]
-        if sum(len(found) * length for found, (length, _) in zip(places, forms, strict=True)) > LARGEST:
+        sizes = np.bincount(kinds, minlength=groups).tolist()
+        if len(sizes) > groups or 0 in sizes:
+            raise ValueError("a block with forms that no record has, or records of no form")
+        if sum((8 + length) * size for size, (length, _) in zip(sizes, forms, strict=True)) > LARGEST:
             raise ValueError("a block of more records than there may be")
+        places = np.split(np.argsort(kinds, kind="stable"), np.cumsum(sizes)[:-1])
         records = [b""] * count
         for found, (length, form) in zip(places, forms, strict=True):
             rows, at = self._rows(data, at, len(found), (length, form))
             for i, row in zip(found, rows, strict=True):
                 records[i] = row.tobytes()[:length]
+        if sum(row.nbytes for row in self._last.values()) > MOST_KEPT:
+            raise ValueError("records of more forms since the last checkpoint than there may be")
         if at != len(data):
             raise ValueError(f"a block with {len(data) - at} bytes too many")
         return records

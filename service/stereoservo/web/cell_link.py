@@ -89,6 +89,8 @@ class CellLink:
                 self._read(self._client)
             except (ClientError, NotRunningError, SessionError, OSError) as error:
                 self._why = str(error)
+            except Exception as error:  # whatever a cell sends: pages are told, and the link begins anew
+                self._why = f"what the cell sends cannot be read: {type(error).__name__}: {error}"
             self._tell("link", {"up": False, "why": self._why})
             client, self._client = self._client, None
             if client is not None:
@@ -170,6 +172,8 @@ class CellLink:
         self._tell("", {"event": event})
 
     def _take_picture(self, sample: Any) -> None:
+        if sample.attachment is None:  # no picture of a camera process
+            return
         header = bytes(sample.attachment.to_bytes())
         camera = str(sample.key_expr).rpartition("/")[2]
         data = struct.pack("<I", len(header)) + header + sample.payload.to_bytes()

@@ -7,9 +7,9 @@ from __future__ import annotations
 import asyncio
 import ssl
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,8 @@ POLICY = (
 MAX_PAGES = 16
 MAX_REQUEST_BYTES = 1 << 14
 MAX_WAITING = 512
+MAX_UNDER_WAY, MAX_STOPS = 8, 32
+"""Requests of a page that are carried out at a time, and stops, which wait for none of them."""
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
 PING_S = 5.0
@@ -70,6 +72,23 @@ class Page:
         self.base: FloatArray | None = None
         self.draft: FloatArray | None = None
         self.checked: Goal | None = None
+        self.changes = 0
+        """Drags and checks so far: what was checked is what is sent only where none came in between."""
+        self._under_way = 0
+
+    @contextmanager
+    def under_way(self, what: str) -> Iterator[None]:
+        """A request is being carried out. Raises RightsError where too many are."""
+        if self._under_way >= MAX_UNDER_WAY:
+            raise RightsError(
+                f"{what}: {self._under_way} requests of this page are being carried out, {MAX_UNDER_WAY} are allowed: "
+                "wait for one of them; stop goes before all"
+            )
+        self._under_way += 1
+        try:
+            yield
+        finally:
+            self._under_way -= 1
 
     def put(self, slot: str, data: bytes) -> None:
         """Queue a message; of one slot only the newest is kept."""
@@ -195,7 +214,7 @@ class PageServer:
                 task = asyncio.create_task(self._answer(page, message))
                 tasks.add(task)
                 task.add_done_callback(tasks.discard)
-                if len(tasks) > 8:
+                if len(tasks) > MAX_UNDER_WAY + MAX_STOPS:
                     await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except ConnectionClosed:
             pass
@@ -233,22 +252,28 @@ class PageServer:
             n = request.n
             if not isinstance(request, ask.OPEN):
                 self.holder.require(page, str(request.__struct_config__.tag))
-            pool = self._stops if isinstance(request, ask.Stop) else self._work
-            assert self._loop is not None
-            answer = {"ok": True} | await self._loop.run_in_executor(pool, self._do, page, request)
+            if isinstance(request, ask.Stop):
+                answer = {"ok": True} | await self._run(self._stops, page, request)
+            else:
+                with page.under_way(str(request.__struct_config__.tag)):
+                    answer = {"ok": True} | await self._run(self._work, page, request)
         except EXPECTED as error:
             answer = refusal(error)
         except Exception as error:  # told to the page; the next request is answered as usual
             answer = {"ok": False, "message": f"the page's server failed: {type(error).__name__}: {error}"}
-        self._let_go_if_closed(page)
+        self._let_go(page)
         page.tell({"answer": {"n": n, **answer}})
 
-    def _let_go_if_closed(self, page: Page) -> None:
-        """What a page was still doing when it was closed must not outlive it."""
+    async def _run(self, pool: ThreadPoolExecutor, page: Page, request: ask.PageRequest) -> dict[str, Any]:
+        assert self._loop is not None
+        return await self._loop.run_in_executor(pool, self._do, page, request)
+
+    def _let_go(self, page: Page) -> None:
+        """What a page was still doing when it was closed, or gave up the arm, must not outlive that."""
         if page not in self._pages:
             self.holder.release(page)
-            if not self.holder.taken:  # else its leases are another page's by now
-                self.link.end_leases()
+        if not self.holder.taken:  # else its leases are another page's by now
+            self.link.end_leases()
 
     def _do(self, page: Page, request: ask.PageRequest) -> dict[str, Any]:
         """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
@@ -304,13 +329,15 @@ class PageServer:
         base = page.base if page.draft is None else page.draft
         assert base is not None
         found = model.dragged(base, request.camera, request.shift, request.turn, request.nearer)
+        page.changes += 1
         page.checked = None
         if request.done:
             page.draft, page.base = found.joints, None
         return drag_answer(model, found.joints, request.camera, found.left_px)
 
     def _check(self, page: Page, request: ask.Check) -> dict[str, Any]:
-        page.checked = None
+        page.changes += 1
+        page.checked, change = None, page.changes
         if request.name is not None:
             goal = self.link.taught_goal(request.name)
         elif page.draft is not None:
@@ -318,7 +345,8 @@ class PageServer:
         else:
             raise LinkDownError("nothing was dragged yet: drag the outline of the body in a picture")
         reply = self.link.client.check(goal)
-        page.checked = goal
+        if page.changes == change:
+            page.checked = goal
         return _told(reply) | {"plan": reply.plan}
 
     def _go(self, page: Page) -> dict[str, Any]:
@@ -333,7 +361,9 @@ class PageServer:
 
 
 async def _send(connection: ServerConnection, page: Page) -> None:
-    """Send what waits for a page, the newest of each slot; one that reads slowly misses pictures, nothing else."""
+    """Send what waits for a page, the newest of each slot; one that reads slowly misses pictures, and of what is in no
+    slot what is more than `MAX_WAITING` messages old.
+    """
     try:
         while True:
             await page.wake.wait()
