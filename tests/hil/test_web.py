@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,13 +19,18 @@ from typing import Any
 import msgspec
 import pytest
 
+from stereoservo.client import Client, EventWatch, NoReplyError
 from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.messages.wire import EventMessage
 
-from .conftest import CELL
+from .conftest import CELL, eventually
 
 pytest.importorskip("websockets", reason="the page's server needs websockets (extra web)")
 
 from websockets.sync.client import connect
+
+from stereoservo.web.cell_link import CellLink
+from stereoservo.web.leases import LEASE_S
 
 BROWSER = shutil.which("chromium"), shutil.which("chromedriver")
 
@@ -119,6 +126,39 @@ def test_a_closed_page_lets_its_goal_end(shared: DaemonProcess) -> None:
         assert "read-only" in watcher.ask("resume")["message"]
         assert watcher.ask("stop")["ok"]
         watcher.close()
+
+
+@pytest.mark.process
+def test_a_goal_outlives_a_session_of_its_page_that_failed(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: deque[bytes] = deque()
+    link = CellLink(CELL, None, "ann", lambda slot, data, keep: told.append(data))
+    polled, failing = EventWatch.poll, threading.Event()
+
+    def poll(watch: EventWatch) -> list[EventMessage]:
+        if failing.is_set():
+            failing.clear()
+            raise NoReplyError("state", 2.0)
+        return polled(watch)
+
+    try:
+        link.start()
+        eventually("the model is there", lambda: link.drag_model)
+        assert link.send(link.taught_goal("park")).accepted
+        goal = client.status().goal
+        client.hold()  # it would be reached before its lease runs out
+        monkeypatch.setattr(EventWatch, "poll", poll)
+        for _ in range(2):  # each costs the link its session
+            failing.set()
+            told.clear()
+            eventually("it is open again", lambda: any(b'"up":true' in data for data in list(told)))
+            time.sleep(0.75 * LEASE_S)
+        assert client.status().goal == goal, "as long as its page is there"
+        link.end_leases()
+        eventually("it ends without it", lambda: not client.status().goal)
+    finally:
+        link.close()
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import asyncio
 import http.client
 import random
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
@@ -19,7 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 from stereoservo.client import Client, ClientError
 from stereoservo.messages.goals import Goal, TaughtTarget
 from stereoservo.messages.wire import Reply
-from stereoservo.web.cell_link import CellLink
+from stereoservo.web.cell_link import CellLink, Publish
 from stereoservo.web.requests import PageRequest
 from stereoservo.web.server import PageServer
 
@@ -46,6 +47,7 @@ class NotedLink(NotedClient):
 
     cell = "noted"
     drag_model = None
+    publish: Publish
 
     def __init__(self, calls: list[str]) -> None:
         super().__init__(calls)
@@ -70,7 +72,12 @@ def serving(operator: str | None) -> Iterator[tuple[int, list[str], list[str], N
     calls: list[str] = []
     tokens: list[str] = []
     link = NotedLink(calls)
-    server = PageServer(lambda publish: cast(CellLink, link), operator, tokens.append)
+
+    def make_link(publish: Publish) -> CellLink:
+        link.publish = publish
+        return cast(CellLink, link)
+
+    server = PageServer(make_link, operator, tokens.append)
     loop = asyncio.new_event_loop()
     thread = Thread(target=loop.run_forever, daemon=True)
     thread.start()
@@ -172,6 +179,30 @@ def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
                     break
             assert answer(other, {"do": "hold"}, 500)["ok"]
             assert link.ended >= 1
+        with connect(f"ws://127.0.0.1:{port}/socket") as later:
+            while "held the arm was closed" not in (told := str(later.recv(timeout=10))):
+                assert "answer" not in told, "it is told with what happened before"
+
+
+def test_a_page_that_does_not_read_is_sent_no_more_pictures_until_it_has() -> None:
+    count, size = 150, 100_000
+    with (
+        serving(None) as (port, _, _, link),
+        connect(f"ws://127.0.0.1:{port}/socket", max_queue=1) as page,
+    ):
+        answer(page, {"do": "take", "token": ""}, 1)
+        for k in range(count):
+            link.publish("picture left", k.to_bytes(4, "little") + bytes(size), False)
+            time.sleep(0.002)  # for the server's loop, which sends what fits
+        link.publish("", b'{"last": true}', False)
+        shown = []
+        while (message := page.recv(timeout=10)) != '{"last": true}':
+            if isinstance(message, bytes):
+                shown.append(int.from_bytes(message[:4], "little"))
+        assert len(shown) <= 8, "the sockets' buffers would hold some sixty"
+        while not isinstance(message := page.recv(timeout=10), bytes):
+            pass
+        assert int.from_bytes(message[:4], "little") == count - 1, "the newest of all"
 
 
 def test_a_stop_waits_for_nothing_that_a_page_has_asked_for() -> None:

@@ -7,19 +7,19 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 import msgspec
 import numpy as np
+from zenoh import ZError
 from zenoh.handlers import RingChannel
 
-from stereoservo.client import Client, ClientError, EventWatch, RefusedError, SessionError
+from stereoservo.client import Client, ClientError, EventWatch, NoReplyError, RefusedError, SessionError
 from stereoservo.client.client import GOAL_TIMEOUT_S
 from stereoservo.client.connection import read_message
-from stereoservo.client.goal_handle import TERMINAL, Lease
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.model import ModelFileError, decode_model
 from stereoservo.messages.discovery import NotRunningError
@@ -27,15 +27,14 @@ from stereoservo.messages.goals import Calibrate, FeatureTarget, Goal, TaughtTar
 from stereoservo.messages.wire import CellInfo, EventMessage, FeaturesMessage, Reply, StateMessage, encode
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web.drag_goal import DragModel
+from stereoservo.web.leases import LEASE_S, Leases
 from stereoservo.web.scene import Scene
 
 POLL_S = 0.004
-AGAIN_S = 1.0
+AGAIN_S = 0.25
+"""Before another session is tried; well within `LEASE_S`, so that a goal outlives a session that failed."""
 SILENT_S = 2.0
 INFO_EVERY_S = 0.5
-LEASE_S = 2.0
-"""Of a page's goals, renewed while the page is there: one that is closed, or loses its server, stops the arm."""
-ENDS = (*TERMINAL, "calibration_finished", "check_finished", "calibration_aborted", "calibration_failed")
 Publish = Callable[[str, bytes, bool], None]
 
 
@@ -61,7 +60,7 @@ class CellLink:
         self._epoch = -1
         self._seen: dict[str, FeaturesMessage] = {}
         self._state: StateMessage | None = None
-        self._leases: dict[str, Lease] = {}
+        self._leases = Leases(lambda: self._client)
         self._why = ""
         self.watched = threading.Event()
         """Set while a page is open: pictures are subscribed to only then."""
@@ -71,10 +70,11 @@ class CellLink:
     def start(self) -> None:
         """Begin to publish."""
         self._thread.start()
+        self._leases.start()
 
     def close(self) -> None:
         """End the thread and the session. Idempotent."""
-        self.end_leases()
+        self._leases.close()
         self._ended.set()
         if self._thread.is_alive():
             self._thread.join(3.0)
@@ -94,7 +94,10 @@ class CellLink:
             self._tell("link", {"up": False, "why": self._why})
             client, self._client = self._client, None
             if client is not None:
-                client.close()
+                closing = threading.Thread(target=client.close, name="cell-link-close", daemon=True)
+                closing.start()  # of a session that hangs: seconds, longer than leases last
+                if self._ended.is_set():
+                    closing.join()
             self._ended.wait(AGAIN_S)
 
     def _read(self, client: Client) -> None:
@@ -154,8 +157,10 @@ class CellLink:
             return
         try:
             model = decode_model(client.query(client.keys.model))
+        except NoReplyError:
+            raise  # asked again over another session
         except (ClientError, ModelFileError) as error:
-            self._tell("", {"notice": f"the model cannot be shown: {error}"})
+            self._tell("", {"notice": f"the model cannot be shown: {error}", "t_wall": time.time()})
             return
         limits = np.array([[joint.position_min, joint.position_max] for joint in self.info.joints])
         self.drag_model = DragModel(model, limits)
@@ -167,8 +172,7 @@ class CellLink:
         self._tell(f"features {found.camera}", {"features": msgspec.Raw(data)})
 
     def _take_event(self, event: EventMessage) -> None:
-        if event.kind in ENDS and (lease := self._leases.pop(event.id, None)) is not None:
-            lease.end()
+        self._leases.take_event(event)
         self._tell("", {"event": event})
 
     def _take_picture(self, sample: Any) -> None:
@@ -240,37 +244,25 @@ class CellLink:
     def send(self, goal: Goal) -> Reply:
         """Send a goal, and renew its lease until it ends or `end_leases`. Raises ClientError, LinkDownError."""
         client = self.client
-        with self._leased(client, goal.id):
+        with self._leases.held(goal.id):
             return client.request("goal", client.goal_key, encode(goal), GOAL_TIMEOUT_S)
 
     def calibrate(self, check: bool) -> Reply:
         """Begin a calibration, or a check motion; its events tell the rest. Raises ClientError, LinkDownError."""
         client = self.client
         command = Calibrate(Client.make_goal(TaughtTarget("x")).id, check=check, lease_s=LEASE_S)
-        with self._leased(client, command.id):
+        with self._leases.held(command.id):
             return client.command("calibrate", command)
 
-    @contextmanager
-    def _leased(self, client: Client, motion: str) -> Iterator[None]:
-        """Renew the lease of ``motion`` from now on, unless what is done within raises.
-
-        From before it is asked for: its end may be told before its acceptance is.
-        """
-        lease = self._leases[motion] = Lease(client, motion, LEASE_S)
-        try:
-            yield
-        except BaseException:
-            self._leases.pop(motion, None)
-            lease.end()
-            raise
-
     def stop(self) -> Reply:
-        """Stop the arm, over a session of its own where the link is down. Raises ClientError, NotRunningError,
-        SessionError.
+        """Stop the arm, over a session of its own where the link's is down, closed or does not answer.
+
+        Raises ClientError, NotRunningError, SessionError.
         """
         client = self._client
         if client is not None:
-            return client.stop()
+            with suppress(NoReplyError, ZError):
+                return client.stop()
         with self._connect() as fresh:
             return fresh.stop()
 
@@ -283,9 +275,7 @@ class CellLink:
 
     def end_leases(self) -> None:
         """Renew no lease any more: what the page has started ends within `LEASE_S`."""
-        while self._leases:
-            with suppress(KeyError):
-                self._leases.popitem()[1].end()
+        self._leases.end()
 
 
 def _by_camera(model: DragModel, pixels: FloatArray) -> dict[str, dict[int, list[float]]]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,7 @@ import numpy as np
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from stereoservo.client import ClientError, SessionError
@@ -50,7 +52,9 @@ MAX_UNDER_WAY, MAX_STOPS = 8, 32
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
 PING_S = 5.0
-"""A page that does not answer for so long is closed; one that holds the arm then lets it stop."""
+"""A page is asked every so often whether it is there, and closed where it does not answer for so long; one that holds
+the arm then lets it stop.
+"""
 EXPECTED = (
     ClientError,
     GeometryError,
@@ -224,6 +228,7 @@ class PageServer:
             if self.holder.release(page):
                 self.link.end_leases()
                 self._tell_all_rights()
+                self._spread("", _gone(connection), False)
             if not self._pages:
                 self.link.watched.clear()
 
@@ -361,22 +366,33 @@ class PageServer:
 
 
 async def _send(connection: ServerConnection, page: Page) -> None:
-    """Send what waits for a page, the newest of each slot; one that reads slowly misses pictures, and of what is in no
-    slot what is more than `MAX_WAITING` messages old.
+    """Send what waits for a page, the newest of each slot, and no more before it has read that: it answers a ping.
+
+    Else what a slow page has not read fills the buffers of the sockets, megabytes of pictures: it would show what is
+    long past, and answer too late whether it is there, for which its goal would end. It misses pictures instead. Of what is in
+    no slot it misses what is more than `MAX_WAITING` messages old.
     """
     try:
         while True:
             await page.wake.wait()
             page.wake.clear()
-            while page.waiting or page.newest:
-                if page.waiting:
-                    await connection.send(page.waiting.popleft(), text=True)
-                else:
-                    slot = next(iter(page.newest))
-                    data = page.newest.pop(slot)
-                    await connection.send(data, text=not slot.startswith("picture "))
+            while page.waiting:
+                await connection.send(page.waiting.popleft(), text=True)
+            newest, page.newest = page.newest, {}
+            for slot, data in newest.items():
+                await connection.send(data, text=not slot.startswith("picture "))
+            await (await connection.ping())
     except ConnectionClosed:
         return
+
+
+def _gone(connection: ServerConnection) -> bytes:
+    """What pages are told of the one that held the arm and is gone."""
+    lost = connection.close_code == CloseCode.ABNORMAL_CLOSURE
+    how = f"lost its connection, or did not answer for {PING_S:g} s" if lost else "was closed"
+    return msgspec.json.encode(
+        {"notice": f"The page that held the arm {how}: what it had started stops.", "t_wall": time.time()}
+    )
 
 
 def _told(reply: Reply) -> dict[str, Any]:

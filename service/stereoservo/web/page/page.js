@@ -49,6 +49,8 @@ function connect() {
   socket.onclose = () => {
     banner("link", "The page's server does not answer. What it shows is old; stop the arm with `stereoservo stop` or the emergency stop.", true);
     rights = {};
+    state = undefined;
+    $("events").replaceChildren(); // they are all told again
     showRights();
     for (const settle of answers.values()) settle({ ok: false, message: "the page's server does not answer" });
     answers.clear();
@@ -113,7 +115,7 @@ function take(message) {
   else if (message.event) showEvent(message.event);
   else if (message.goal) showPlan(message.goal.plan, `goal ${message.goal.id.slice(0, 8)}`);
   else if ("up" in message) banner("link", message.up ? "" : `The daemon does not answer: ${message.why}`, true);
-  else if (message.notice) banner("answer", message.notice, true);
+  else if (message.notice) showNotice(message);
 }
 
 function showRights() {
@@ -166,13 +168,24 @@ function showInfo(info) {
   redraw();
 }
 
-function showEvent(event) {
-  const item = document.createElement("li");
-  item.value = event.seq;
-  item.textContent = `${new Date(1000 * event.t_wall).toLocaleTimeString()} ${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)} ${event.message}`;
+function list(t_wall, text, attributes = {}) {
+  const item = Object.assign(document.createElement("li"), attributes);
+  item.textContent = `${new Date(1000 * t_wall).toLocaleTimeString()} ${text}`;
   $("events").prepend(item);
   while ($("events").childElementCount > 200) $("events").lastChild.remove();
-  stats.events.push([event.kind, event.id, event.error_px, [event.message, ...event.reasons.map((r) => `${r.code}: ${r.hint}`)].join("\n")]);
+}
+
+function showNotice({ notice, t_wall }) {
+  list(t_wall, notice);
+  if (state) banner("answer", notice, true); // before the first state a page is told the past
+}
+
+function showEvent(event) {
+  const why = [...new Set([event.message, ...event.reasons.map((r) => `${r.code}: ${r.hint}`)])].filter(Boolean).join("\n");
+  const what = `${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)}`;
+  list(event.t_wall, `${what} ${why}`, { value: event.seq });
+  if (state && /_aborted$|_failed$/.test(event.kind)) banner("answer", `${what}: ${why}`, true);
+  stats.events.push([event.kind, event.id, event.error_px, why]);
   const done = event.progress === null ? "" : ` (${Math.round(100 * event.progress)} %)`;
   if (event.kind !== "calibration_report" && /^(calibrat|fit_|check|trial|zeros)/.test(event.kind)) {
     const c = event.calibration;
