@@ -369,8 +369,8 @@ async def _send(connection: ServerConnection, page: Page) -> None:
     """Send what waits for a page, the newest of each slot, and no more before it has read that: it answers a ping.
 
     Else what a slow page has not read fills the buffers of the sockets, megabytes of pictures: it would show what is
-    long past, and answer too late whether it is there, for which its goal would end. It misses pictures instead. Of what is in
-    no slot it misses what is more than `MAX_WAITING` messages old.
+    long past, and answer too late whether it is there, for which its goal would end. It misses pictures instead; and
+    of what is in no slot what is more than `MAX_WAITING` messages old.
     """
     try:
         while True:
