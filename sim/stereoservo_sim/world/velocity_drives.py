@@ -1,4 +1,4 @@
-"""Simulated drives of velocities or positions: ramps, limits, command time-out; interface of the plant that they move."""
+"""Simulated drives of velocities or positions: ramps, limits, time-out; interface of the plant that they move."""
 
 from __future__ import annotations
 
