@@ -163,7 +163,7 @@ class FakeJointDriver(SimulatedArm):
         if _due(self.faults.drop_writes_after, self._writes):
             return asked.copy(), ()
         if self.faults.gain != 1.0:
-            bank.command(now_ns, asked * self.faults.gain)
+            super().send(bank, now_ns, asked * self.faults.gain)
             return asked.copy(), ()
         return super().send(bank, now_ns, asked)
 

@@ -6,6 +6,10 @@ import numpy as np
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
+LEAD_S = 0.1
+"""Time at the largest velocity that an ordered position may be ahead, where the cell file says nothing."""
+LOAD_OFFSET = {"revolute": 0.06, "prismatic": 0.005}
+"""[rad, m] By which a drive may stand off its ordered position under load, where the cell file says nothing."""
 LEARNS_S = 0.2
 """Time constant in which the offset under load follows what a standing joint shows."""
 STANDS_SHARE = 0.02
@@ -42,6 +46,7 @@ class PositionOutput:
         self._period_s = period_s
         self.orders = np.full(len(lead), np.nan)
         self.offsets = np.zeros(len(lead))
+        self._carried = np.zeros(len(lead))
         self._slow = np.full(len(lead), np.nan)
         self._last = np.full(len(lead), np.nan)
         self._load = np.full(len(lead), np.nan)
@@ -81,7 +86,8 @@ class PositionOutput:
         standing = ~moves & (np.abs(positions - self._last) < self._standing * self._period_s)
         self._slow = self._slow + self._period_s / LEARNS_S * (positions - self._slow)
         self._last = positions.copy()
-        self._learn_offsets(positions, standing)
+        pushes = (velocities != 0.0) | (self._pressed != 0.0) | (self._lets_go != 0.0)
+        self._learn_offsets(positions, standing, pushes & ~moves)
         self._release(velocities, positions, standing, moves)
         level = positions + self.offsets
         ahead = np.where(velocities > 0.0, np.maximum(self.orders, level + self._lead), np.inf)
@@ -92,10 +98,17 @@ class PositionOutput:
         self.orders = np.clip(wanted, np.maximum(behind, floor), np.minimum(ahead, ceiling))
         return self.orders
 
-    def _learn_offsets(self, positions: FloatArray, standing: BoolArray) -> None:
+    def _learn_offsets(self, positions: FloatArray, standing: BoolArray, pushes: BoolArray) -> None:
+        """Of joints that stand. What blocks one that ``pushes`` (n,) bears its load, too: its offset is then no farther
+        than ``largest_offset`` from the one that it carried, so that it goes no farther than that when it is freed.
+        """
         error = np.where(standing, self.orders - positions - self.offsets, 0.0)
         learnt = self.offsets + self._period_s / LEARNS_S * error
-        self.offsets = np.clip(learnt, -self._largest_offset, self._largest_offset)
+        self._carried = np.where(pushes, self._carried, self.offsets)
+        low = np.maximum(self._carried, 0.0) - self._largest_offset
+        high = np.minimum(self._carried, 0.0) + self._largest_offset
+        self.offsets = np.where(pushes, np.clip(learnt, low, high), learnt)
+        self.offsets = np.clip(self.offsets, -self._largest_offset, self._largest_offset)
 
     def _release(
         self, velocities: FloatArray, positions: FloatArray, standing: BoolArray, moves: BoolArray

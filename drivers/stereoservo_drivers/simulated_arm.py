@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -21,13 +21,14 @@ from stereoservo.ports.devices import (
 )
 from stereoservo_drivers.kit.auxiliary import AuxiliaryMotion
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
+from stereoservo_drivers.position_output import LEAD_S, LOAD_OFFSET, PositionOutput
 from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, place_of
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
 from stereoservo_sim.world.mechanical_plant import MechanicalPlant
 from stereoservo_sim.world.mechanics import MechanicsOption, chosen_mechanics, column, quantised
 from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.simulated_cell import SimulatedCell
-from stereoservo_sim.world.velocity_drives import DriveBank, Plant
+from stereoservo_sim.world.velocity_drives import DriveBank, Plant, PositionBank
 
 RECORD_EVERY_NS = 3_000_000
 """At least between two samples of the history, so that a plant of 1 kHz does not fill it sooner; cubic between them."""
@@ -42,7 +43,8 @@ class ArmOptions(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True
     simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
     resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept. ``mechanics``: a preset, or
     what is not perfect by joint, see `stereoservo_sim.world.mechanics`; its ``encoder_step`` replaces ``encoder``.
-    ``auxiliary``: joints and outputs beside the arm's, which nothing shows.
+    ``auxiliary``: joints and outputs beside the arm's, which nothing shows. ``drives``: whether its drives take
+    velocities, or positions (`PositionOutput`) and then watch nobody.
     """
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
@@ -53,6 +55,7 @@ class ArmOptions(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True
     history: Annotated[int, Meta(ge=64, le=10_000_000)] = CAPACITY
     mechanics: MechanicsOption = "none"
     auxiliary: tuple[AuxiliarySpec, ...] = ()
+    drives: Literal["velocity", "position"] = "velocity"
 
 
 class SimulatedArm:
@@ -99,6 +102,7 @@ class SimulatedArm:
         self._life = DriverLifecycle(f"joint driver {self.driver!r}")
         self._auxiliary = AuxiliaryMotion(options.auxiliary)
         self._bank: DriveBank | None = None
+        self._output: PositionOutput | None = None
         self._history: TrueJointHistory | None = None
         self._seq = 0
         self._write_seq = 0
@@ -134,13 +138,7 @@ class SimulatedArm:
         plant = self.make_plant(positions)
         if self._mechanics is not None:
             plant = MechanicalPlant(plant, self._mechanics, self._robot)
-        self._bank = DriveBank(
-            self._joints,
-            plant,
-            now_ns=now_ns,
-            step_ns=self.step_ns,
-            timeout_ns=round(self._options.command_timeout_s * 1e9),
-        )
+        self._bank = self._make_bank(plant, now_ns)
         self._record(self._bank)
         self._life.state = LifecycleState.CONFIGURED
 
@@ -196,6 +194,8 @@ class SimulatedArm:
         self.stop_auxiliary()
         if self._bank is not None and self._life.state in (LifecycleState.CONFIGURED, LifecycleState.ACTIVE):
             self._bank.brake(self._context.clock.now_ns())
+            if self._output is not None:
+                self._output.orders = self._bank.set_positions.copy()
             self._record(self._bank)
 
     def deactivate(self) -> None:
@@ -222,6 +222,22 @@ class SimulatedArm:
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         """Send a command to the drives: returns what was sent (n,), and why it differs from what was commanded."""
         return bank.command(now_ns, asked)
+
+    def _make_bank(self, plant: Plant, now_ns: int) -> DriveBank:
+        timeout_ns = round(self._options.command_timeout_s * 1e9)
+        if self._options.drives == "velocity":
+            return DriveBank(self._joints, plant, now_ns=now_ns, step_ns=self.step_ns, timeout_ns=timeout_ns)
+        low, high, fastest = np.array(
+            [(j.position_min, j.position_max, j.velocity_max) for j in self._joints]
+        ).T
+        period_ns = round(1e9 / self._options.rate_hz)
+        largest = np.array([LOAD_OFFSET[joint.kind] for joint in self._joints])
+        output = PositionOutput(LEAD_S * fastest, largest, fastest, period_ns * 1e-9)
+        self._output = output
+        return PositionBank(
+            self._joints, plant, now_ns=now_ns, step_ns=self.step_ns, timeout_ns=timeout_ns, period_ns=period_ns,
+            order=lambda velocities: output.step(velocities, self.encode(plant.readings), low, high),
+        )  # fmt: skip
 
     def _advance(self) -> DriveBank:
         assert self._bank is not None  # configured: the lifecycle was checked

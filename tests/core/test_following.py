@@ -23,10 +23,11 @@ Encoder = Callable[[np.ndarray], np.ndarray]
 
 
 def watched(
-    settings: Any, commands: np.ndarray, readings: np.ndarray, every: int = 1, state: CoreState | None = None
-) -> tuple[Reason | None, int]:
+    settings: Any, commands: np.ndarray, readings: np.ndarray, every: int = 1, state: CoreState | None = None,
+    sent_share: float | None = None,
+) -> tuple[Reason | None, int]:  # fmt: skip
     """What the watch says of joint 1, sent ``commands`` (k,) [rad/s] and read as ``readings`` (k,) in every so many
-    steps, and when. ``state``: what it remembers.
+    steps, and when. ``state``: what it remembers. ``sent_share``: of the commands, that the driver says it has sent.
     """
     state = initial_state(settings) if state is None else state
     room = workspace(settings, None)
@@ -34,7 +35,8 @@ def watched(
         q = np.zeros(len(settings.joint_names))
         q[0] = readings[k - k % every]
         state.block.numbers.last_joints_ns = 1 + k - k % every
-        reason = detect_following_error(state, settings, room, q, DT_S)
+        sent = None if sent_share is None else sent_share * state.block.command
+        reason = detect_following_error(state, settings, room, q, DT_S, sent)
         if reason is not None:
             return reason, k
         state.block.command[:] = np.zeros_like(q)
@@ -121,6 +123,22 @@ def test_a_reading_that_only_flickers_stands_still(bench, noise):
     reason, k = watched(bench.settings, commands, rng.uniform(-noise, noise, len(commands)))
     assert reason is not None
     assert k * DT_S * 0.05 < 0.09
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_a_command_that_the_driver_has_scaled_down_lacks_nothing_of_what_was_sent(bench, share):
+    commands = np.full(1000, 0.8)
+    readings = travelled(share * commands)
+    assert watched(bench.settings, commands, readings)[0] is not None
+    assert watched(bench.settings, commands, readings, sent_share=share) == (None, len(commands))
+
+
+def test_a_joint_that_is_blocked_is_found_by_what_was_sent(bench):
+    commands = np.full(1000, 0.8)
+    stands = np.minimum(travelled(0.4 * commands), 0.1)
+    reason, at = watched(bench.settings, commands, stands, sent_share=0.4)
+    assert reason is not None
+    assert reason.value <= 0.4 * 0.8 * at * DT_S - 0.1 + 1e-9  # no more than it was sent, less what it went
 
 
 def on_a_rail(settings: Any) -> Any:

@@ -103,7 +103,10 @@ def test_a_velocity_beyond_the_drives_limit_is_told(cell: Cell) -> None:
     cell.driver.write_velocity(beyond)
     cell.run(0.002)
     cell.driver.read_state()
-    assert cell.driver.write_velocity(0.0 * beyond).reasons == ("drive_velocity_limit",)
+    report = cell.driver.write_velocity(beyond)  # and what was sent in its place
+    assert report.reasons == ("drive_velocity_limit",)
+    np.testing.assert_array_equal(report.sent, 0.1 * beyond)
+    np.testing.assert_array_equal(cell.driver.write_velocity(0.0 * beyond).sent, 0.0 * beyond)
 
 
 @pytest.mark.parametrize("call", ["read", "write"])

@@ -115,6 +115,14 @@ class StubArm:
         self.calls.append("close")
 
 
+class SlowArm(StubArm):
+    """Whose robot goes at a tenth of what it is told, and says so."""
+
+    def write_velocity(self, qd: FloatArray) -> CommandReport:
+        super().write_velocity(0.1 * qd)
+        return CommandReport(self.seq, self.clock.now_ns(), qd, 0.1 * qd, ("robot_limit",))
+
+
 class GrippingArm(StubArm):
     """With a gripper beside the joints."""
 
@@ -232,6 +240,27 @@ def test_a_request_is_answered_and_moves_the_arm(bench: Bench) -> None:
     assert bench.arm.positions[0] > 0.0
     bench.run(25)
     assert bench.state().differences == ("capped",)
+
+
+def test_an_arm_that_was_sent_less_than_commanded_is_not_taken_for_a_lagging_joint(tmp_path: Path) -> None:
+    """It ended as a fault, with a travel that the joint was never sent; the true reason is told, and recorded."""
+    bench = Bench(tmp_path, arm=SlowArm)
+    bench.connect()
+    bench.process.configure()
+    bench.run(5)
+    enabled(bench)
+    ring = RingReader(bench.directories.steps_ring)
+    ring.attach()
+    jog(bench, round(2.0 * RATE_HZ))
+    bench.run(25)
+    assert bench.arm.positions[0] > 0.02
+    assert bench.state().differences == ("robot_limit",)
+    assert bench.state().driver_active
+    steps = [unpack_step_message(data) for data in ring.read(1000)]
+    inputs = [decode_step(step.data).inputs for step in steps if isinstance(step, RecordedStep)]
+    told = [one.sent for one in inputs if one.sent is not None]
+    assert any(sent[0] == pytest.approx(0.05) for sent in told)
+    bench.links.close()
 
 
 def test_a_sample_that_is_stamped_while_it_is_read_is_not_of_the_future(bench: Bench) -> None:

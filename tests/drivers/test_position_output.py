@@ -67,6 +67,20 @@ def test_a_joint_that_is_blocked_is_pressed_no_harder_than_lead_and_offset_allow
     assert float(order[0]) == pytest.approx(0.09)
 
 
+@pytest.mark.parametrize("sag", [0.0, np.radians(2.5), -np.radians(2.5)])
+@pytest.mark.parametrize("blocked_s", [0.3, 5.0])
+def test_a_joint_that_is_freed_when_orders_have_ended_goes_no_further_than_lead_and_offset(sag, blocked_s):
+    """What blocks a joint that its load pulls along bears that load: it went 0.2 rad, and not 0.16."""
+    servo = Servo(output(), sag)
+    servo.run(3.0)
+    servo.run(0.5, 0.4)
+    for _ in range(round(blocked_s / PERIOD)):
+        order = servo.output.step(np.array([0.4]), np.array([servo.position]), *LIMITS)
+    servo.order, at = float(order[0]), servo.position
+    servo.run(2.0, None)
+    assert 0.08 < servo.position - at <= 0.16 + 1e-3
+
+
 @pytest.mark.parametrize("sag", [0.0, np.radians(2.5)])
 @pytest.mark.parametrize("then", [-0.05, 0.0], ids=["reversed", "stopped"])
 @pytest.mark.parametrize("blocked_s", [0.5, 5.0])

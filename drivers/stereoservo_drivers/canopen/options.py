@@ -10,6 +10,7 @@ from msgspec import Meta
 
 from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.ports.devices import JointSpec
+from stereoservo_drivers.position_output import LEAD_S, LOAD_OFFSET
 
 Positive = Annotated[float, Meta(gt=0)]
 NodeId = Annotated[int, Meta(ge=1, le=126)]
@@ -17,10 +18,6 @@ Feedback = Literal["velocity", "effort", "following_error", "switches"]
 CommandMode = Literal["csv", "pv", "csp", "ip"]
 Missing = Literal["watch"]
 POSITION_MODES = ("csp", "ip")
-LEAD_S = 0.1
-"""Time at the largest velocity that an ordered position may be ahead, where the cell file says nothing."""
-LOAD_OFFSET = {"revolute": 0.06, "prismatic": 0.005}
-"""[rad, m] By which a drive may stand off its ordered position under load, where the cell file says nothing."""
 
 
 class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -41,7 +41,8 @@ class StepInputs(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     the kernels that work with a model are not loaded yet (the first start on a computer); a model waits for them.
 
     ``driver_active``: what the servo process did with the driver (it owns enable and disable); the core's lifecycle
-    follows ``driver_active`` and asks for transitions through ``StepOutputs.driver_request``.
+    follows ``driver_active`` and asks for transitions through ``StepOutputs.driver_request``. ``sent``: velocities (n,)
+    that it sent to the drives in place of the last step's command; None: that command.
     """
 
     now_ns: int
@@ -56,6 +57,7 @@ class StepInputs(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     driver_fault: DriverFault | None = None
     parameter_epoch: int = 0
     compiling: bool = False
+    sent: FloatArray | None = None
 
 
 EventKind = Literal[

@@ -286,17 +286,21 @@ FOLLOWS, LACKS, SILENT = range(3)
 
 
 def detect_following_error(
-    state: CoreState, settings: CoreSettings, room: Workspace, q: FloatArray, dt_s: float
-) -> Reason | None:
+    state: CoreState, settings: CoreSettings, room: Workspace, q: FloatArray, dt_s: float,
+    sent: FloatArray | None = None,
+) -> Reason | None:  # fmt: skip
     """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
 
-    The block's command is still that of the last step. A joint's missing travel is its commanded minus its measured
-    one, forgotten over ``MEMORY_S``; it may reach ``LAG_S`` at full speed, beside what its drive's delay explains. What
-    is sent to a joint whose reading does not change at all is not forgotten, so that a slow command to a stuck encoder
-    ends, too. Without a new joint sample nothing is concluded: stale samples are the safety stage's affair.
+    The block's command is still that of the last step; ``sent`` (n,), if any: what the driver made of it, which counts.
+    A joint's missing travel is its commanded minus its measured one, forgotten over ``MEMORY_S``; it may reach
+    ``LAG_S`` at full speed, beside what its drive's delay explains. What is sent to a joint whose reading stands still
+    is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new sample nothing is concluded.
     """
-    block, numbers = state.block, room.numbers
+    block, numbers, commanded = state.block, room.numbers, state.block.command
+    if sent is not None and sent.shape == q.shape and np.isfinite(sent).all():
+        commanded, block.command[:] = commanded.copy(), sent
     found = account_following(block.record, room.record, q, dt_s)
+    block.command[:] = commanded
     if found == FOLLOWS:
         return None
     joint = numbers.worst
@@ -408,7 +412,7 @@ def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     if not context.settings.watch_following or state.block.numbers.history_count == 0:
         return ()
     room, elapsed_s = context.derived.room, context.ingested.elapsed_s
-    reason = detect_following_error(state, context.settings, room, context.q, elapsed_s)
+    reason = detect_following_error(state, context.settings, room, context.q, elapsed_s, context.inputs.sent)
     if state.lifecycle != Lifecycle.ACTIVE:
         state.block.numbers.silence_known = 0  # what was sent before is no matter of what is sent next
         return ()  # an arm that is off may be moved by hand

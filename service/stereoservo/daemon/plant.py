@@ -109,9 +109,11 @@ class PlantProcess:
                 self._beat(DRIVER_CALL_S)
                 self._change(active=orders.active)
             if orders.velocity_number != done.velocity_number and orders.active:
-                reasons = self.driver.write_velocity(orders.velocities).reasons
-                if reasons != self._remarks.reasons:
-                    self._remarks = Remarks(reasons=reasons)
+                report = self.driver.write_velocity(orders.velocities)
+                differs = not np.array_equal(report.sent, orders.velocities)
+                sent = tuple(report.sent.tolist()) if differs else ()
+                if (report.reasons, sent) != (self._remarks.reasons, self._remarks.sent):
+                    self._remarks = Remarks(reasons=report.reasons, sent=sent)
             if orders.auxiliary_number != done.auxiliary_number and self._auxiliary is not None:
                 values = dict(zip(self._names, orders.auxiliary.tolist(), strict=True))
                 asked = {name: value for name, value in values.items() if value == value}
@@ -155,7 +157,9 @@ class PlantProcess:
             yield
         except DriverError as error:
             self.driver.stop()
-            self._remarks = Remarks(error.code, str(error), error.retry, self._remarks.reasons)
+            self._remarks = Remarks(
+                error.code, str(error), error.retry, self._remarks.reasons, self._remarks.sent
+            )
             self._state = self._state._replace(failures=self._state.failures + 1)
             self._read_ns = self._clock.now_ns() + FAILED_READ_EVERY_NS
 

@@ -75,12 +75,15 @@ class Orders(NamedTuple):
 
 
 class Remarks(msgspec.Struct, frozen=True, array_like=True):
-    """Texts of a plant's state: its last failure, and why the last velocities were not sent as they were ordered."""
+    """Of a plant's state: its last failure, and why the last velocities were not sent as they were ordered, but as
+    ``sent``; empty: they were.
+    """
 
     code: str = ""
     message: str = ""
     retry: bool = False
     reasons: tuple[str, ...] = ()
+    sent: tuple[float, ...] = ()
 
 
 class PlantState(NamedTuple):
@@ -228,7 +231,7 @@ class PlantDriver:
         return state.sample()
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
-        """Order velocities (n,); the report's reasons are those of the order before. Raises DriverError."""
+        """Order velocities (n,); what was sent, and why, is of the order before. Raises DriverError."""
         orders = self._orders
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != orders.velocities.shape or not np.all(np.isfinite(asked)):
@@ -238,9 +241,9 @@ class PlantDriver:
             )
         self._raise_failure(self._state_of_session())
         self._send(velocities=asked, velocity_number=orders.velocity_number + 1)
-        return CommandReport(
-            self._orders.velocity_number, self._clock.now_ns(), asked, asked, self._remarks.reasons
-        )
+        remarks = self._remarks
+        sent = np.array(remarks.sent) if remarks.sent and asked.any() else asked
+        return CommandReport(self._orders.velocity_number, self._clock.now_ns(), asked, sent, remarks.reasons)
 
     def stop(self) -> None:
         """Order the drives to brake. Any state; never raises."""

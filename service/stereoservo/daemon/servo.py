@@ -38,6 +38,7 @@ from stereoservo.messages.directories import DirectoryError
 from stereoservo.messages.goals import Hold, OrderAuxiliary, Request
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path
 from stereoservo.messages.servo_state import LoopStatistics
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import AuxiliaryDriver, Clock, DriverError, JointDriver, JointState
@@ -96,6 +97,7 @@ class ServoProcess:
         self._silent = False
         self._moving = False
         self._differences: tuple[str, ...] = ()
+        self._sent: FloatArray | None = None
         self._state_every = max(1, round(rate_hz / STATE_RATE_HZ))
         self._statistics_every = max(1, round(rate_hz * STATISTICS_EVERY_S))
         self._cycles = 0
@@ -146,6 +148,7 @@ class ServoProcess:
             return None
 
     def _write(self, outputs: StepOutputs, now_ns: int) -> None:
+        self._sent = None
         if outputs.command is None or not self._active or self._dry_run:
             return
         try:
@@ -154,6 +157,8 @@ class ServoProcess:
             self._latch_fault(error, now_ns)
             return
         self._differences = report.reasons
+        if not np.array_equal(report.sent, outputs.command):
+            self._sent = np.array(report.sent, dtype=np.float64)
 
     def _order_auxiliary(self, inputs: StepInputs, outputs: StepOutputs, now_ns: int) -> None:
         """Hand orders of auxiliary joints, which the core has accepted, to the driver; a stop stops them, too."""
@@ -256,6 +261,7 @@ class ServoProcess:
             driver_active=self._active,
             driver_fault=self._fault,
             compiling=self._kernels is not None,
+            sent=self._sent,
         )
         self._stream.before(self._links.step_recorder(), self.core, now_ns)
         outputs = self.core.step(inputs)

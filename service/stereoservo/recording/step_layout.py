@@ -3,7 +3,8 @@ nothing is encoded and records of a kind can be compared word by word.
 
 A record is a multiple of 8 bytes, little-endian: the head (``HEAD``); the velocity before and after the safety stage;
 of joints stamps, positions, velocities, efforts, following errors; of each observation a head, the camera's name, ids,
-pixels, covariances. What is rare (requests, a model, a fault of the driver, samples of other types) follows in msgpack.
+pixels, covariances. What is rare (requests, a model, a fault of the driver, what it sent in place of a command, samples
+of other types) follows in msgpack.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class StepEncoder:
         usual = not seen or _add_sights(parts, seen, inputs.now_ns)
         mark = zlib.crc32("\0".join([one.camera for one in seen]).encode()) & 0xFFFF if seen else 0
         rest = b""
-        rare = inputs.requests or inputs.model_update or inputs.driver_fault
+        rare = inputs.requests or inputs.model_update or inputs.driver_fault or inputs.sent is not None
         if rare or not usual or (joints is not None and not n):
             rest = _rest(inputs, joints=n == 0, observations=not usual)
             parts.append(rest)

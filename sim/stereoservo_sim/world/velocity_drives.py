@@ -1,7 +1,8 @@
-"""Simulated velocity drives: ramps, limits, command time-out; interface of the plant that they move."""
+"""Simulated drives of velocities or positions: ramps, limits, time-out; interface of the plant that they move."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -163,7 +164,7 @@ class DriveBank:
             if self.t_ns >= self._deadline_ns and np.any(self._target):
                 self._target = np.zeros_like(self._target)
                 self.timed_out = True
-            if not np.any(self._target) and not np.any(self._v):
+            if self._stands():
                 left_ns = (now_ns - self.t_ns) // self._step_ns * self._step_ns
                 if self.plant.rest(left_ns * 1e-9):
                     self.t_ns += left_ns
@@ -174,10 +175,60 @@ class DriveBank:
                 end = now_ns if self.t_ns >= self._deadline_ns else min(now_ns, self._deadline_ns)
                 steps = max((end - self.t_ns) // self._step_ns, 1)
             h = steps * self._step_ns * 1e-9
-            self._q, self._v = ramp(self._q, self._v, self._target, self._acceleration, h)
-            stopped = (self._q < self._low) | (self._q > self._high)
-            if np.any(stopped):  # the mechanical end stop
-                self._q = np.clip(self._q, self._low, self._high)
-                self._v = np.where(stopped, 0.0, self._v)
+            self._q, self._v = self._course(h)
             self.plant.follow(self._q, self._v, h)
             self.t_ns += steps * self._step_ns
+
+    def _stands(self) -> bool:
+        """Whether the set-points are at rest."""
+        return not np.any(self._target) and not np.any(self._v)
+
+    def _course(self, h: float) -> tuple[FloatArray, FloatArray]:
+        """Set-points and their velocities (n,) after ``h`` [s]."""
+        q, v = ramp(self._q, self._v, self._target, self._acceleration, h)
+        stopped = (q < self._low) | (q > self._high)
+        if np.any(stopped):  # the mechanical end stop
+            q, v = np.clip(q, self._low, self._high), np.where(stopped, 0.0, v)
+        return q, v
+
+
+class PositionBank(DriveBank):
+    """Position drives of all joints: set-points go to the newest orders within ``period_ns``, no faster than a joint
+    can, and stay there when no more come: these drives watch nobody.
+
+    ``order``: positions (n,) to order for commanded velocities (n,), asked once a period.
+    """
+
+    def __init__(
+        self, joints: tuple[JointSpec, ...], plant: Plant, *, now_ns: int, step_ns: int, timeout_ns: int,
+        period_ns: int, order: Callable[[FloatArray], FloatArray],
+    ) -> None:  # fmt: skip
+        super().__init__(joints, plant, now_ns=now_ns, step_ns=step_ns, timeout_ns=timeout_ns)
+        self._period_ns, self._order = period_ns, order
+        self._due_ns = now_ns
+        self._orders, self._speed = self._q.copy(), np.zeros_like(self._q)
+
+    def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+        """As of velocity drives: what is sent (n,) is what the orders are led by."""
+        self.advance(t_ns)
+        sent = np.clip(velocities, -self._velocity, self._velocity)
+        if t_ns - self._due_ns > self._timeout_ns:  # nothing was commanded meanwhile
+            self._due_ns = t_ns
+        while self._due_ns <= t_ns:
+            self._due_ns += self._period_ns
+            self._orders = self._order(sent).copy()
+            gap = np.abs(self._orders - self._q)
+            self._speed = np.minimum(gap / (self._period_ns * 1e-9), self._velocity)
+        return sent, () if np.array_equal(sent, velocities) else ("drive_velocity_limit",)
+
+    def brake(self, t_ns: int) -> None:
+        """Stay at the set-points of ``t_ns``."""
+        self.advance(t_ns)
+        self._orders = self._q.copy()
+
+    def _stands(self) -> bool:
+        return np.array_equal(self._q, self._orders)
+
+    def _course(self, h: float) -> tuple[FloatArray, FloatArray]:
+        step = np.clip(self._orders - self._q, -self._speed * h, self._speed * h)
+        return self._q + step, step / h

@@ -159,6 +159,26 @@ def test_gears_that_ripple(tmp_path: Path, amplitude: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(TIMEOUT_S)
+def test_drives_that_take_positions_with_sag_and_play(tmp_path: Path) -> None:
+    """2.5° of sag and 1° of play before the encoders, as docs/simulation.md states them."""
+    servo = (
+        '{ sag = 0.0436, play = 0.01745, encoder_side = "joint", encoder_step = 0.001534, dead_band = 0.001534, '
+        "lag_s = 0.02, delay_s = 0.005 }"
+    )
+    lines = [f"mechanics.j{j + 1} = {servo}\n" for j in range(6)]
+    path = tmp_path / "demo.toml"
+    text = CELL_FILES["demo"].read_text()
+    path.write_text(
+        text.replace("[joints.options]\n", '[joints.options]\ndrives = "position"\n' + "".join(lines))
+    )
+    result = run_demo(tmp_path / "out", "--lockstep", "--cell", str(path))
+    assert [goal["outcome"] for goal in result["goals"]] == ["reached"] * 3
+    assert max(goal["final_error_px"] for goal in result["goals"]) <= 0.1
+    assert result["replay"]["identical"] is True
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
 @pytest.mark.parametrize("name", ["strain_wave", "planetary_qdd", "serial_servo"])
 def test_joints_as_they_are(tmp_path: Path, name: str) -> None:
     """Coarse encoders never arrived. The way there leaves its line by the play; its end does not."""
