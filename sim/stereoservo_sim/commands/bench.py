@@ -48,9 +48,15 @@ def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
 
 
 def _loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.loop import run_loop
+    from stereoservo_sim.benchmarks.live_loop.loop import run_loop
 
     return run_loop(repetitions, seed, progress)
+
+
+def _page(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.live_loop.page import run_page
+
+    return run_page(repetitions, seed, progress)
 
 
 def _recording(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
@@ -103,6 +109,7 @@ BENCHES: dict[str, Bench] = {
     "features": _features,
     "kills": _kills,
     "loop": _loop,
+    "page": _page,
     "recording": _recording,
     "scale": _scale,
     "soak": _soak,
@@ -120,8 +127,8 @@ def bench(
         typer.Option(
             min=1,
             help="Timed fits of `calibration`, trials of each of `faults`, ten of `kills`, two virtual minutes of "
-            "`soak`, two real ones of `soak-live`, commands of `startup`, pairs of segments of `loop`; the others "
-            "take a multiple.",
+            "`soak`, two real ones of `soak-live`, commands of `startup`, pairs of segments of `loop` and `page`; the "
+            "others take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,13 +95,30 @@ def _of_daemon(
     folder: Path, rate_hz: int, priority: int, repetitions: int, seed: int
 ) -> list[dict[str, Any]]:
     """The rows of one daemon: all loads."""
+    with moving_cell(folder, rate_hz, priority, seed) as cell:
+        rows = []
+        for load, beside in LOADS.items():
+            with _running(beside):
+                row = _measured(folder, cell.cycles, rate_hz, priority, repetitions)
+            rows.append({"rate_hz": rate_hz, "scheduler": cell.scheduler, "load": load, **row})
+        for row in rows:
+            row["interruptions"] = cell.motion.interruptions
+        return rows
+
+
+@contextmanager
+def moving_cell(folder: Path, rate_hz: int, priority: int, seed: int) -> Iterator[MovingCell]:
+    """The demonstration's cell as processes, whose arm goes to a goal in the images and away from it.
+
+    Raises ExperimentError where the daemon does not come up.
+    """
     path, log = folder / "loop.toml", folder / "daemon.log"
     text = shipped_cell_path("demo").read_text(encoding="utf-8")
     text = text.replace("rate_hz = 250.0", f"rate_hz = {rate_hz}.0\npriority = {priority}")
     path.write_text(
         text.replace("[joints.options]", f"[joints.options]\nrate_hz = {rate_hz}.0"), encoding="utf-8"
     )
-    cycles = _new_log(folder / "live.cycles")
+    cycles = new_log(folder / "live.cycles")
     variables = {RUNTIME_VARIABLE: str(folder / "r"), STATE_VARIABLE: str(folder / "s")}
     try:
         with environment(variables), ExitStack() as ending:
@@ -114,15 +131,7 @@ def _of_daemon(
             ending.enter_context(DaemonProcess(path, log=log, environment=environ)).wait_ready()
             servo = processes_of(directories.runtime)["servo"]
             scheduler = "fifo" if os.sched_getscheduler(servo) & os.SCHED_FIFO else "ordinary"
-            motion = ending.enter_context(_moving())
-            rows = []
-            for load, beside in LOADS.items():
-                with _running(beside):
-                    row = _measured(folder, cycles, rate_hz, priority, repetitions)
-                rows.append({"rate_hz": rate_hz, "scheduler": scheduler, "load": load, **row})
-            for row in rows:
-                row["interruptions"] = motion.interruptions
-            return rows
+            yield MovingCell(cycles, scheduler, ending.enter_context(_moving()))
     except (ClientError, DaemonError) as error:
         raise ExperimentError("loop", f"{error}; {log.read_text()[-2000:]}") from error
 
@@ -135,9 +144,9 @@ def _measured(folder: Path, live_log: Path, rate_hz: int, priority: int, repetit
         begin_ns = time.monotonic_ns()
         time.sleep(SEGMENT_S)
         end_ns = time.monotonic_ns()
-        rows = _cycles(live_log)
+        rows = cycles_of(live_log)
         live.append(rows[(rows[:, 0] > begin_ns) & (rows[:, 0] < end_ns)])
-        log = _new_log(folder / "empty.cycles")
+        log = new_log(folder / "empty.cycles")
         program = [
             sys.executable,
             "-c",
@@ -147,19 +156,19 @@ def _measured(folder: Path, live_log: Path, rate_hz: int, priority: int, repetit
             str(round(SEGMENT_S * rate_hz)),
         ]
         subprocess.run(program, env={**os.environ, CYCLE_LOG_VARIABLE: str(log)}, check=True)
-        empty.append(_cycles(log))
+        empty.append(cycles_of(log))
     figures = {"live": _figures(np.concatenate(live)), "empty": _figures(np.concatenate(empty))}
     excess = figures["live"]["overrun_share"] - figures["empty"]["overrun_share"]
     return {**figures, "excess_overruns": excess, "stolen_share": stolen_share(before, stolen_ticks())}
 
 
-def _new_log(path: Path) -> Path:
+def new_log(path: Path) -> Path:
     """A log of cycles without any; real zeros, so that no cycle waits for the file system."""
     path.write_bytes(bytes((CYCLES + 1) * CYCLE_BYTES))
     return path
 
 
-def _cycles(path: Path) -> IntArray:
+def cycles_of(path: Path) -> IntArray:
     """The cycles (k, 4) of a log: when they woke, how late, the work before [ns], slots skipped; not the first one."""
     rows = np.fromfile(path, dtype=np.int64).reshape(-1, CYCLE_BYTES // 8)
     return np.array(rows[2 : rows[0, 0] + 1])
@@ -181,6 +190,14 @@ def _quantiles(samples: IntArray) -> dict[str, float]:
     p50, p99, p999 = np.percentile(samples, (50.0, 99.0, 99.9)) * 1e-3
     found = {"p50": p50, "p99": p99, "p99.9": p999, "max": samples.max() * 1e-3}
     return {name: round(float(value), 1) for name, value in found.items()}
+
+
+class MovingCell(NamedTuple):
+    """A running cell: the log of its loop's cycles, the scheduler that it got, and its motion."""
+
+    cycles: Path
+    scheduler: str
+    motion: _Motion
 
 
 class _Motion:
