@@ -51,7 +51,7 @@ def encode_state(state: CoreState) -> bytes:
 
 
 def decode_state(data: bytes) -> CoreState:
-    """Inverse of :func:`encode_state`. Raises msgspec.MsgspecError, StateVersionError."""
+    """Inverse of :func:`encode_state`. Raises StateVersionError, and anything on damaged bytes."""
     # Asked first: a state of another version may hold other fields, too.
     version = msgspec.msgpack.decode(data, type=_Versioned).version
     if not OLDEST_VERSION <= version <= STATE_VERSION:

@@ -35,7 +35,8 @@ def rounded(observation: CameraObservation) -> CameraObservation:
     number's bits, and every one of them is recorded.
 
     Pixels in steps of ``PIXEL_STEP``. Variances upwards by a 32nd at most, correlations towards zero by a 16th at most,
-    so that a covariance stays one, and states no less noise.
+    so that a covariance stays one, and neither its variances nor its determinant are less. Along the long axis of a
+    slanted ellipse the variance may be less, by a 32nd at most.
     """
     covariances = observation.covariances.copy()
     variances = covariances[:, (0, 1), (0, 1)]

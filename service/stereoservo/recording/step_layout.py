@@ -88,7 +88,7 @@ class OutputsChecksum:
         if None in numbers:
             numbers = [ABSENT if value is None else value for value in numbers]
         parts: list[Any] = [outputs.command, *_arrays(status), struct.pack(f"<{len(numbers)}d", *numbers)]
-        if outputs.command is None or status.efforts is None or status.effort_limits is None:
+        if any(part is None for part in parts):
             parts = [_NONE if part is None else part for part in parts]
         for prior in outputs.priors:
             parts += (prior.camera.encode(), prior.ids, prior.pixels, prior.velocities, prior.covariances)
