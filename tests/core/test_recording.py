@@ -387,3 +387,14 @@ def test_the_checksum_sees_every_bit_of_the_outputs(bench: Any) -> None:
         assert outputs_crc(changed) != known, name
     assert outputs_crc(msgspec.structs.replace(outputs, driver_request="reset")) != known
     assert outputs_crc(msgspec.structs.replace(outputs, command=None)) != known
+
+
+@pytest.mark.parametrize("told", range(16))
+def test_loads_that_drives_do_not_tell_are_no_zeros(bench: Any, told: int) -> None:
+    names = ("efforts", "following_errors", "effort_limits", "following_limits")
+    outputs = bench.ready().step()
+    given = {name: np.zeros(6) if told >> k & 1 else None for k, name in enumerate(names)}
+    fewer = msgspec.structs.replace(outputs, status=msgspec.structs.replace(outputs.status, **given))
+    all_told = msgspec.structs.replace(outputs.status, **dict.fromkeys(names, np.zeros(6)))
+    whole = msgspec.structs.replace(outputs, status=all_told)
+    assert (outputs_crc(fewer) == outputs_crc(whole)) == (told == 15)
