@@ -224,7 +224,7 @@ def test_looking_around_with_a_wildcard_reads_everything_and_stops_nothing(clien
     for reply in client.session.get(f"{client.keys.prefix}/**", timeout=2.0):
         if reply.ok is not None:
             found[str(reply.ok.key_expr)] = reply.ok.payload.to_bytes()
-    assert set(found) == {client.keys.state, client.keys.info, client.keys.event}
+    assert set(found) == {client.keys.state, client.keys.info, client.keys.event, client.keys.model}
     client.session.put(f"{client.keys.prefix}/command/*", b"{}")
     assert client.goal({"j1": client.status().joints["j1"]}).reached(30.0)
     assert not {"STOPPED", "HELD"} & {reason.code for reason in client.status().reasons}
