@@ -1,5 +1,6 @@
 """An installation without extras: client and remote verbs run, the others name the extra that they need."""
 
+import importlib.abc
 import json
 import re
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 
 from stereoservo.cli import dispatch
 from stereoservo.ports import plugins
+from stereoservo_sim.world.physics import PhysicsError, import_pybullet
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -107,10 +109,16 @@ def test_verbs_that_need_an_extra_name_it(extra: str, tmp_path: Path) -> None:
         assert "Traceback" not in err
 
 
-def test_a_simulated_cell_without_pybullet_says_where_it_runs(tmp_path: Path) -> None:
-    cell = ROOT / "deploy/cells/demo.toml"
-    [(code, out, err)] = answers([["demo", "--lockstep", "--cell", str(cell), "--json"]], tmp_path, "sim")
-    assert code == 1
-    assert "pip install 'stereoservo[sim]'" in json.loads(out)["error"]["message"]
-    assert "Linux x86_64" in err
-    assert "Traceback" not in err
+class WithoutPybullet(importlib.abc.MetaPathFinder):
+    """Finds that pybullet is not installed."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
+        if name == "pybullet":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+def test_a_simulated_cell_without_pybullet_says_where_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "pybullet", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [WithoutPybullet(), *sys.meta_path])
+    with pytest.raises(PhysicsError, match=r"pip install 'stereoservo\[sim\]' on Python 3.11, Linux x86_64"):
+        import_pybullet()
