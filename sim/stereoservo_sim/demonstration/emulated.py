@@ -60,7 +60,7 @@ def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Pa
     tree = tomllib.loads(text)
     emulated = "drives" in tree.get("emulate", {})
     driver = tree["joints"]["driver"]
-    if not emulated and driver not in ("fake", "pybullet"):
+    if not emulated and driver not in ("fake", "pybullet", "twist"):
         raise ValueError(
             f"{cell_path}: joints.driver is {driver!r}; only simulated arms have a choice of mechanics"
         )
