@@ -25,9 +25,9 @@ from stereoservo.messages.recording_request import images_directory
 from stereoservo.ports.image_files import ImageReader
 from stereoservo.recording.flight_recorder import FORMAT
 from stereoservo.recording.foxglove_channels import (
-    CellStatus,
     MetricScene,
     Published,
+    cell_status,
     joints,
     log,
     markers_seen,
@@ -111,24 +111,6 @@ class FlightChannels:
         self._scene_ns = now_ns
         yield self._scene.transforms(now_ns + self.shift_ns)
         yield self._scene.update(now_ns + self.shift_ns, status.positions)
-
-
-def cell_status(status: Status) -> CellStatus:
-    """What of a step's status is plotted."""
-    return CellStatus(
-        lifecycle=status.lifecycle,
-        source=status.source,
-        goal=status.goal,
-        law=status.law,
-        level=status.level,
-        reasons=tuple(reason.code for reason in status.reasons),
-        error_px=status.error_px,
-        progress=status.progress,
-        seconds_left=status.seconds_left,
-        task_error=tuple(float(value) for value in status.task_error),
-        innovation_px=status.innovation_px,
-        visible=status.visible,
-    )
 
 
 class _File:

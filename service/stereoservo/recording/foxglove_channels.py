@@ -38,11 +38,13 @@ from foxglove.messages import (
 )
 from scipy.spatial.transform import Rotation
 
+from stereoservo.core.cycle import Status
 from stereoservo.geometry.strata import upper_triangular
 from stereoservo.kinematics.axes import euclidean_centres, joint_axes, stratum_frame
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.reasons import Reason
+from stereoservo.messages.wire import StateMessage
 from stereoservo.numerics.arrays import FloatArray
 
 CELL_FRAME = "cell"
@@ -70,6 +72,24 @@ class CellStatus(msgspec.Struct, frozen=True):
     task_error: tuple[float, ...]
     innovation_px: dict[str, float]
     visible: dict[str, int]
+
+
+def cell_status(status: Status | StateMessage) -> CellStatus:
+    """What of a step's status, or of a live cell's state, is plotted."""
+    return CellStatus(
+        lifecycle=status.lifecycle,
+        source=status.source,
+        goal=status.goal,
+        law=status.law,
+        level=status.level,
+        reasons=tuple(reason.code for reason in status.reasons),
+        error_px=status.error_px,
+        progress=status.progress,
+        seconds_left=status.seconds_left,
+        task_error=tuple(float(value) for value in status.task_error),
+        innovation_px=status.innovation_px,
+        visible=status.visible,
+    )
 
 
 class Published(NamedTuple):

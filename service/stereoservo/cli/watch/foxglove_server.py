@@ -10,8 +10,8 @@ import numpy as np
 
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 from stereoservo.recording.foxglove_channels import (
-    CellStatus,
     Published,
+    cell_status,
     joints,
     log,
     markers_seen,
@@ -81,25 +81,11 @@ def state_channels(state: StateMessage, t_ns: int) -> list[Published]:
     """Joints, command and status of a live cell."""
     names = list(state.joints)
     efforts = [state.efforts[name] for name in names] if len(state.efforts) == len(names) else None
-    status = CellStatus(
-        lifecycle=state.lifecycle,
-        source=state.source,
-        goal=state.goal,
-        law=state.law,
-        level=state.level,
-        reasons=tuple(reason.code for reason in state.reasons),
-        error_px=state.error_px,
-        progress=state.progress,
-        seconds_left=state.seconds_left,
-        task_error=state.task_error,
-        innovation_px=state.innovation_px,
-        visible=state.visible,
-    )
     return [
         joints(
             "/joints", t_ns, names, positions=list(state.joints.values()),
             velocities=[state.velocities[name] for name in names], efforts=efforts,
         ),
         joints("/command", t_ns, list(state.command), velocities=list(state.command.values())),
-        Published("/status", t_ns, status),
+        Published("/status", t_ns, cell_status(state)),
     ]  # fmt: skip
