@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -111,13 +112,20 @@ def calibrated(cell_file: Path, roots: Path) -> Path:
     return cell_file
 
 
-@pytest.fixture
-def kept_state(calibrated: Path, directories: CellDirectories, tmp_path: Path) -> Iterator[None]:
-    """Puts the calibrated cell's state back after a test that changes its model. To be the first argument."""
-    saved = shutil.copytree(directories.state, tmp_path / "state")
+@contextmanager
+def as_before(directories: CellDirectories, aside: Path) -> Iterator[None]:
+    """Put the cell's state back, as it was before, when the body ends."""
+    saved = shutil.copytree(directories.state, aside / "state")
     yield
     shutil.rmtree(directories.state)
     shutil.copytree(saved, directories.state)
+
+
+@pytest.fixture
+def kept_state(calibrated: Path, directories: CellDirectories, tmp_path: Path) -> Iterator[None]:
+    """Puts the calibrated cell's state back after a test that changes its model. To be the first argument."""
+    with as_before(directories, tmp_path):
+        yield
 
 
 @pytest.fixture
@@ -141,12 +149,15 @@ def start(
 
 
 @pytest.fixture(scope="module")
-def shared(calibrated: Path, directories: CellDirectories, roots: Path) -> Iterator[DaemonProcess]:
-    """A daemon of the calibrated cell for all tests of a module that leave it alive."""
-    with DaemonProcess(calibrated, log=roots / "shared.log") as daemon:
-        daemon.wait_ready()
-        yield daemon
-    eventually("no process is left", lambda: not processes(directories))
+def shared(
+    calibrated: Path, directories: CellDirectories, roots: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[DaemonProcess]:
+    """A daemon of the calibrated cell for all tests of a module that leave it alive; what they taught goes with it."""
+    with as_before(directories, tmp_path_factory.mktemp("shared")):
+        with DaemonProcess(calibrated, log=roots / "shared.log") as daemon:
+            daemon.wait_ready()
+            yield daemon
+        eventually("no process is left", lambda: not processes(directories))
 
 
 @pytest.fixture
