@@ -278,3 +278,49 @@ def test_goal_beyond_the_joint_limits_is_refused_with_joint_and_place(bench: Any
     assert bench.ended(30.0).kind == "goal_reached"
     assert bench.error_px(goal_q) < 0.3
     assert bench.q[5] < narrow[5]
+
+
+def test_a_goal_is_reached_in_the_posture_that_it_names(bench: Any) -> None:
+    """A spherical wrist turned over has the body where it was: (q4 + pi, -q5, q6 + pi), by the arm's DH rows."""
+    bench.ready()
+    goal_q = bench.q + 0.5 * DISPLACED
+    over = goal_q * (1, 1, 1, 1, -1, 1) + np.array([0, 0, 0, -np.pi, 0, np.pi])
+    np.testing.assert_allclose(bench.truth.points(over), bench.truth.points(goal_q), atol=1e-12)
+    near = {f"j{i + 1}": q + 0.1 for i, q in enumerate(over)}
+    target = FeatureTarget(bench.features(goal_q))
+    reply = bench.reply(bench.goal(target, law="trajectory", posture=near))
+    assert reply.accepted, reply
+    assert reply.plan.way == "straight in the joints"
+    assert bench.ended(60.0).kind == "goal_reached"
+    assert bench.error_px(goal_q) < 0.15
+    np.testing.assert_allclose(np.exp(1j * bench.q), np.exp(1j * over), atol=2e-3)  # up to whole turns
+    # The same images again in the posture of before; joints that are left out stay near.
+    back = {f"j{i + 1}": goal_q[i] for i in (3, 4, 5)}
+    assert bench.reply(bench.goal(target, law="trajectory", posture=back)).accepted
+    assert bench.ended(60.0).kind == "goal_reached"
+    np.testing.assert_allclose(bench.q, goal_q, atol=2e-3)
+
+
+def test_a_posture_that_is_none_of_the_goal_is_refused_before_anything_moves(bench: Any) -> None:
+    bench.ready()
+    goal_q = bench.q + 0.5 * DISPLACED
+    target = FeatureTarget(bench.features(goal_q))
+
+    def refused(target: Target, law: str, **posture: float) -> Any:
+        reply = bench.reply(bench.goal(target, law=law, posture=posture))
+        assert not reply.accepted
+        return reply.reasons[0]
+
+    beside = refused(target, "trajectory", j4=goal_q[3] + 0.9)
+    away = bench.q.copy()
+    away[3] = goal_q[3] + 0.9
+    assert beside.code == "NOT_REACHABLE"
+    apart = bench.truth.pixels(away) - bench.truth.pixels(goal_q)
+    assert beside.value == pytest.approx(np.linalg.norm(apart, axis=-1).max(), rel=0.02)
+    assert "`stereoservo ik`" in beside.hint
+    unplanned = refused(target, "stereo", j4=0.0)
+    assert unplanned.code == "POSTURE_NOT_PLANNED"
+    assert unplanned.hint.endswith("by a law that plans: trajectory")
+    assert refused(JointTarget({"j1": 0.0}), "trajectory", j4=0.0).code == "POSTURE_NOT_PLANNED"
+    assert refused(target, "trajectory", elbow=0.0).code == "NO_SUCH_JOINT"
+    assert np.abs(np.array(bench.commands)).max() == 0.0

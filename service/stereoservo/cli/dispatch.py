@@ -42,6 +42,7 @@ COMMANDS: dict[str, str] = {
     "record": "record:record",
     "replay": "replay:replay",
     "export": "export:export",
+    "ik": "ik:ik",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",
     "init": "init:init",

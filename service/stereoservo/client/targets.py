@@ -28,6 +28,7 @@ class GoalOptions(TypedDict, total=False):
     centre: Centre | None
     cameras: tuple[str, ...] | None
     profile: ProfileName | None
+    posture: dict[str, float] | None
     gain: float | AdaptiveGain | None
     tolerance_px: float | None
     hold_frames: int | None

@@ -161,7 +161,9 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ``lease_s``: the goal is aborted when no renewal arrives for so long (None: no lease). ``tolerance_px``: largest
     pixel distance over visible markers and cameras, held ``hold_frames`` frames. ``speed_scale`` may only lower.
-    ``cameras``: whose images the law may use (None: all). ``profile``: of laws that follow a plan.
+    ``cameras``: whose images the law may use (None: all). ``profile``: of laws that follow a plan; ``posture``
+    likewise: joint positions by name [rad or m] near which the plan ends, where the arm reaches the goal by several
+    postures; joints left out are near to where they are now.
 
     ``blend_px``: hand over to the next queued goal as soon as the error is below it, without stopping; without one it
     is reached as usual. ``acknowledge_s``: reached, the arm holds there and the queue waits until a client
@@ -176,6 +178,7 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     centre: Centre | None = None
     cameras: tuple[str, ...] | None = None
     profile: ProfileName | None = None
+    posture: dict[str, float] | None = None
     gain: Gain | AdaptiveGain | None = None
     tolerance_px: Pixels | None = None
     hold_frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None

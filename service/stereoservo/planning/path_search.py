@@ -8,7 +8,8 @@ towards them, to the right or left and down or up in the images.
 ``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: the arm along it. Where the arm
 cannot follow the path that was asked for, ``UNCONSTRAINED_IK`` follows it once more without limits, which gives the
 joints at the goal, and ``STRAIGHT_IN_JOINTS`` tries the straight line in joint space to these. When all else fails,
-``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these.
+``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these. Where the
+request names a ``posture``, this is the only seed, and the first thing that is tried.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from stereoservo.planning.path_ik import (
     follow_joint_line,
     follow_path,
     joints_from_seed,
+    move_arm,
     pixel_distance,
     seed_joints,
 )
@@ -75,6 +77,12 @@ GOAL_MISSED = 30
 """What a path counts that ends beside the goal, for want of freedoms: few others will do better."""
 GOAL_BEYOND = 90
 """What it counts that the goal itself is beyond a joint's limit, unless joints turn there another way."""
+
+POSTURE = 0.35
+"""Largest distance of a joint [rad or m] at the goal from the posture that was asked for."""
+
+THERE = 1e-6
+"""Joints that are no farther from the goal's are there."""
 
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
 """What the ``index`` of an approach NOT_REACHABLE names."""
@@ -234,15 +242,49 @@ def _give_up(p: Planning) -> None:
     p.failure = tuple(f for f in (p.goal_failure, p.asked_failure, p.best_failure) if f is not None)
 
 
+def go_to_posture(planning: Planning) -> None:
+    """Plan for the posture that the request names, and for no other."""
+    planning.stage, planning.sample = int(Stage.MULTISTART_IK), 0
+
+
 def _next_seed(p: Planning) -> None:
     """Find the goal's joints from the next seed; where they keep the limits, the straight line to them is next."""
     if p.seeds >= SEEDS:
         _give_up(p)
         return
+    if p.request.posture is not None:
+        _from_posture(p, p.request.posture)
+        return
     joints, arrived = _from_seed(p, p.seeds)
     p.seeds += 1
     if arrived and int(check_joints(joints, 1.0, p.constraints, empty_table())) < 0:
         _straight_to(p, joints)
+
+
+def _from_posture(p: Planning, posture: FloatArray) -> None:
+    """Likewise from the ``posture`` (n,) alone; a failure says how far from the goal the markers are in it."""
+    p.seeds = SEEDS
+    joints, arrived = _from_joints(p, posture)
+    apart = np.abs(joints - posture)
+    if arrived and float(np.where(p.turns > 0.0, _within_half_turn(apart), apart).max()) <= POSTURE:
+        table = empty_table()
+        broken = int(check_joints(joints, 1.0, p.constraints, table))
+        if broken < 0 and float(np.abs(joints - p.request.joints).max()) <= THERE:
+            stay(p)
+        elif broken < 0:
+            _straight_to(p, joints)
+        else:
+            p.table = table
+            p.goal_failure = approach(p, broken)
+        return
+    distance, marker = _distance_in_posture(posture, p.constraints, p.goal, _arm_at_start(p))
+    room = TOLERANCE_PX - distance
+    p.table[NOT_REACHABLE] = (room, room, distance, TOLERANCE_PX, -1.0, marker, 1.0)
+    p.goal_failure = approach(p, NOT_REACHABLE)
+
+
+def _within_half_turn(angles: FloatArray) -> FloatArray:
+    return np.asarray(np.abs(np.mod(angles + math.pi, 2.0 * math.pi) - math.pi), dtype=np.float64)
 
 
 def stay(planning: Planning) -> None:
@@ -368,6 +410,17 @@ def _distance_from_goal(
     return pixel_distance(s.cameras, s.must_stay_visible, moved(displacement, s.body), goal)
 
 
+@kernel
+def _distance_in_posture(
+    posture: FloatArray, constraints: Constraints, goal: FloatArray, start: Arm
+) -> tuple[float, int]:
+    """Likewise with the arm of ``start`` in a ``posture`` (n,)."""
+    displacement = np.eye(4)
+    arm = Arm(start.composition, start.operators.copy(), start.joints.copy(), displacement, start.bias.copy())
+    move_arm(arm, posture - start.joints)
+    return _distance_from_goal(displacement, constraints, goal)
+
+
 def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
     """Go on with the nearer of the joints at the end of the requested path and those of a direct step to the goal."""
     start, s = writable_copy(p.request.joints), p.constraints
@@ -392,11 +445,18 @@ def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
 
 
 def _from_seed(p: Planning, nth: int) -> tuple[FloatArray, bool]:
-    s, start = p.constraints, writable_copy(p.request.joints)
-    seed = seed_joints(nth, start, s.lower, s.upper)
-    arm = Arm(int(p.request.composition), p.start_operators, start, np.eye(4), np.zeros(len(start)))
-    joints, arrived = joints_from_seed(seed, p.goal, s, p.turns, arm)
+    s = p.constraints
+    return _from_joints(p, seed_joints(nth, p.request.joints, s.lower, s.upper))
+
+
+def _from_joints(p: Planning, seed: FloatArray) -> tuple[FloatArray, bool]:
+    joints, arrived = joints_from_seed(writable_copy(seed), p.goal, p.constraints, p.turns, _arm_at_start(p))
     return joints, bool(arrived)
+
+
+def _arm_at_start(p: Planning) -> Arm:
+    start = writable_copy(p.request.joints)
+    return Arm(int(p.request.composition), p.start_operators, start, np.eye(4), np.zeros(len(start)))
 
 
 def _straight_to(p: Planning, joints: FloatArray) -> None:

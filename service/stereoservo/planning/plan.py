@@ -41,7 +41,8 @@ class PlanRequest(msgspec.Struct, frozen=True, eq=False):
     ``centre_target`` (4,): heights 1. ``faces`` (f, 3): markers of the faces that must stay visible to every camera
     that sees them now and at the goal. ``kept`` (m,): 1 for markers that must stay in the images of these cameras.
     ``bend``: whether detours from ``profile``'s straight path are searched where that is not feasible.
-    ``speed_scale`` (0, 1] of velocity and acceleration limits.
+    ``speed_scale`` (0, 1] of velocity and acceleration limits. ``posture`` (n,): joints near which the plan ends, on
+    the straight line in the joints, where the arm reaches the goal by several postures.
     """
 
     operators: FloatArray
@@ -59,6 +60,7 @@ class PlanRequest(msgspec.Struct, frozen=True, eq=False):
     profile: Profile = "linear"
     bend: bool = True
     speed_scale: float = 1.0
+    posture: FloatArray | None = None
 
 
 class ClosestApproach(msgspec.Struct, frozen=True):

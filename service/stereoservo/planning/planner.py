@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import invert4
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
@@ -31,6 +32,7 @@ from stereoservo.planning.path_search import (
     TOLERANCE_PX,
     Planning,
     face_normal,
+    go_to_posture,
     next_candidate,
     plan_on,
     stay,
@@ -134,6 +136,8 @@ def start_planning(request: PlanRequest) -> Planning:
     )
     if refusal is not None:
         planning.finished, planning.failure = True, (refusal,)
+    elif r.posture is not None:
+        go_to_posture(planning)
     elif float(np.abs(goal - body).max()) <= PRESENT:
         stay(planning)
     else:
@@ -148,6 +152,11 @@ def _check(request: PlanRequest) -> None:
         values = getattr(request, name)
         if not np.isfinite(values).all():
             raise PlanRequestError(f"{name} of a plan's request must be finite, got {values.tolist()}")
+    posture = request.posture
+    if posture is not None and not (posture.shape == request.joints.shape and np.isfinite(posture).all()):
+        raise PlanRequestError(f"posture {posture.tolist()}: {len(request.joints)} finite joints are needed")
+    if posture is not None and request.composition == Composition.SIMULTANEOUS:
+        raise PlanRequestError("joints that turn simultaneously from the present pose have no other posture")
     if not 0.0 < request.speed_scale <= 1.0:
         raise PlanRequestError(f"speed_scale is {request.speed_scale}; above 0, at most 1 is valid")
     if len(request.joints) == 0 or len(request.matrices) == 0:

@@ -44,6 +44,9 @@ Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
 """The process that waits for a goal holds its lease: when it dies, the arm stops."""
 
+FOR_POSTURES = ("taught", "features")
+"""Kinds of targets whose postures are told."""
+
 NameArgument = Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")]
 RelativeToOption = Annotated[
     str | None,
@@ -119,6 +122,12 @@ ProfileOption = Annotated[
     str | None,
     typer.Option(help="linear, exponential, translation-first, …, for laws that follow a plan."),
 ]
+PostureOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", help="End in the posture that `stereoservo ik` lists as number N (law trajectory)."
+    ),
+]
 GainOption = Annotated[float | None, typer.Option(help="Gain [1/s].")]
 AdaptiveGainOption = Annotated[
     str | None, typer.Option(metavar="NEAR:FAR[:SLOPE]", help="Gain that falls with the error [1/s].")
@@ -171,6 +180,7 @@ def goal(
     centre: CentreOption = None,
     camera: CameraOption = None,
     profile: ProfileOption = None,
+    posture: PostureOption = None,
     gain: GainOption = None,
     adaptive_gain: AdaptiveGainOption = None,
     tolerance: ToleranceOption = None,
@@ -208,13 +218,26 @@ def goal(
     elif file is None:
         files = {"points": points, "displacement": displacement, "incidence": incidence}
         target = target_tree(name, joint, set_points, files, relative_to, common)
+    ends_in: dict[str, float] | None = None
+    if posture is not None:
+        if (
+            file is not None
+            or stream is not None
+            or endpoint is not None
+            or target.get("kind") not in FOR_POSTURES
+        ):
+            raise CommandError("usage", "--posture goes with NAME or --set-points, on the cell's host")
+        from stereoservo.cli import ik  # numerics: for this alone
+
+        ends_in, law = ik.posture(cell, target, posture, operator), law or ik.PLANNED_LAW
     if file is not None:
         requested = decode(read_file(file), Goal)
     else:
         requested = make_goal(
             target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
-            cameras=camera or None, profile=profile, gain=gain if adaptive_gain is None else adaptive(adaptive_gain),
+            cameras=camera or None, profile=profile, posture=ends_in,
+            gain=gain if adaptive_gain is None else adaptive(adaptive_gain),
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
         )  # fmt: skip

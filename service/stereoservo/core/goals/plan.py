@@ -20,6 +20,7 @@ from stereoservo.core.goals.marker_body import (
     view_of,
 )
 from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
+from stereoservo.core.goals.resolve import joint_index
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import centre_of, chain_at, markers_at
 from stereoservo.core.sources.law import choose, goal_error, scene_and_task
@@ -112,7 +113,16 @@ def _plan_request(
         profile=goal.profile or "linear",
         bend=context.derived.laws[source.law].planned,
         speed_scale=goal.speed_scale,
+        posture=None if goal.posture is None else _posture(goal.posture, joints, context),
     )
+
+
+def _posture(named: dict[str, float], joints: FloatArray, context: StepContext) -> FloatArray:
+    """Joints (n,) of a goal's posture, others as in ``joints`` (n,). Raises RefusalError for unknown names."""
+    posture = joints.copy()
+    for name, position in named.items():
+        posture[joint_index(name, context.settings)] = position
+    return posture
 
 
 def go_on_planning(job: PlanJob) -> bool:
@@ -142,7 +152,7 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
         return _planned(job, plan, context)
     failures = planning.failure
     approaches = tuple(_approach(failure, job, context) for failure in failures)
-    texts = tuple(_text(failure, context) for failure in approaches)
+    texts = tuple(_text(failure, context, source.goal.posture is not None) for failure in approaches)
     report = PlanReport(
         law=source.law, way=f"not guaranteed: {texts[0]}", seconds=_exponential_s(job, context), approaches=approaches,
         shares=(), joints={}, pixels={},
@@ -283,7 +293,7 @@ def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> 
     )  # fmt: skip
 
 
-def _text(failure: goals.Approach, context: StepContext) -> str:
+def _text(failure: goals.Approach, context: StepContext, asked_posture: bool) -> str:
     """In words where and on what a way fails."""
     where = "at the goal" if failure.share >= 1.0 else f"at {100.0 * failure.share:.0f} % of the way"
     value, limit, unit = f"{failure.value:.4g}", f"{failure.limit:.4g}", failure.unit
@@ -298,6 +308,11 @@ def _text(failure: goals.Approach, context: StepContext) -> str:
         )
     if failure.code == "FACE_HIDDEN":
         return f"{where} camera {failure.subject!r} would see the face under {value} {unit}; {limit} {unit} are needed"
+    if failure.code == "NOT_REACHABLE" and asked_posture and failure.share >= 1.0:
+        return (
+            f"the posture that was asked for is none of this goal: in it the markers are {value} px from it, "
+            f"{limit} px are allowed; `stereoservo ik` lists the postures that reach it"
+        )
     if failure.code == "BEHIND_CAMERA":
         return f"{where} marker {failure.marker} would pass camera {failure.subject!r}: {value} {unit}"
     return (

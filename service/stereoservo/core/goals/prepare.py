@@ -4,6 +4,7 @@ body a part of the work a step, so that no step has a goal's whole work.
 
 from __future__ import annotations
 
+from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext, no_model
 from stereoservo.core.goals.marker_body import BodyState, place_now
 from stereoservo.core.goals.plan import begin_plan
@@ -39,6 +40,8 @@ def prepare(
     where they are. Raises RefusalError.
     """
     target = goal.target
+    if goal.posture is not None:
+        _require_plan(goal, context)
     if isinstance(target, JointTarget):
         return joint_goal(goal, target, context)
     if isinstance(target, TaughtTarget):
@@ -63,6 +66,21 @@ def prepare(
     if job.source is None or (job.planning is not None):
         return job
     return job.source
+
+
+def _require_plan(goal: Goal, context: StepContext) -> None:
+    """Raises RefusalError where a goal with a posture is none that a law reaches by a plan."""
+    name, law = law_of(goal, context)
+    planned = " or ".join(LAWS.on_path("planned")) or "none is installed"
+    if isinstance(goal.target, JointTarget | IncidenceTarget):
+        said = f"a goal in {'joints' if isinstance(goal.target, JointTarget) else 'incidences'} has none of choice"
+    elif not law.planned:
+        said = f"law {name!r} follows no plan, and ends in the posture that its way leads to"
+    else:
+        return
+    raise RefusalError(
+        "POSTURE_NOT_PLANNED", f"{said}; a posture is for goals of markers by a law that plans: {planned}"
+    )
 
 
 def set_up(job: PlanJob, context: StepContext) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereoservo.kinematics.inverse.solutions import InverseSolutions, distinct, nearest_turns
+from stereoservo.kinematics.inverse.solutions import InverseSolutions, distinct, within_limits
 from stereoservo.kinematics.joint_angles import JointAngles, measured_joints
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, joint_problem
 from stereoservo.numerics.arrays import FloatArray
@@ -49,9 +49,7 @@ def refined_on_images(
     for q in found.joints:
         try:
             best = measured_joints(problem, limits=limits, start=q, largest_deviation=np.inf)[0]
-            if limits is None:
-                best = replace(best, q=nearest_turns(seen.chain.kinds, best.q, q))
-            refined.append(best)
+            refined.append(replace(best, q=within_limits(seen.chain.kinds, best.q, q, limits)[0]))
         except JointAnglesError as error:
             if error.code not in ("no_agreement", "outside_limits"):
                 raise
