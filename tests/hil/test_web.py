@@ -144,7 +144,7 @@ def test_a_goal_outlives_a_session_of_its_page_that_failed(
 
     try:
         link.start()
-        eventually("the model is there", lambda: link.drag_model)
+        eventually("the model is there", lambda: link.view.model)
         assert link.send(link.taught_goal("park")).accepted
         goal = client.status().goal
         client.hold()  # it would be reached before its lease runs out

@@ -8,7 +8,6 @@ import json
 import re
 import subprocess
 import sys
-import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,17 +15,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from core.conftest import Bench, make_bench
+from core.conftest import Bench
+from recording.bench_flight import record_bench
 from stereoservo.cli import main as cli
-from stereoservo.core.state_encoding import encode_state
-from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
-from stereoservo.messages.recording_request import images_directory
-from stereoservo.ports.devices import Frame
-from stereoservo.ports.image_files import ImageWriter
-from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.messages.goals import FeatureTarget
 from stereoservo.recording.replay import recorded_messages, replay
-from stereoservo.recording.step_layout import StepEncoder
-from stereoservo.recording.step_records import fingerprint
 
 for needed in ("foxglove", "google.protobuf", "jsonschema"):
     pytest.importorskip(needed, reason=f"{needed} is of the extra `test`")
@@ -53,20 +46,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """Four seconds towards a goal, with pictures of one camera."""
     folder = tmp_path_factory.mktemp("flight")
     flight, file = folder / "flight.mcap", folder / "flight.foxglove.mcap"
-    bench = make_bench(0, 0.02, k1=-0.1).ready()
-    encoder = StepEncoder()
-    target = FeatureTarget(bench.features(bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])))
-    images_directory(flight).mkdir()
-    pictures = ImageWriter(images_directory(flight) / "left.avi", "left", (64, 48), 30.0, driver="fake")
-    with FlightRecorder(flight, bench.settings, fingerprint()) as recorder, pictures:
-        recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
-        for k in range(STEPS):
-            outputs = bench.step(*([RunGoal(Goal(str(uuid.UUID(int=1)), target))] if k == 5 else []))
-            inputs = bench.log[-1][0]
-            recorder.step(encoder.encode(inputs, outputs), inputs.now_ns)
-            if k % 100 == 0:
-                image = np.full((48, 64), k // 4, dtype=np.uint8)
-                pictures.append(Frame("left", k, inputs.now_ns, inputs.now_ns, image))
+    bench, target = record_bench(flight, STEPS)
     assert cli.invoke(["export", str(flight), "--json"]) == 0
     return Exported(bench, flight, file, target)
 

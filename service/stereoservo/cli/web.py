@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, note
 from stereoservo.messages.keys import InvalidKeyError, check_name
 
 if TYPE_CHECKING:
@@ -21,7 +22,14 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def web(
-    cell: CellArgument,
+    cell: Annotated[
+        str | None,
+        typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml)."),
+    ] = None,
+    flight: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell."),
+    ] = None,
     port: Annotated[int, typer.Option(help="TCP port; 0: a free one.", min=0, max=65535)] = 8080,
     address: Annotated[
         str, typer.Option(help="Address to listen on; any but loopback needs --tls.")
@@ -40,7 +48,16 @@ def web(
     endpoint: EndpointOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Serve the operators' page, until Ctrl-C. Without --operate it shows the cell and may stop the arm."""
+    """Serve the operators' page, until Ctrl-C. Without --operate it shows the cell and may stop the arm.
+
+    With --flight it plays a recording, and commands nothing.
+    """
+    if (cell is None) == (flight is None):
+        raise CommandError(
+            "usage", "one of CELL, a live cell, and --flight FILE, a recording, is to be given"
+        )
+    if flight is not None and (operate is not None or endpoint is not None):
+        raise CommandError("usage", "--flight shows a recording: --operate and --endpoint are of a live CELL")
     context = _tls_context(address, tls)
     if operate is not None:
         try:
@@ -48,7 +65,7 @@ def web(
         except InvalidKeyError as error:
             raise CommandError("usage", str(error)) from error
     try:
-        from stereoservo.web.cell_link import CellLink
+        from stereoservo.web.cell_link import CellLink, Publish
         from stereoservo.web.server import PageServer
     except ModuleNotFoundError as error:
         if error.name != "websockets":
@@ -56,6 +73,14 @@ def web(
         raise CommandError(
             "missing", "the page needs the package websockets: pip install 'stereoservo[web]'"
         ) from error
+    make_link: Callable[[Publish], CellLink | FlightLink]
+    if flight is not None:
+        from stereoservo.web.flight_link import FlightLink
+
+        make_link = partial(FlightLink, flight)
+    else:
+        assert cell is not None
+        make_link = partial(CellLink, cell, endpoint, operate or "page")
     tokens: list[str] = []
 
     def announce(token: str) -> None:
@@ -63,7 +88,7 @@ def web(
         if len(tokens) > 1 or not json:
             note(f"token to command the arm as {operate}, good for one use: {token}")
 
-    server = PageServer(partial(CellLink, cell, endpoint, operate or "page"), operate, announce)
+    server = PageServer(make_link, operate, announce)
     with suppress(KeyboardInterrupt):
         asyncio.run(_serve(server, address, port, context, tokens, json))
 

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -26,12 +26,17 @@ from websockets.http11 import Request, Response
 from stereoservo.client import ClientError, SessionError
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.messages.discovery import NotRunningError
-from stereoservo.messages.goals import Goal
+from stereoservo.messages.goals import Goal, UpdateGoal
 from stereoservo.messages.wire import MessageError, Reply
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web import requests as ask
-from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, drag_answer, refusal
+from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, refusal
+from stereoservo.web.leases import LEASE_S
+from stereoservo.web.model_view import drag_answer, goal_message
 from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
+
+if TYPE_CHECKING:
+    from stereoservo.web.flight_link import FlightLink
 
 FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -116,7 +121,7 @@ class PageServer:
 
     def __init__(
         self,
-        make_link: Callable[[Publish], CellLink],
+        make_link: Callable[[Publish], CellLink | FlightLink],
         operator: str | None,
         announce: Callable[[str], None],
     ) -> None:
@@ -253,8 +258,13 @@ class PageServer:
         """Do what a page asks, as far as it may, and tell it how that went."""
         n = 0
         try:
-            request = ask.decode_request(message.encode() if isinstance(message, str) else message)
-            n = request.n
+            data = message.encode() if isinstance(message, str) else message
+            n = ask.number_of(data)
+            request = ask.decode_request(data)
+            if self.link.recording is True:
+                answer = {"ok": True} | _playback(self.link, request)
+                page.tell({"answer": {"n": n, **answer}})
+                return
             if not isinstance(request, ask.OPEN):
                 self.holder.require(page, str(request.__struct_config__.tag))
             if isinstance(request, ask.Stop):
@@ -282,7 +292,7 @@ class PageServer:
 
     def _do(self, page: Page, request: ask.PageRequest) -> dict[str, Any]:
         """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
-        link = self.link
+        link = self._cell_link
         match request:
             case ask.Stop():
                 return _told(link.stop())
@@ -319,18 +329,33 @@ class PageServer:
                 return self._check(page, request)
             case ask.Go():
                 return self._go(page)
+            case ask.Send():
+                return self._send_goal(msgspec.structs.replace(request.goal, lease_s=LEASE_S, check=False))
+            case ask.Update():
+                link.update(UpdateGoal(request.id, request.target, request.stamp_s))
+                return {"message": "moved"}
+            case ask.Play() | ask.Seek():
+                raise RightsError(
+                    "a live cell is shown, which has no past: `stereoservo web --flight FILE` plays one"
+                )
+
+    @property
+    def _cell_link(self) -> CellLink:
+        """The link to the cell, where no recording is shown."""
+        assert self.link.recording is False
+        return self.link
 
     def _rights_changed(self) -> None:
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self._tell_all_rights)
 
     def _drag(self, page: Page, request: ask.Drag) -> dict[str, Any]:
-        model = self.link.drag_model
+        model = self._cell_link.view.model
         if model is None:
             raise LinkDownError("there is no model of the arm yet: calibrate first")
         if not request.draft or page.draft is None:
             page.draft = None
-            page.base = self.link.joints() if page.base is None else page.base
+            page.base = self._cell_link.joints() if page.base is None else page.base
         base = page.base if page.draft is None else page.draft
         assert base is not None
         found = model.dragged(base, request.camera, request.shift, request.turn, request.nearer)
@@ -343,13 +368,16 @@ class PageServer:
     def _check(self, page: Page, request: ask.Check) -> dict[str, Any]:
         page.changes += 1
         page.checked, change = None, page.changes
-        if request.name is not None:
-            goal = self.link.taught_goal(request.name)
+        link = self._cell_link
+        if request.goal is not None:
+            goal = msgspec.structs.replace(request.goal, lease_s=LEASE_S)
+        elif request.name is not None:
+            goal = link.taught_goal(request.name)
         elif page.draft is not None:
-            goal = self.link.dragged_goal(np.array(page.draft))
+            goal = link.dragged_goal(np.array(page.draft))
         else:
             raise LinkDownError("nothing was dragged yet: drag the outline of the body in a picture")
-        reply = self.link.client.check(goal)
+        reply = link.client.check(goal)
         if page.changes == change:
             page.checked = goal
         return _told(reply) | {"plan": reply.plan}
@@ -358,10 +386,13 @@ class PageServer:
         goal = page.checked
         if goal is None:
             raise LinkDownError("check the goal first: its path is shown before anything moves")
-        reply = self.link.send(goal)
+        found = self._send_goal(goal)
         page.checked = page.draft = page.base = None
-        plan = msgspec.json.encode({"goal": {"id": goal.id, "plan": reply.plan}})
-        self._publish("goal", plan, True)
+        return found
+
+    def _send_goal(self, goal: Goal) -> dict[str, Any]:
+        reply = self._cell_link.send(goal)
+        self._publish("goal", msgspec.json.encode(goal_message(goal, reply.plan)), True)
         return _told(reply) | {"id": goal.id}
 
 
@@ -384,6 +415,20 @@ async def _send(connection: ServerConnection, page: Page) -> None:
             await (await connection.ping())
     except ConnectionClosed:
         return
+
+
+def _playback(link: FlightLink, request: ask.PageRequest) -> dict[str, Any]:
+    """Do what a page asks of a recording. Raises RightsError for what would be asked of an arm."""
+    match request:
+        case ask.Play():
+            return link.play(request.playing, request.speed)
+        case ask.Seek():
+            return link.seek(request.at)
+    verb = request.__struct_config__.tag
+    raise RightsError(
+        f"{verb}: a recording is shown, and nothing can be commanded here; play and seek are valid. An arm is stopped "
+        "by `stereoservo stop CELL`, or on the page of its cell"
+    )
 
 
 def _gone(connection: ServerConnection) -> bytes:
