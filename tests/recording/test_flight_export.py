@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import re
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from mcap.reader import make_reader
 
 from core.conftest import Bench
 from recording.bench_flight import record_bench
+from recording.foxglove_schemas import decode_by_schema
 from stereoservo.cli import main as cli
 from stereoservo.messages.goals import FeatureTarget
 from stereoservo.recording.replay import recorded_messages, replay
@@ -52,30 +52,13 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
 
 
 def decoded(file: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Messages with a schema, by topic with their times: by google's protobuf from the schema in the file, or JSON
-    that its JSON Schema has accepted.
-    """
-    import jsonschema
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-
+    """Messages with a schema, by topic with their times."""
     found: dict[str, list[tuple[int, Any]]] = {}
     with file.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
-            if schema is None:
-                continue
-            if channel.message_encoding == "json":
-                content = json.loads(message.data)
-                jsonschema.validate(content, json.loads(schema.data))
-            else:
-                pool = descriptor_pool.DescriptorPool()
-                for part in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-                    pool.Add(part)  # type: ignore[no-untyped-call]
-                kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
-                content = kind.FromString(message.data)
-                known = kind.FromString(message.data)
-                known.DiscardUnknownFields()
-                assert known.ByteSize() == content.ByteSize() == len(message.data), channel.topic
-            found.setdefault(channel.topic, []).append((message.log_time, content))
+            if schema is not None:
+                content = decode_by_schema(channel.message_encoding, schema.name, schema.data, message.data)
+                found.setdefault(channel.topic, []).append((message.log_time, content))
     return found
 
 

@@ -2,7 +2,9 @@
 
 import asyncio
 import http.client
+import json
 import random
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 from stereoservo.client import Client, ClientError
 from stereoservo.messages.goals import Goal, TaughtTarget
 from stereoservo.messages.wire import Reply
+from stereoservo.web import server as page_server
 from stereoservo.web.cell_link import CellLink, Publish
 from stereoservo.web.model_view import ModelView
 from stereoservo.web.requests import PageRequest
@@ -207,6 +210,27 @@ def test_a_page_that_does_not_read_is_sent_no_more_pictures_until_it_has() -> No
         while not isinstance(message := page.recv(timeout=10), bytes):
             pass
         assert int.from_bytes(message[:4], "little") == count - 1, "the newest of all"
+
+
+def frame(text: str) -> bytes:
+    """A masked WebSocket frame of a short text, by the letter of RFC 6455."""
+    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text.encode()
+
+
+def test_a_page_that_answers_no_ping_lets_the_arm_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_server, "PING_S", 0.2)
+    monkeypatch.setattr(page_server, "SILENT_S", 0.2)
+    with serving("ann") as (port, _, tokens, link), socket.create_connection(("127.0.0.1", port)) as frozen:
+        frozen.sendall(
+            f"GET /socket HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        frozen.sendall(frame(json.dumps({"do": "take", "token": tokens[0]})))  # and nothing from here on
+        with connect(f"ws://127.0.0.1:{port}/socket") as other:
+            while "held the arm lost its connection" not in str(other.recv(timeout=20)):
+                pass
+            assert answer(other, {"do": "take", "token": tokens[1]}, 1)["ok"]
+        assert link.ended >= 1
 
 
 def test_a_stop_waits_for_nothing_that_a_page_has_asked_for() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import ssl
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,6 +19,7 @@ from stereoservo.messages.keys import InvalidKeyError, check_name
 if TYPE_CHECKING:
     from stereoservo.web.server import PageServer
 
+HOST_NAME = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
@@ -37,6 +39,13 @@ def web(
     tls: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address."),
+    ] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Another name under which browsers reach the server (a cell.example); repeat.",
+        ),
     ] = None,
     operate: Annotated[
         str | None,
@@ -59,6 +68,12 @@ def web(
     if flight is not None and (operate is not None or endpoint is not None):
         raise CommandError("usage", "--flight shows a recording: --operate and --endpoint are of a live CELL")
     context = _tls_context(address, tls)
+    for name in host or []:
+        if not HOST_NAME.fullmatch(name):
+            raise CommandError(
+                "usage",
+                f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port",
+            )
     if operate is not None:
         try:
             check_name("operator", operate)
@@ -80,7 +95,7 @@ def web(
         make_link = partial(FlightLink, flight)
     else:
         assert cell is not None
-        make_link = partial(CellLink, cell, endpoint, operate or "page")
+        make_link = partial(CellLink, cell, endpoint, operate or "page", log=note)
     tokens: list[str] = []
 
     def announce(token: str) -> None:
@@ -90,7 +105,7 @@ def web(
 
     server = PageServer(make_link, operate, announce)
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(server, address, port, context, tokens, json))
+        asyncio.run(_serve(server, address, port, context, host or [], tokens, json))
 
 
 async def _serve(
@@ -98,11 +113,12 @@ async def _serve(
     address: str,
     port: int,
     context: ssl.SSLContext | None,
+    names: list[str],
     tokens: list[str],
     as_json: bool,
 ) -> None:
     try:
-        found = await server.start(address, port, context)
+        found = await server.start(address, port, context, names)
     except OSError as error:
         await asyncio.to_thread(server.link.close)
         raise CommandError(

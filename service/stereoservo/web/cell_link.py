@@ -45,12 +45,22 @@ class CellLink:
     """Reads a cell and commands it. ``publish(slot, message, keep)``: a message for all pages, as JSON text or, of
     pictures, bytes; of one slot only the newest counts, unless the slot is empty; ``keep``: new pages get it, too.
 
+    ``log``: called with a line on every motion that was aborted or failed, with all its reasons.
+
     Raises NotRunningError, SessionError, ClientError where the cell cannot be reached at the start.
     """
 
     recording: Literal[False] = False
 
-    def __init__(self, cell: str, endpoint: str | None, operator: str, publish: Publish) -> None:
+    def __init__(
+        self,
+        cell: str,
+        endpoint: str | None,
+        operator: str,
+        publish: Publish,
+        log: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._log = log
         self._connect: Callable[[], Client] = partial(Client, cell, endpoint=endpoint, operator=operator)
         self._publish = publish
         self._client: Client | None = self._connect()
@@ -164,6 +174,9 @@ class CellLink:
 
     def _take_event(self, event: EventMessage) -> None:
         self._leases.take_event(event)
+        if event.kind.endswith(("_aborted", "_failed")):
+            at = time.strftime("%H:%M:%S", time.localtime(event.t_wall))
+            self._log(f"{at} {event.kind} {event.id}: {why(event)}")
         self._tell("", {"event": event})
 
     def _take_picture(self, sample: Any) -> None:
@@ -270,6 +283,20 @@ class CellLink:
     def end_leases(self) -> None:
         """Renew no lease any more: what the page has started ends within `LEASE_S`."""
         self._leases.end()
+
+
+def why(event: EventMessage) -> str:
+    """What an event says of its reasons: its message, and codes, values and hints of them."""
+    found = [event.message] if event.message else []
+    for reason in event.reasons:
+        value = "" if reason.value is None else f" {reason.value:.4g}"
+        limit = "" if reason.threshold is None else f", limit {reason.threshold:.4g}"
+        subject = f" {reason.subject}" if reason.subject else ""
+        hint = "" if reason.hint in found else f": {reason.hint}"
+        found.append(
+            f"{reason.code}{subject}{f' ({value.strip()}{limit} {reason.unit})' if value else ''}{hint}"
+        )
+    return "; ".join(found) or "the daemon gave no reason, which is a fault of it"
 
 
 def picture_message(header: bytes, jpeg: bytes) -> bytes:

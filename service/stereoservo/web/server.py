@@ -6,14 +6,15 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -32,11 +33,8 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web import requests as ask
 from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, refusal
 from stereoservo.web.leases import LEASE_S
-from stereoservo.web.model_view import drag_answer, goal_message
+from stereoservo.web.model_view import ModelView, drag_answer, goal_message
 from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
-
-if TYPE_CHECKING:
-    from stereoservo.web.flight_link import FlightLink
 
 FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -56,9 +54,10 @@ MAX_UNDER_WAY, MAX_STOPS = 8, 32
 """Requests of a page that are carried out at a time, and stops, which wait for none of them."""
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
-PING_S = 5.0
+PING_S, SILENT_S = 2.0, 3.0
 """A page is asked every so often whether it is there, and closed where it does not answer for so long; one that holds
-the arm then lets it stop.
+the arm then lets it stop. A browser on a busy computer is late by tenths of a second; a page that is closed in error
+costs a goal.
 """
 EXPECTED = (
     ClientError,
@@ -69,6 +68,30 @@ EXPECTED = (
     RightsError,
     SessionError,
 )
+
+
+class Playback(Protocol):
+    """A recording in the place of a cell, `web.flight_link.FlightLink`: this module knows nothing of recordings."""
+
+    recording: Literal[True]
+    cell: str
+    view: ModelView
+    watched: threading.Event
+
+    def start(self) -> None:
+        """Begin to publish."""
+
+    def close(self) -> None:
+        """End. Idempotent."""
+
+    def end_leases(self) -> None:
+        """There are none."""
+
+    def play(self, playing: bool, speed: float | None) -> dict[str, Any]:
+        """Play or pause."""
+
+    def seek(self, seconds: float) -> dict[str, Any]:
+        """Go to a time [s] after the recording's begin."""
 
 
 class Page:
@@ -121,7 +144,7 @@ class PageServer:
 
     def __init__(
         self,
-        make_link: Callable[[Publish], CellLink | FlightLink],
+        make_link: Callable[[Publish], CellLink | Playback],
         operator: str | None,
         announce: Callable[[str], None],
     ) -> None:
@@ -133,11 +156,14 @@ class PageServer:
         self._work = ThreadPoolExecutor(4, thread_name_prefix="page-command")
         self._stops = ThreadPoolExecutor(4, thread_name_prefix="page-stop")
         self._hosts: frozenset[str] = frozenset()
+        self._port = 0
         self._secure = False
         self.link = make_link(self._publish)
 
-    async def start(self, address: str, port: int, tls: ssl.SSLContext | None = None) -> int:
-        """Listen; returns the port (given as 0: a free one). Raises OSError."""
+    async def start(
+        self, address: str, port: int, tls: ssl.SSLContext | None = None, names: Sequence[str] = ()
+    ) -> int:
+        """Listen; returns the port (given as 0: a free one). ``names``: more names of this server. Raises OSError."""
         self._loop = asyncio.get_running_loop()
         self._secure = tls is not None
         self._server: Server = await serve(
@@ -150,12 +176,12 @@ class PageServer:
             open_timeout=5.0,
             close_timeout=1.0,
             ping_interval=PING_S,
-            ping_timeout=PING_S,
+            ping_timeout=SILENT_S,
             compression=None,
             server_header=None,
         )
         found: int = self._server.sockets[0].getsockname()[1]
-        self._hosts = allowed_hosts(address, found)
+        self._hosts, self._port = allowed_hosts(address, found, names), found
         self.link.start()
         return found
 
@@ -175,7 +201,7 @@ class PageServer:
         hosts = request.headers.get_all("Host")
         host = hosts[0] if len(hosts) == 1 else None
         try:
-            check_host(host, self._hosts)
+            check_host(host, self._hosts, connection.local_address[0], self._port)
             if request.path == "/socket":
                 origins = request.headers.get_all("Origin")
                 if len(origins) > 1:
@@ -417,7 +443,7 @@ async def _send(connection: ServerConnection, page: Page) -> None:
         return
 
 
-def _playback(link: FlightLink, request: ask.PageRequest) -> dict[str, Any]:
+def _playback(link: Playback, request: ask.PageRequest) -> dict[str, Any]:
     """Do what a page asks of a recording. Raises RightsError for what would be asked of an arm."""
     match request:
         case ask.Play():
@@ -434,7 +460,7 @@ def _playback(link: FlightLink, request: ask.PageRequest) -> dict[str, Any]:
 def _gone(connection: ServerConnection) -> bytes:
     """What pages are told of the one that held the arm and is gone."""
     lost = connection.close_code == CloseCode.ABNORMAL_CLOSURE
-    how = f"lost its connection, or did not answer for {PING_S:g} s" if lost else "was closed"
+    how = f"lost its connection, or did not answer for {SILENT_S:g} s" if lost else "was closed"
     return msgspec.json.encode(
         {"notice": f"The page that held the arm {how}: what it had started stops.", "t_wall": time.time()}
     )

@@ -197,7 +197,9 @@ function showNotice({ notice, t_wall }) {
 }
 
 function showEvent(event) {
-  const why = [...new Set([event.message, ...event.reasons.map((r) => `${r.code}: ${r.hint}`)])].filter(Boolean).join("\n");
+  const reasons = event.reasons.map((r) => `${r.code}${r.subject ? ` ${r.subject}` : ""}${r.hint && r.hint !== event.message ? `: ${r.hint}` : ""}`);
+  const why = [...new Set([event.message, ...reasons])].filter(Boolean).join("\n") ||
+    (/_aborted$|_failed$/.test(event.kind) ? "the daemon gave no reason, which is a fault of it" : "");
   const what = `${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)}`;
   list(event.t_wall, `${what} ${why}`, { value: event.seq });
   if (state && !flight && /_aborted$|_failed$/.test(event.kind)) banner("answer", `${what}: ${why}`, true);
