@@ -27,7 +27,10 @@ def record_bench(flight: Path, steps: int) -> tuple[Bench, FeatureTarget]:
     encoder = StepEncoder()
     target = FeatureTarget(bench.features(bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])))
     images_directory(flight).mkdir()
-    pictures = ImageWriter(images_directory(flight) / "left.avi", "left", (64, 48), 30.0, driver="fake")
+    left = bench.settings.cameras[0]
+    pictures = ImageWriter(
+        images_directory(flight) / "left.avi", left.name, (left.width, left.height), 30.0, driver="fake"
+    )
     with FlightRecorder(flight, bench.settings, fingerprint()) as recorder, pictures:
         recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
         for k in range(steps):
@@ -35,6 +38,6 @@ def record_bench(flight: Path, steps: int) -> tuple[Bench, FeatureTarget]:
             inputs = bench.log[-1][0]
             recorder.step(encoder.encode(inputs, outputs), inputs.now_ns)
             if k % 100 == 0:
-                image = np.full((48, 64), k // 4, dtype=np.uint8)
-                pictures.append(Frame("left", k, inputs.now_ns, inputs.now_ns, image))
+                image = np.full((left.height, left.width), k // 4, dtype=np.uint8)
+                pictures.append(Frame(left.name, k, inputs.now_ns, inputs.now_ns, image))
     return bench, target
