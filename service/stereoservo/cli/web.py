@@ -68,17 +68,7 @@ def web(
     if flight is not None and (operate is not None or endpoint is not None):
         raise CommandError("usage", "--flight shows a recording: --operate and --endpoint are of a live CELL")
     context = _tls_context(address, tls)
-    for name in host or []:
-        if not HOST_NAME.fullmatch(name):
-            raise CommandError(
-                "usage",
-                f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port",
-            )
-    if operate is not None:
-        try:
-            check_name("operator", operate)
-        except InvalidKeyError as error:
-            raise CommandError("usage", str(error)) from error
+    _check_names(host or [], operate)
     try:
         from stereoservo.web.cell_link import CellLink, Publish
         from stereoservo.web.server import PageServer
@@ -106,6 +96,21 @@ def web(
     server = PageServer(make_link, operate, announce)
     with suppress(KeyboardInterrupt):
         asyncio.run(_serve(server, address, port, context, host or [], tokens, json))
+
+
+def _check_names(hosts: list[str], operator: str | None) -> None:
+    """Raises CommandError for a host or an operator that is no name."""
+    for name in hosts:
+        if not HOST_NAME.fullmatch(name):
+            raise CommandError(
+                "usage",
+                f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port",
+            )
+    if operator is not None:
+        try:
+            check_name("operator", operator)
+        except InvalidKeyError as error:
+            raise CommandError("usage", str(error)) from error
 
 
 async def _serve(

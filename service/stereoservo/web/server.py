@@ -70,7 +70,7 @@ EXPECTED = (
 )
 
 
-class Playback(Protocol):
+class RecordedLink(Protocol):
     """A recording in the place of a cell, `web.flight_link.FlightLink`: this module knows nothing of recordings."""
 
     recording: Literal[True]
@@ -144,7 +144,7 @@ class PageServer:
 
     def __init__(
         self,
-        make_link: Callable[[Publish], CellLink | Playback],
+        make_link: Callable[[Publish], CellLink | RecordedLink],
         operator: str | None,
         announce: Callable[[str], None],
     ) -> None:
@@ -201,7 +201,7 @@ class PageServer:
         hosts = request.headers.get_all("Host")
         host = hosts[0] if len(hosts) == 1 else None
         try:
-            check_host(host, self._hosts, connection.local_address[0], self._port)
+            check_host(host, self._hosts, connection.local_address[0].removeprefix("::ffff:"), self._port)
             if request.path == "/socket":
                 origins = request.headers.get_all("Origin")
                 if len(origins) > 1:
@@ -443,7 +443,7 @@ async def _send(connection: ServerConnection, page: Page) -> None:
         return
 
 
-def _playback(link: Playback, request: ask.PageRequest) -> dict[str, Any]:
+def _playback(link: RecordedLink, request: ask.PageRequest) -> dict[str, Any]:
     """Do what a page asks of a recording. Raises RightsError for what would be asked of an arm."""
     match request:
         case ask.Play():
