@@ -76,9 +76,9 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
         (("pick", "--adaptive-gain", "4:1", "--gain", "2"), "one of them"),
         (
             ("pick", "--jacobian", "last"),
-            "jacobian: Invalid enum value 'last'; valid: current, desired, mean",
+            "jacobian: Invalid enum value 'last'; valid: current, desired, fixed-depth, mean",
         ),
-        (("pick", "--profile", "wavy"), "profile: Invalid enum value 'wavy'; valid: linear, exponential"),
+        (("pick", "--profile", "wavy"), "profile: Invalid enum value 'wavy'; valid: exponential, linear"),
         (("pick", "--follow", "-"), "--follow is a target of its own"),
         (("--follow", "/none.jsonl"), "/none.jsonl: No such file"),
         (("--displacement", "/none.json"), "/none.json: No such file"),

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -210,3 +215,19 @@ def moved_away(client: Client) -> None:
     start = client.status().joints
     away = {name: value + 0.12 for name, value in start.items() if name in ("j1", "j4")}
     client.goal(away).reached(60.0)
+
+
+@contextmanager
+def serving(*arguments: str) -> Iterator[dict[str, Any]]:
+    """``stereoservo web`` as a process: what it prints as JSON. It ends by Ctrl-C."""
+    command = [sys.executable, "-m", "stereoservo.cli.main", "web", "--port", "0", "--json", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                assert process.wait(60) == 0
+            finally:
+                process.kill()

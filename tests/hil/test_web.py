@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import random
 import shutil
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from recording.bench_flight import record_bench
 from stereoservo.client import Client, EventWatch, NoReplyError
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo.messages.wire import EventMessage
 
-from .conftest import CELL, eventually
+from .conftest import CELL, eventually, serving
 
 pytest.importorskip("websockets", reason="the page's server needs websockets (extra web)")
 
@@ -33,19 +31,6 @@ from stereoservo.web.cell_link import CellLink
 from stereoservo.web.leases import LEASE_S
 
 BROWSER = shutil.which("chromium"), shutil.which("chromedriver")
-
-
-@contextmanager
-def serving(cell: str, *options: str) -> Iterator[dict[str, Any]]:
-    """``stereoservo web`` as a process: what it prints as JSON. It ends by Ctrl-C."""
-    command = [sys.executable, "-m", "stereoservo.cli.main", "web", cell, "--port", "0", "--json", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield json.loads(process.stdout.readline())
-        finally:
-            process.send_signal(signal.SIGINT)
-            assert process.wait(20) == 0
 
 
 class Page:
@@ -144,7 +129,7 @@ def test_a_goal_outlives_a_session_of_its_page_that_failed(
 
     try:
         link.start()
-        eventually("the model is there", lambda: link.drag_model)
+        eventually("the model is there", lambda: link.view.model)
         assert link.send(link.taught_goal("park")).accepted
         goal = client.status().goal
         client.hold()  # it would be reached before its lease runs out
@@ -176,78 +161,138 @@ def demo(roots: Path) -> Iterator[str]:
         yield "webdemo"
 
 
-@pytest.mark.slow
-@pytest.mark.process
-@pytest.mark.timeout(900)
-@pytest.mark.skipif(
-    None in BROWSER or importlib.util.find_spec("selenium") is None,
-    reason="needs chromium and chromium-driver (Debian's packages) and selenium",
-)
-def test_in_a_browser_the_cell_is_calibrated_and_dragged_goals_are_reached(demo: str, tmp_path: Path) -> None:
-    from selenium import webdriver
-    from selenium.webdriver.common.action_chains import ActionChains
-    from selenium.webdriver.common.by import By
+class Browser:
+    """A headless Chromium with the page."""
 
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(BROWSER[0])
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,1200"):
-        options.add_argument(argument)
-    browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(str(BROWSER[1])))
+    def __init__(self) -> None:
+        from selenium import webdriver
 
-    def value(script: str, seconds: float = 60.0) -> Any:
+        options = webdriver.ChromeOptions()
+        options.binary_location = str(BROWSER[0])
+        for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1280,1200"):
+            options.add_argument(argument)
+        self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(str(BROWSER[1])))
+
+    def run(self, script: str) -> Any:
+        return self.driver.execute_script(script)  # type: ignore[no-untyped-call]
+
+    def value(self, script: str, seconds: float = 60.0) -> Any:
         until = time.monotonic() + seconds
-        while not (found := browser.execute_script(f"return {script}")):
-            assert time.monotonic() < until, (script, browser.execute_script("return window.stats"))
+        while not (found := self.run(f"return {script}")):
+            assert time.monotonic() < until, (script, self.run("return window.stats"))
             time.sleep(0.05)
         return found
 
-    def press(selector: str) -> None:
-        before = browser.execute_script("return stats.answers.length")
-        browser.find_element(By.CSS_SELECTOR, selector).click()
-        value(f"stats.answers.length > {before}")
-        _, accepted, text = browser.execute_script("return stats.answers.at(-1)")
+    def element(self, selector: str) -> Any:
+        return self.driver.find_element("css selector", selector)
+
+    def press(self, selector: str) -> None:
+        before = self.run("return stats.answers.length")
+        self.element(selector).click()
+        self.value(f"stats.answers.length > {before}")
+        _, accepted, text = self.run("return stats.answers.at(-1)")
         assert accepted, text
 
-    try:
-        with serving(demo, "--operate", "ann") as served:
-            browser.get(served["url"])
-            value("window.stats && stats.pictures > 3")
-            browser.find_element(By.ID, "token").send_keys(served["token"])
-            press("#take button")
-            press("[data-do=enable]")
-            press("[data-do=calibrate]")
-            value("stats.events.some(event => event[0] === 'calibrated')", 600.0)
-            value("document.getElementById('calibration').textContent.startsWith('Calibrated')")
-            for k, (du, dv) in enumerate(((40, 20), (-30, 25), (20, -35), (-35, -15))):
-                canvas = browser.find_element(
-                    By.CSS_SELECTOR, f"canvas[data-camera={('left', 'right')[k % 2]}]"
+    def drag(self, camera: str, to: tuple[float, float]) -> None:
+        """Drag the outline so that the middle of the markers comes to pixel ``to``."""
+        from selenium.webdriver.common.action_chains import ActionChains
+
+        canvas = self.element(f"canvas[data-camera={camera}]")
+        self.run("window.scrollTo(0, 0); stats.dragged = stats.goal = null")
+        width, height = canvas.size["width"], canvas.size["height"]
+        scale = width / 640
+        begin, end = (
+            [round(scale * v) for v in pixel] for pixel in (self.value(f"stats.middle('{camera}')"), to)
+        )
+        ActionChains(self.driver).move_to_element_with_offset(
+            canvas, begin[0] - width // 2, begin[1] - height // 2
+        ).click_and_hold().move_by_offset(end[0] - begin[0], end[1] - begin[1]).release().perform()
+        self.value("stats.dragged")
+
+    def require_room(self, width: int, folder: Path) -> None:
+        """Nothing is cut off at the side of a window of this width, in the light and in the dark."""
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+        self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        for scheme in ("light", "dark"):
+            features = [{"name": "prefers-color-scheme", "value": scheme}]
+            self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+            assert self.value("document.documentElement.scrollWidth") <= width
+            self.driver.save_screenshot(str(folder / f"page-{width}-{scheme}.png"))
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    if None in BROWSER or importlib.util.find_spec("selenium") is None:
+        pytest.skip("needs chromium and chromium-driver (Debian's packages) and selenium")
+    found = Browser()
+    yield found
+    found.driver.quit()
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(1200)
+def test_in_a_browser_the_cell_is_calibrated_and_twenty_dragged_goals_are_reached(
+    demo: str, browser: Browser, tmp_path: Path
+) -> None:
+    rng = random.Random(18)
+    with serving(demo, "--operate", "ann") as served:
+        browser.driver.get(served["url"])
+        browser.value("window.stats && stats.pictures > 3")
+        browser.element("#token").send_keys(served["token"])
+        browser.press("#take button")
+        browser.press("[data-do=enable]")
+        browser.press("[data-do=calibrate]")
+        browser.value("stats.events.some(event => event[0] === 'calibrated')", 600.0)
+        browser.value("document.getElementById('calibration').textContent.startsWith('Calibrated')")
+        middle = {camera: browser.value(f"stats.middle('{camera}')") for camera in ("left", "right")}
+        ends = []
+        for k in range(20):
+            camera = ("left", "right")[k % 2]
+            u, v = middle[camera]
+            browser.drag(camera, (u + rng.uniform(-50.0, 50.0), v + rng.uniform(-40.0, 40.0)))
+            browser.press("#check")
+            browser.press("#go")
+            goal = browser.value("stats.goal")
+            ends.append(
+                browser.value(
+                    f"stats.events.find(e => e[1] === '{goal}' && /goal_(reached|aborted)/.test(e[0]))", 120.0
                 )
-                browser.execute_script("window.scrollTo(0, 0); stats.dragged = stats.goal = null")
-                u, v = value(f"stats.middle('{('left', 'right')[k % 2]}')")
-                scale = canvas.size["width"] / 640
-                ActionChains(browser).move_to_element_with_offset(
-                    canvas,
-                    int(u * scale - canvas.size["width"] / 2),
-                    int(v * scale - canvas.size["height"] / 2),
-                ).click_and_hold().move_by_offset(int(du * scale), int(dv * scale)).release().perform()
-                value("stats.dragged")
-                press("#check")
-                press("#go")
-                goal = value("stats.goal")
-                end = value(
-                    f"stats.events.find(e => e[1] === '{goal}' && /goal_(reached|aborted)/.test(e[0]))"
-                )
-                assert end[0] == "goal_reached", end
-                assert end[2] < 0.5, "px"
-            for width in (1280, 390):
-                size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
-                browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-                assert value("document.documentElement.scrollWidth") <= width, (
-                    "nothing is cut off at the side"
-                )
-                assert browser.find_element(By.ID, "stop").is_displayed()
-                browser.save_screenshot(str(tmp_path / f"page-{width}.png"))
-            browser.execute_script("dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
-            value("stats.answers.at(-1)[0] === 'stop' && stats.answers.at(-1)[1]")
-    finally:
-        browser.quit()
+            )
+        assert [end for end in ends if end[0] != "goal_reached" or end[2] > 0.5] == [], "with their reasons"
+        for width in (1280, 390):
+            browser.require_room(width, tmp_path)
+            assert browser.element("#stop").is_displayed()
+        browser.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
+        browser.value("stats.answers.at(-1)[0] === 'stop' && stats.answers.at(-1)[1]")
+
+
+@pytest.mark.slow
+@pytest.mark.process
+def test_in_a_browser_a_recording_is_played(browser: Browser, tmp_path: Path) -> None:
+    flight = tmp_path / "flight.mcap"
+    record_bench(flight, 400)
+    with serving("--flight", str(flight)) as served:
+        browser.driver.get(served["url"])
+        browser.value("document.getElementById('at').textContent.startsWith('3.99 of 3.99 s, ')")
+        assert browser.value("document.getElementById('play').textContent") == "Play", "it is at its end"
+        browser.run(
+            "const bar = document.getElementById('time'); bar.value = 2.5; bar.dispatchEvent(new Event('input'))"
+        )
+        browser.value("document.getElementById('at').textContent.startsWith('2.50 of 3.99 s, ')")
+        browser.value("stats.events.some(event => event[0] === 'goal_started')")
+        green = """(() => {
+            const canvas = document.querySelector('canvas[data-camera=left]');
+            const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+            let found = 0;
+            for (let i = 0; i < data.length; i += 4)
+                found += data[i + 1] > 150 && data[i] < 120 && data[i + 2] < 160 && data[i + 3] > 0;
+            return found;
+        })()"""
+        assert browser.value(green) > 100, "markers are drawn"
+        browser.press("#play")
+        browser.value("document.getElementById('at').textContent.startsWith('3.99 of 3.99 s, ')")
+        for hidden in ("#stop", "#controls", "#go"):
+            assert not browser.element(hidden).is_displayed()
+        for width in (1280, 390):
+            browser.require_room(width, tmp_path)

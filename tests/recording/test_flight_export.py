@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import re
 import subprocess
 import sys
-import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,17 +14,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from core.conftest import Bench, make_bench
+from core.conftest import Bench
+from recording.bench_flight import record_bench
+from recording.foxglove_schemas import decode_by_schema
 from stereoservo.cli import main as cli
-from stereoservo.core.state_encoding import encode_state
-from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
-from stereoservo.messages.recording_request import images_directory
-from stereoservo.ports.devices import Frame
-from stereoservo.ports.image_files import ImageWriter
-from stereoservo.recording.flight_recorder import FlightRecorder
+from stereoservo.messages.goals import FeatureTarget
 from stereoservo.recording.replay import recorded_messages, replay
-from stereoservo.recording.step_layout import StepEncoder
-from stereoservo.recording.step_records import fingerprint
 
 for needed in ("foxglove", "google.protobuf", "jsonschema"):
     pytest.importorskip(needed, reason=f"{needed} is of the extra `test`")
@@ -53,49 +46,19 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """Four seconds towards a goal, with pictures of one camera."""
     folder = tmp_path_factory.mktemp("flight")
     flight, file = folder / "flight.mcap", folder / "flight.foxglove.mcap"
-    bench = make_bench(0, 0.02, k1=-0.1).ready()
-    encoder = StepEncoder()
-    target = FeatureTarget(bench.features(bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])))
-    images_directory(flight).mkdir()
-    pictures = ImageWriter(images_directory(flight) / "left.avi", "left", (64, 48), 30.0, driver="fake")
-    with FlightRecorder(flight, bench.settings, fingerprint()) as recorder, pictures:
-        recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
-        for k in range(STEPS):
-            outputs = bench.step(*([RunGoal(Goal(str(uuid.UUID(int=1)), target))] if k == 5 else []))
-            inputs = bench.log[-1][0]
-            recorder.step(encoder.encode(inputs, outputs), inputs.now_ns)
-            if k % 100 == 0:
-                image = np.full((48, 64), k // 4, dtype=np.uint8)
-                pictures.append(Frame("left", k, inputs.now_ns, inputs.now_ns, image))
+    bench, target = record_bench(flight, STEPS)
     assert cli.invoke(["export", str(flight), "--json"]) == 0
     return Exported(bench, flight, file, target)
 
 
 def decoded(file: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Messages with a schema, by topic with their times: by google's protobuf from the schema in the file, or JSON
-    that its JSON Schema has accepted.
-    """
-    import jsonschema
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-
+    """Messages with a schema, by topic with their times."""
     found: dict[str, list[tuple[int, Any]]] = {}
     with file.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
-            if schema is None:
-                continue
-            if channel.message_encoding == "json":
-                content = json.loads(message.data)
-                jsonschema.validate(content, json.loads(schema.data))
-            else:
-                pool = descriptor_pool.DescriptorPool()
-                for part in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
-                    pool.Add(part)  # type: ignore[no-untyped-call]
-                kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
-                content = kind.FromString(message.data)
-                known = kind.FromString(message.data)
-                known.DiscardUnknownFields()
-                assert known.ByteSize() == content.ByteSize() == len(message.data), channel.topic
-            found.setdefault(channel.topic, []).append((message.log_time, content))
+            if schema is not None:
+                content = decode_by_schema(channel.message_encoding, schema.name, schema.data, message.data)
+                found.setdefault(channel.topic, []).append((message.log_time, content))
     return found
 
 

@@ -1,5 +1,7 @@
 """Hosts, origins, tokens, and the one page that holds the arm."""
 
+import socket
+
 import pytest
 
 from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
@@ -8,7 +10,7 @@ from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_
 def test_only_this_servers_names_are_hosts() -> None:
     loopback = allowed_hosts("127.0.0.1", 8080)
     for host in ("127.0.0.1:8080", "localhost:8080", "LOCALHOST:8080", "[::1]:8080"):
-        check_host(host, loopback)
+        check_host(host, loopback, "127.0.0.1", 8080)
     for host in (
         None,
         "",
@@ -19,8 +21,18 @@ def test_only_this_servers_names_are_hosts() -> None:
         "127.0.0.1:8080:1",
     ):
         with pytest.raises(RightsError):
-            check_host(host, loopback)
-    assert allowed_hosts("10.0.0.5", 443) == {"10.0.0.5:443", "10.0.0.5"}
+            check_host(host, loopback, "127.0.0.1", 8080)
+    assert {"10.0.0.5:443", "10.0.0.5"} < allowed_hosts("10.0.0.5", 443)
+
+
+def test_a_server_beyond_loopback_has_this_computers_names_and_those_given() -> None:
+    names = allowed_hosts("0.0.0.0", 8443, ["Cell.example", "fd00::5"])
+    computer = socket.gethostname()
+    for host in (f"{computer}:8443", "cell.example:8443", "[fd00::5]:8443", "10.0.0.5:8443"):
+        check_host(host, names, "10.0.0.5", 8443)
+    for host in ("evil.example:8443", "10.0.0.6:8443", "10.0.0.5", "10.0.0.5:8444", "localhost:8443"):
+        with pytest.raises(RightsError, match="--host NAME"):
+            check_host(host, names, "10.0.0.5", 8443)
 
 
 def test_another_pages_origin_is_refused() -> None:

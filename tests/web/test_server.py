@@ -2,7 +2,9 @@
 
 import asyncio
 import http.client
+import json
 import random
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,12 +22,23 @@ from websockets.sync.client import ClientConnection, connect
 from stereoservo.client import Client, ClientError
 from stereoservo.messages.goals import Goal, TaughtTarget
 from stereoservo.messages.wire import Reply
+from stereoservo.web import server as page_server
 from stereoservo.web.cell_link import CellLink, Publish
+from stereoservo.web.model_view import ModelView
 from stereoservo.web.requests import PageRequest
 from stereoservo.web.server import PageServer
 
 EXAMPLE = Client.make_goal(TaughtTarget("a"))
 VERBS = [kind.__struct_config__.tag for kind in PageRequest.__args__]
+NEEDED: dict[str, dict[str, Any]] = {
+    "take": {"token": "guess"},
+    "teach": {"name": "a"},
+    "drag": {"camera": "left", "shift": [1, 1]},
+    "send": {"goal": msgspec.to_builtins(EXAMPLE)},
+    "update": {"id": EXAMPLE.id, "target": {"kind": "features", "set_points": {}}},
+    "seek": {"at": 1.0},
+}
+"""What a request must hold beside its verb."""
 
 
 class NotedClient:
@@ -46,7 +59,8 @@ class NotedLink(NotedClient):
     """A `CellLink` without a cell."""
 
     cell = "noted"
-    drag_model = None
+    recording = False
+    view = ModelView()
     publish: Publish
 
     def __init__(self, calls: list[str]) -> None:
@@ -115,12 +129,8 @@ def fuzzed(rng: random.Random) -> str | bytes:
     }  # fmt: skip
     for key in rng.sample(sorted(fields), rng.randint(0, 3)):
         tree[key] = fields[key]
-    if verb in ("take", "teach", "drag") and rng.random() < 0.5:
-        tree |= {
-            "take": {"token": "guess"},
-            "teach": {"name": "a"},
-            "drag": {"camera": "left", "shift": [1, 1]},
-        }[verb]
+    if rng.random() < 0.5:
+        tree |= NEEDED.get(verb, {})
     data = bytearray(msgspec.json.encode(tree))
     match rng.randint(0, 5):
         case 0:
@@ -151,12 +161,9 @@ def test_a_thousand_fuzzed_requests_of_a_read_only_page_command_nothing_but_stop
 def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
     with serving("ann") as (port, calls, tokens, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
         requests = [
-            {
-                "do": verb,
-                **{"teach": {"name": "a"}, "drag": {"camera": "left", "shift": [0, 0]}}.get(verb, {}),
-            }
+            {"do": verb, **NEEDED.get(verb, {})}
             for verb in VERBS
-            if verb not in ("stop", "take", "release")
+            if verb not in ("stop", "take", "release", "play", "seek")
         ]
         for n, request in enumerate(requests, 1):
             assert "does not hold the arm" in answer(page, request, n)["message"]
@@ -205,6 +212,27 @@ def test_a_page_that_does_not_read_is_sent_no_more_pictures_until_it_has() -> No
         assert int.from_bytes(message[:4], "little") == count - 1, "the newest of all"
 
 
+def frame(text: str) -> bytes:
+    """A masked WebSocket frame of a short text, by the letter of RFC 6455."""
+    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text.encode()
+
+
+def test_a_page_that_answers_no_ping_lets_the_arm_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_server, "PING_S", 0.2)
+    monkeypatch.setattr(page_server, "SILENT_S", 0.2)
+    with serving("ann") as (port, _, tokens, link), socket.create_connection(("127.0.0.1", port)) as frozen:
+        frozen.sendall(
+            f"GET /socket HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+        )
+        frozen.sendall(frame(json.dumps({"do": "take", "token": tokens[0]})))  # and nothing from here on
+        with connect(f"ws://127.0.0.1:{port}/socket") as other:
+            while "held the arm lost its connection" not in str(other.recv(timeout=20)):
+                pass
+            assert answer(other, {"do": "take", "token": tokens[1]}, 1)["ok"]
+        assert link.ended >= 1
+
+
 def test_a_stop_waits_for_nothing_that_a_page_has_asked_for() -> None:
     free = Event()
     with serving("ann") as (port, calls, tokens, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
@@ -246,6 +274,38 @@ def test_a_goal_is_not_sent_where_another_was_asked_for_while_it_was_checked() -
             pass
         assert "check the goal first" in answer(page, {"do": "go"}, 4)["message"]
         assert "send" not in calls
+
+
+def test_a_page_of_a_recording_commands_nothing_not_even_a_stop() -> None:
+    with serving("ann") as (port, calls, _, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
+        link.recording = True
+        link.seek = lambda at: {"message": f"at {at}"}
+        for n, verb in enumerate(sorted(set(VERBS) - {"play", "seek"}), 1):
+            told = answer(page, {"do": verb, **NEEDED.get(verb, {})}, n)
+            assert not told["ok"]
+        assert "play and seek are valid" in told["message"]
+        assert answer(page, {"do": "seek", "at": 3.0}, 100)["message"] == "at 3.0"
+        assert calls == []
+
+
+@pytest.mark.parametrize(
+    ("request_", "told"),
+    [
+        ('{"do": "dance", "n": 7}', ["dance", "stop", "enable"]),
+        ('{"do": "teach", "nmae": "a", "n": 7}', ["nmae", "name"]),
+        ('{"do": "teach", "n": 7}', ["`name`"]),
+        ('{"do": "send", "n": 7, "goal": {"id": "12345678", "target": {"kind": "taught", "name": "a", "tol": 1}}}',
+         ["goal.target", "`tol`", "relative_to"]),
+        ('{"do": "send", "n": 7, "goal": {"id": "12345678", "target": {"kind": "tought", "name": "a"}}}',
+         ["tought", "taught", "features"]),
+        ('{"n": 7}', ["`do`", "stop"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_key_is_named_with_what_would_be_valid(request_: str, told: list[str]) -> None:
+    with serving(None) as (port, _, _, _), connect(f"ws://127.0.0.1:{port}/socket") as page:
+        found = answer(page, request_, 7)
+        assert not found["ok"]
+        assert all(word in found["message"] for word in told), found
 
 
 def test_other_hosts_origins_and_paths_get_nothing() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import ssl
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -11,17 +13,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, note
 from stereoservo.messages.keys import InvalidKeyError, check_name
 
 if TYPE_CHECKING:
     from stereoservo.web.server import PageServer
 
+HOST_NAME = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def web(
-    cell: CellArgument,
+    cell: Annotated[
+        str | None,
+        typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml)."),
+    ] = None,
+    flight: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell."),
+    ] = None,
     port: Annotated[int, typer.Option(help="TCP port; 0: a free one.", min=0, max=65535)] = 8080,
     address: Annotated[
         str, typer.Option(help="Address to listen on; any but loopback needs --tls.")
@@ -29,6 +39,13 @@ def web(
     tls: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address."),
+    ] = None,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Another name under which browsers reach the server (a cell.example); repeat.",
+        ),
     ] = None,
     operate: Annotated[
         str | None,
@@ -40,15 +57,20 @@ def web(
     endpoint: EndpointOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Serve the operators' page, until Ctrl-C. Without --operate it shows the cell and may stop the arm."""
+    """Serve the operators' page, until Ctrl-C. Without --operate it shows the cell and may stop the arm.
+
+    With --flight it plays a recording, and commands nothing.
+    """
+    if (cell is None) == (flight is None):
+        raise CommandError(
+            "usage", "one of CELL, a live cell, and --flight FILE, a recording, is to be given"
+        )
+    if flight is not None and (operate is not None or endpoint is not None):
+        raise CommandError("usage", "--flight shows a recording: --operate and --endpoint are of a live CELL")
     context = _tls_context(address, tls)
-    if operate is not None:
-        try:
-            check_name("operator", operate)
-        except InvalidKeyError as error:
-            raise CommandError("usage", str(error)) from error
+    _check_names(host or [], operate)
     try:
-        from stereoservo.web.cell_link import CellLink
+        from stereoservo.web.cell_link import CellLink, Publish
         from stereoservo.web.server import PageServer
     except ModuleNotFoundError as error:
         if error.name != "websockets":
@@ -56,6 +78,14 @@ def web(
         raise CommandError(
             "missing", "the page needs the package websockets: pip install 'stereoservo[web]'"
         ) from error
+    make_link: Callable[[Publish], CellLink | FlightLink]
+    if flight is not None:
+        from stereoservo.web.flight_link import FlightLink
+
+        make_link = partial(FlightLink, flight)
+    else:
+        assert cell is not None
+        make_link = partial(CellLink, cell, endpoint, operate or "page", log=note)
     tokens: list[str] = []
 
     def announce(token: str) -> None:
@@ -63,9 +93,24 @@ def web(
         if len(tokens) > 1 or not json:
             note(f"token to command the arm as {operate}, good for one use: {token}")
 
-    server = PageServer(partial(CellLink, cell, endpoint, operate or "page"), operate, announce)
+    server = PageServer(make_link, operate, announce)
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(server, address, port, context, tokens, json))
+        asyncio.run(_serve(server, address, port, context, host or [], tokens, json))
+
+
+def _check_names(hosts: list[str], operator: str | None) -> None:
+    """Raises CommandError for a host or an operator that is no name."""
+    for name in hosts:
+        if not HOST_NAME.fullmatch(name):
+            raise CommandError(
+                "usage",
+                f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port",
+            )
+    if operator is not None:
+        try:
+            check_name("operator", operator)
+        except InvalidKeyError as error:
+            raise CommandError("usage", str(error)) from error
 
 
 async def _serve(
@@ -73,11 +118,12 @@ async def _serve(
     address: str,
     port: int,
     context: ssl.SSLContext | None,
+    names: list[str],
     tokens: list[str],
     as_json: bool,
 ) -> None:
     try:
-        found = await server.start(address, port, context)
+        found = await server.start(address, port, context, names)
     except OSError as error:
         await asyncio.to_thread(server.link.close)
         raise CommandError(

@@ -358,13 +358,13 @@ class Gateway:
         """Description of the cell, as served on ``info``."""
         model = self._calibration.model
         return cell_info(
-            self.plan,
             self.settings,
             self.boot,
             model,
             None if model is None else self._models.path(model.epoch),
             self._teaching.goals,
             self._recordings.path if self._recordings.running else "",
+            self.plan,
         )
 
     # -- events of the core --------------------------------------------------------------------------------

@@ -117,19 +117,7 @@ class EventLog:
 
     def add_core(self, event: Event, kind: str = "", operator: str = "") -> EventMessage:
         """Publish an event of the core."""
-        return self.add(
-            kind or event.kind,
-            t_ns=event.t_ns,
-            message=event.message,
-            id=event.id,
-            request=event.request,
-            operator=operator,
-            accepted=event.accepted,
-            reasons=event.reasons,
-            name=event.name,
-            error_px=event.error_px,
-            progress=event.progress,
-        )
+        return self.add(kind or event.kind, t_ns=event.t_ns, operator=operator, **core_event_fields(event))
 
     def since(self, number: int) -> EventList:
         """Events from ``number`` on, as many as fit into one reply."""
@@ -139,6 +127,20 @@ class EventLog:
         asked = range(offset, min(offset + EVENTS_A_REPLY, len(self._kept)))
         some = tuple(msgspec.json.decode(self._kept[i], type=EventMessage) for i in asked)
         return EventList(self._boot, first, begin + len(some), some)
+
+
+def core_event_fields(event: Event) -> dict[str, Any]:
+    """What of a core's event clients are told, beside its kind and time."""
+    return {
+        "message": event.message,
+        "id": event.id,
+        "request": event.request,
+        "accepted": event.accepted,
+        "reasons": event.reasons,
+        "name": event.name,
+        "error_px": event.error_px,
+        "progress": event.progress,
+    }
 
 
 class KeeperNotes:
@@ -164,20 +166,24 @@ class KeeperNotes:
             self._log.add("warning", message=text, origin="gateway")
 
 
-def features_message(observation: CameraObservation) -> FeaturesMessage:
-    """An observation in the clients' format. Raises MessageError for numbers that are not finite."""
+def features_message(observation: CameraObservation, shift_ns: int | None = None) -> FeaturesMessage:
+    """An observation in the clients' format; ``shift_ns``: wall clock less its clock (None: this host's, as of now).
+
+    Raises MessageError for numbers that are not finite.
+    """
     if not (np.isfinite(observation.pixels).all() and np.isfinite(observation.covariances).all()):
         raise MessageError(
             f"camera {observation.camera}: frame {observation.seq} holds numbers that are not finite"
         )
-    now_ns = time.monotonic_ns()
+    if shift_ns is None:
+        shift_ns = time.time_ns() - time.monotonic_ns()
     sigmas = np.sqrt(0.5 * np.trace(observation.covariances, axis1=1, axis2=2))
     return FeaturesMessage(
         camera=observation.camera,
         seq=observation.seq,
         t_shutter_ns=observation.t_shutter_ns,
         t_received_ns=observation.t_received_ns,
-        t_wall=time.time() - (now_ns - observation.t_shutter_ns) * 1e-9,
+        t_wall=(observation.t_shutter_ns + shift_ns) * 1e-9,
         ids=tuple(observation.ids.tolist()),
         pixels=tuple((u, v) for u, v in observation.pixels.tolist()),
         sigmas=tuple(sigmas.tolist()),
@@ -250,15 +256,15 @@ class Publishers:
 
 
 def cell_info(
-    plan: RunPlan,
     settings: CoreSettings,
     boot: str,
     model: CellModel | None,
     model_path: Path | None,
     taught: dict[str, TaughtGoal],
     recording: str,
+    plan: RunPlan | None,
 ) -> CellInfo:
-    """Description of the cell: joints, cameras, laws, model, taught goals."""
+    """Description of the cell: joints, cameras, laws, model, taught goals; and of its run, with a ``plan``."""
     limits = settings.limits
     return CellInfo(
         cell=settings.cell,
@@ -305,8 +311,8 @@ def cell_info(
         ),
         can_calibrate=settings.trials is not None,
         can_home=settings.home is not None,
-        dry_run=plan.dry_run,
-        commissioning=plan.commissioning,
+        dry_run=plan is not None and plan.dry_run,
+        commissioning=plan is not None and plan.commissioning,
         recording=recording,
-        auxiliary=plan.joints.auxiliary,
+        auxiliary=() if plan is None else plan.joints.auxiliary,
     )

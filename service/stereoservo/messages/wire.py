@@ -6,10 +6,10 @@ import functools
 import math
 import re
 from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar
 
 import msgspec
-from msgspec import Meta
+from msgspec import Meta, inspect
 
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import (
@@ -32,7 +32,6 @@ from stereoservo.messages.goals import (
     RenewGoal,
     Reset,
     Resume,
-    Target,
     Teach,
     UpdateGoal,
 )
@@ -434,41 +433,100 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
     if where.startswith("key` in `"):
         return f"a key of {where.removeprefix('key` in `$.').rstrip('`')}: {text}"
     place = where.rstrip("`").removeprefix("$").lstrip(".")
-    if not place:
-        known = getattr(kind, "__struct_fields__", ()) if "unknown field" in text else ()
-        return text + (f"; known: {', '.join(known)}" if known else "")
     try:
         value: Any = msgspec.json.decode(data)
     except (
         Exception
     ):  # values that the typed decoder, which ends at the first error, did not reach; only the place is named
-        return f"{place}: {text}"
-    for part in place.split("."):
-        value = value.get(part) if isinstance(value, dict) and "[" not in part else None
-    given = (
-        "" if value is None or isinstance(value, dict | list) or repr(value) in text else f", got {value!r}"
+        return f"{place}: {text}" if place else text
+    at = f"{place}: " if place else ""
+    parts = place.replace("[", ".[").split(".") if place else []
+    if "field `" in text:  # an unknown one, or one that is missing
+        known = _keys(_type_at(kind, value, parts), _value_at(value, parts), text.split("`")[1])
+        return at + text + (f"; {known}" if known else "")
+    given = _value_at(value, parts)
+    said = (
+        "" if given is None or isinstance(given, dict | list) or repr(given) in text else f", got {given!r}"
     )
-    words = _valid_words().get(place, ()) if text.startswith("Invalid ") else ()
-    return f"{place}: {text}{given}" + (f"; valid: {', '.join(words)}" if words else "")
+    words = _words(_type_at(kind, value, parts), parts[-1]) if text.startswith("Invalid ") and parts else ()
+    return at + text + said + (f"; valid: {', '.join(words)}" if words else "")
 
 
-@functools.cache
-def _valid_words() -> dict[str, tuple[str, ...]]:
-    """Valid values of those fields of a goal that take one of a few words, by the field's place in the message."""
-    return {
-        **{
-            field.name: tuple(
-                word
-                for part in get_args(field.type)
-                for word in get_args(part) or (part,)
-                if isinstance(word, str)
-            )
-            for field in msgspec.structs.fields(Goal)
-        },
-        "target.kind": tuple(str(target.__struct_config__.tag) for target in get_args(Target)),
-        "target.relative_to": ("workpiece", "cameras"),
-        "command": ("renew", "update", "acknowledge", "cancel"),
-    }
+_described = functools.cache(inspect.type_info)
+
+
+def _members(found: Any) -> list[Any]:
+    """The types of which a value of type ``found`` is one."""
+    if isinstance(found, inspect.Metadata):
+        return _members(found.type)
+    if isinstance(found, inspect.UnionType):
+        return [member for part in found.types for member in _members(part)]
+    return [] if found is None else [found]
+
+
+def _structs(found: Any) -> list[inspect.StructType]:
+    return [member for member in _members(found) if isinstance(member, inspect.StructType)]
+
+
+def _struct_of(found: Any, value: Any) -> inspect.StructType | None:
+    """The struct of type ``found`` that ``value`` is meant to be, by its tag where there are several."""
+    structs = _structs(found)
+    if len(structs) == 1:
+        return structs[0]
+    given = value if isinstance(value, dict) else {}
+    return next((s for s in structs if s.tag_field and given.get(s.tag_field) == s.tag), None)
+
+
+def _value_at(value: Any, parts: Sequence[str]) -> Any:
+    """What stands at a place of a decoded message; None where that is not known."""
+    for part in parts:
+        if isinstance(value, list) and part.startswith("[") and part[1:-1].isdigit():
+            value = value[int(part[1:-1])]
+        else:
+            value = value.get(part) if isinstance(value, dict) else None
+    return value
+
+
+def _type_at(kind: Any, value: Any, parts: Sequence[str]) -> Any:
+    """The type of what is to stand at a place of a message of ``kind``, for which ``value`` was given; of a tag, the
+    type of its object. None where nobody can say.
+    """
+    found: Any = _described(kind)
+    for k, part in enumerate(parts):
+        if part.startswith("["):
+            inner = [
+                getattr(member, "item_type", getattr(member, "value_type", None))
+                for member in _members(found)
+            ]
+            found = next(filter(None, inner), None)
+        elif any(struct.tag_field == part for struct in _structs(found)):
+            return found
+        else:
+            struct = _struct_of(found, _value_at(value, parts[:k]))
+            fields = () if struct is None else struct.fields
+            found = next((field.type for field in fields if field.encode_name == part), None)
+    return found
+
+
+def _keys(found: Any, value: Any, missing: str) -> str:
+    """The keys that an object of type ``found`` has, or the words for its tag where that is ``missing``."""
+    struct = _struct_of(found, value)
+    if struct is None:
+        words = _words(found, missing)
+        return f"valid: {', '.join(words)}" if words else ""
+    return f"known: {', '.join(field.encode_name for field in struct.fields)}"
+
+
+def _words(found: Any, name: str) -> tuple[str, ...]:
+    """The words that are valid for the key ``name`` of type ``found``; empty where it is not one of a few."""
+    tags = tuple(str(struct.tag) for struct in _structs(found) if struct.tag_field == name)
+    return tags or tuple(
+        str(word)
+        for member in _members(found)
+        if isinstance(member, inspect.LiteralType)
+        for word in member.values
+        if isinstance(word, str)
+    )
 
 
 def _require_bounded(tree: Any) -> None:

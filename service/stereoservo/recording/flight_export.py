@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import msgspec
 from foxglove.messages import CompressedImage
 from mcap.writer import CompressionType, Writer
 
 from stereoservo.core.cycle import Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state_encoding import decode_state
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import RunGoal
 from stereoservo.messages.recording_request import images_directory
@@ -36,7 +34,13 @@ from stereoservo.recording.foxglove_channels import (
     set_points_of,
     stamp,
 )
-from stereoservo.recording.replay import RecordingError, ReplayResult, recorded_messages, replay
+from stereoservo.recording.replay import (
+    RecordingError,
+    ReplayResult,
+    recorded_span,
+    replay,
+    whole_messages,
+)
 from stereoservo.recording.step_layout import decode_step
 
 STATE_EVERY_NS = 50_000_000
@@ -164,8 +168,7 @@ class ExportResult:
 def export_flight(source: Path, target: Path) -> ExportResult:
     """Write ``target``: the recording ``source`` with Foxglove's channels, and its pictures where it has them.
 
-    The recording's clock counts from a computer's start; its last step is taken for the moment at which the file was
-    last changed. Raises RecordingError, ImageFileError, FileExistsError, OSError.
+    Raises RecordingError, ImageFileError, FileExistsError, OSError.
     """
     if target.exists():
         raise FileExistsError(f"{target} exists; name another file with --output, or remove it")
@@ -184,14 +187,14 @@ def export_flight(source: Path, target: Path) -> ExportResult:
 
 def _fill(file: _File, source: Path, target: Path) -> ExportResult:
     """Copy the recording, replay it, add pictures."""
-    first_ns, last_ns, models = _read(source)
-    shift_ns = source.stat().st_mtime_ns - last_ns
+    span = recorded_span(source)
+    shift_ns = span.shift_ns
     channels: FlightChannels | None = None
     incomplete = ""
 
     def begin(settings: CoreSettings) -> None:
         nonlocal channels
-        channels = FlightChannels(settings, shift_ns, models)
+        channels = FlightChannels(settings, shift_ns, span.models)
 
     def observe(inputs: StepInputs, outputs: StepOutputs) -> None:
         assert channels is not None
@@ -204,48 +207,18 @@ def _fill(file: _File, source: Path, target: Path) -> ExportResult:
         if error.result is None or not error.cut:
             raise
         result, incomplete = error.result, str(error)
-    _copy(file, source, first_ns + shift_ns, shift_ns)
+    _copy(file, source, span.first_ns + shift_ns, shift_ns)
     for video in sorted(images_directory(source).glob("*.avi")):
         _add_pictures(file, video, shift_ns)
     return ExportResult(target, result, dict(file.counts), incomplete)
 
 
-def _read(source: Path) -> tuple[int, int, dict[int, CellModel]]:
-    """Times [ns] of the first and last step, and the models of the first state. Raises RecordingError."""
-    first_ns = last_ns = 0
-    models: dict[int, CellModel] = {}
-    begun = False
-    for topic, data in _whole(source):
-        if topic == "checkpoint" and not begun:
-            begun = True
-            try:
-                state = decode_state(msgspec.msgpack.decode(data)[1])
-            except Exception:  # whatever is wrong with it, the replay says it
-                continue
-            models = {m.epoch: m for m in (state.model, state.pending_model) if m is not None}
-        elif topic == "step":
-            last_ns = decode_step(data).inputs.now_ns
-            first_ns = first_ns or last_ns
-    return first_ns, last_ns, models
-
-
 def _copy(file: _File, source: Path, t_ns: int, shift_ns: int) -> None:
     """The recording's own messages, at the wall clock's time of the step that they belong to."""
-    for topic, data in _whole(source):
+    for topic, data in whole_messages(source):
         if topic == "step":
             t_ns = decode_step(data).inputs.now_ns + shift_ns
         file.copy(topic, data, t_ns)
-
-
-def _whole(source: Path) -> Iterator[tuple[str, bytes]]:
-    """The recording's messages, without those that another export has added; up to where it is cut, if it is."""
-    try:
-        for topic, data in recorded_messages(source):
-            if topic in ("header", "step", "checkpoint", "gap"):
-                yield topic, data
-    except RecordingError as error:
-        if not error.cut:
-            raise
 
 
 def _add_pictures(file: _File, video: Path, shift_ns: int) -> None:

@@ -24,6 +24,7 @@ from stereoservo.core.cycle import StepInputs, StepOutputs, decode_array
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state_encoding import StateVersionError, decode_state, is_recorded
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import DamagedError, cause_of, decoding
 from stereoservo.messages.goals import IncidenceTarget, JointTarget, RunGoal
 from stereoservo.recording.compression import LARGEST, Checkpoints, StepBlocks
@@ -288,6 +289,51 @@ def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
                 stated = record.message_count
         if stated != messages:  # a reader skips records of kinds that it does not know: a damaged kind is one
             raise ValueError(f"it states {stated} messages and {messages} were read")
+
+
+@dataclass(frozen=True)
+class RecordedSpan:
+    """What is known of a recording before it is replayed: times [ns] of its first and last step, by its own clock, and
+    the models of its first state, by epoch.
+
+    ``shift_ns``: wall clock less that clock, which counts from a computer's start: the last step is taken for the time
+    when the file was last changed.
+    """
+
+    first_ns: int
+    last_ns: int
+    models: dict[int, CellModel]
+    shift_ns: int
+
+
+def recorded_span(source: Path) -> RecordedSpan:
+    """The span of a recording, up to where it is cut. Raises RecordingError."""
+    first_ns = last_ns = 0
+    models: dict[int, CellModel] = {}
+    begun = False
+    for topic, data in whole_messages(source):
+        if topic == "checkpoint" and not begun:
+            begun = True
+            try:
+                state = decode_state(msgspec.msgpack.decode(data)[1])
+            except Exception:  # whatever is wrong with it, the replay says it
+                continue
+            models = {m.epoch: m for m in (state.model, state.pending_model) if m is not None}
+        elif topic == "step":
+            last_ns = decode_step(data).inputs.now_ns
+            first_ns = first_ns or last_ns
+    return RecordedSpan(first_ns, last_ns, models, source.stat().st_mtime_ns - last_ns)
+
+
+def whole_messages(source: Path) -> Iterator[tuple[str, bytes]]:
+    """The recording's messages, without those that another export has added; up to where it is cut, if it is."""
+    try:
+        for topic, data in recorded_messages(source):
+            if topic in ("header", "step", "checkpoint", "gap"):
+                yield topic, data
+    except RecordingError as error:
+        if not error.cut:
+            raise
 
 
 def _records(source: _BoundedFile) -> Iterator[McapRecord]:

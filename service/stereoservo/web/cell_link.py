@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -23,12 +23,11 @@ from stereoservo.client.connection import read_message
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.model import ModelFileError, decode_model
 from stereoservo.messages.discovery import NotRunningError
-from stereoservo.messages.goals import Calibrate, FeatureTarget, Goal, TaughtTarget
+from stereoservo.messages.goals import Calibrate, FeatureTarget, Goal, TaughtTarget, UpdateGoal
 from stereoservo.messages.wire import CellInfo, EventMessage, FeaturesMessage, Reply, StateMessage, encode
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.web.drag_goal import DragModel
 from stereoservo.web.leases import LEASE_S, Leases
-from stereoservo.web.scene import Scene
+from stereoservo.web.model_view import ModelView
 
 POLL_S = 0.004
 AGAIN_S = 0.25
@@ -46,17 +45,28 @@ class CellLink:
     """Reads a cell and commands it. ``publish(slot, message, keep)``: a message for all pages, as JSON text or, of
     pictures, bytes; of one slot only the newest counts, unless the slot is empty; ``keep``: new pages get it, too.
 
+    ``log``: called with a line on every motion that was aborted or failed, with all its reasons.
+
     Raises NotRunningError, SessionError, ClientError where the cell cannot be reached at the start.
     """
 
-    def __init__(self, cell: str, endpoint: str | None, operator: str, publish: Publish) -> None:
+    recording: Literal[False] = False
+
+    def __init__(
+        self,
+        cell: str,
+        endpoint: str | None,
+        operator: str,
+        publish: Publish,
+        log: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._log = log
         self._connect: Callable[[], Client] = partial(Client, cell, endpoint=endpoint, operator=operator)
         self._publish = publish
         self._client: Client | None = self._connect()
         self.cell = self._client.cell
         self.info: CellInfo = self._client.info()
-        self.drag_model: DragModel | None = None
-        self._scene: Scene | None = None
+        self.view = ModelView()
         self._epoch = -1
         self._seen: dict[str, FeaturesMessage] = {}
         self._state: StateMessage | None = None
@@ -141,18 +151,11 @@ class CellLink:
         self._state = state
         if state.model_epoch != self._epoch:
             self._load_model(client, state.model_epoch)
-        predicted: dict[str, Any] = {}
-        scene = None
-        joints = np.array(list(state.joints.values()))
-        model = self.drag_model
-        if model is not None and joints.shape == model.model.zero.shape and np.isfinite(joints).all():
-            predicted = _by_camera(model, model.pixels(joints))
-            scene = None if self._scene is None else self._scene.at(joints)
-        self._tell("state", {"state": msgspec.Raw(data), "predicted": predicted, "scene": scene}, keep=True)
+        self._tell("state", {"state": msgspec.Raw(data), **self.view.at(state)}, keep=True)
 
     def _load_model(self, client: Client, epoch: int) -> None:
         self._epoch = epoch
-        self.drag_model = self._scene = None
+        self.view = ModelView()
         if epoch == 0:
             return
         try:
@@ -162,9 +165,7 @@ class CellLink:
         except (ClientError, ModelFileError) as error:
             self._tell("", {"notice": f"the model cannot be shown: {error}", "t_wall": time.time()})
             return
-        limits = np.array([[joint.position_min, joint.position_max] for joint in self.info.joints])
-        self.drag_model = DragModel(model, limits)
-        self._scene = Scene.of(model)
+        self.view = ModelView.of(model, self.info)
 
     def _take_features(self, data: bytes) -> None:
         found = read_message("features", data, FeaturesMessage)
@@ -173,14 +174,16 @@ class CellLink:
 
     def _take_event(self, event: EventMessage) -> None:
         self._leases.take_event(event)
+        if event.kind.endswith(("_aborted", "_failed")):
+            at = time.strftime("%H:%M:%S", time.localtime(event.t_wall))
+            self._log(f"{at} {event.kind} {event.id}: {why(event)}")
         self._tell("", {"event": event})
 
     def _take_picture(self, sample: Any) -> None:
         if sample.attachment is None:  # no picture of a camera process
             return
-        header = bytes(sample.attachment.to_bytes())
         camera = str(sample.key_expr).rpartition("/")[2]
-        data = struct.pack("<I", len(header)) + header + sample.payload.to_bytes()
+        data = picture_message(sample.attachment.to_bytes(), sample.payload.to_bytes())
         self._publish(f"picture {camera}", data, False)
 
     def _tell_info(self, client: Client) -> None:
@@ -211,7 +214,7 @@ class CellLink:
 
         Raises LinkDownError, GeometryError.
         """
-        model = self.drag_model
+        model = self.view.model
         if model is None:
             raise LinkDownError("there is no model; calibrate first")
         set_points: dict[str, dict[int, tuple[float, float]]] = {}
@@ -247,6 +250,10 @@ class CellLink:
         with self._leases.held(goal.id):
             return client.request("goal", client.goal_key, encode(goal), GOAL_TIMEOUT_S)
 
+    def update(self, command: UpdateGoal) -> None:
+        """Move the set-points of a goal. Raises LinkDownError, MessageError."""
+        self.client.update(command.id, command.target, command.stamp_s)
+
     def calibrate(self, check: bool) -> Reply:
         """Begin a calibration, or a check motion; its events tell the rest. Raises ClientError, LinkDownError."""
         client = self.client
@@ -278,30 +285,23 @@ class CellLink:
         self._leases.end()
 
 
-def _by_camera(model: DragModel, pixels: FloatArray) -> dict[str, dict[int, list[float]]]:
-    """Pixels (c, m, 2) by camera and marker; those that are not there are left out."""
-    return {
-        camera: {
-            marker: pixel.tolist()
-            for marker, pixel in zip(model.model.marker_ids, shown, strict=True)
-            if np.isfinite(pixel).all()
-        }
-        for camera, shown in zip(model.cameras, pixels, strict=True)
-    }
+def why(event: EventMessage) -> str:
+    """What an event says of its reasons: its message, and codes, values and hints of them."""
+    found = [event.message] if event.message else []
+    for reason in event.reasons:
+        value = "" if reason.value is None else f" {reason.value:.4g}"
+        limit = "" if reason.threshold is None else f", limit {reason.threshold:.4g}"
+        subject = f" {reason.subject}" if reason.subject else ""
+        hint = "" if reason.hint in found else f": {reason.hint}"
+        found.append(
+            f"{reason.code}{subject}{f' ({value.strip()}{limit} {reason.unit})' if value else ''}{hint}"
+        )
+    return "; ".join(found) or "the daemon gave no reason, which is a fault of it"
 
 
-def drag_answer(model: DragModel, joints: FloatArray, camera: str, left_px: float) -> dict[str, Any]:
-    """What a page draws of a dragged posture: pixels, and the epipolar lines of the body's middle."""
-    pixels = model.pixels(joints)
-    c = model.cameras.index(camera)
-    u, v = pixels[c].mean(axis=0).tolist()
-    lines = model.epipolar_lines(camera, (u, v))
-    return {
-        "pixels": _by_camera(model, pixels),
-        "lines": {name: line.tolist() for name, line in lines.items()},
-        "left_px": left_px,
-        "camera": camera,
-    }
+def picture_message(header: bytes, jpeg: bytes) -> bytes:
+    """A picture as pages get it: the size of the header (4 bytes, little-endian), the header, a JPEG."""
+    return struct.pack("<I", len(header)) + bytes(header) + jpeg
 
 
 def refusal(error: Exception) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from stereoservo.messages.goals import Name
+from stereoservo.messages.goals import Goal, GoalId, Name, StreamedTarget
 from stereoservo.messages.wire import decode
 
 Number = Annotated[int, Meta(ge=0, le=2**53)]
@@ -97,9 +97,10 @@ class Drag(msgspec.Struct, frozen=True, tag="drag", tag_field="do", forbid_unkno
 
 
 class Check(msgspec.Struct, frozen=True, tag="check", tag_field="do", forbid_unknown_fields=True):
-    """Plan the taught goal ``name``, or without one the dragged goal. Nothing moves."""
+    """Plan the taught goal ``name``, or ``goal``, or without either the dragged goal. Nothing moves."""
 
     name: Name | None = None
+    goal: Goal | None = None
     n: Number = 0
 
 
@@ -109,9 +110,40 @@ class Go(msgspec.Struct, frozen=True, tag="go", tag_field="do", forbid_unknown_f
     n: Number = 0
 
 
+class Send(msgspec.Struct, frozen=True, tag="send", tag_field="do", forbid_unknown_fields=True):
+    """Send ``goal``, of any kind; its lease is the server's, which renews it while the page is open."""
+
+    goal: Goal
+    n: Number = 0
+
+
+class Update(msgspec.Struct, frozen=True, tag="update", tag_field="do", forbid_unknown_fields=True):
+    """Move the set-points of the goal ``id``; ``stamp_s``: the page's own time of them."""
+
+    id: GoalId
+    target: StreamedTarget
+    stamp_s: float | None = None
+    n: Number = 0
+
+
 class Cancel(msgspec.Struct, frozen=True, tag="cancel", tag_field="do", forbid_unknown_fields=True):
     """Cancel the active goal."""
 
+    n: Number = 0
+
+
+class Play(msgspec.Struct, frozen=True, tag="play", tag_field="do", forbid_unknown_fields=True):
+    """Of a recording: play it, ``speed`` times as fast, or pause."""
+
+    playing: bool = True
+    speed: Annotated[float, Meta(ge=0.05, le=50.0)] | None = None
+    n: Number = 0
+
+
+class Seek(msgspec.Struct, frozen=True, tag="seek", tag_field="do", forbid_unknown_fields=True):
+    """Of a recording: go to ``at`` [s] after its begin."""
+
+    at: Annotated[float, Meta(ge=0.0, le=1e7)]
     n: Number = 0
 
 
@@ -129,13 +161,31 @@ PageRequest = (
     | Drag
     | Check
     | Go
+    | Send
+    | Update
     | Cancel
+    | Play
+    | Seek
 )
 OPEN = (Stop, Take, Release)
 """What a page may ask that does not hold the arm."""
+PLAYBACK = (Play, Seek)
+"""What a page may ask of a recording, and of nothing else."""
+
+
+class _Numbered(msgspec.Struct):
+    n: Number = 0
 
 
 def decode_request(data: bytes) -> PageRequest:
     """A page's request. Raises MessageError, whatever the bytes."""
     kind: type[PageRequest] = PageRequest  # type: ignore[assignment]
     return decode(data, kind)
+
+
+def number_of(data: bytes) -> int:
+    """The number of a request that is not valid, which its answer repeats; 0 where it has none."""
+    try:
+        return msgspec.json.decode(data, type=_Numbered).n
+    except Exception:  # bytes of any kind
+        return 0

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import hmac
 import secrets
+import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from urllib.parse import urlsplit
 
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
@@ -17,17 +18,37 @@ class RightsError(Exception):
     """A request that is not allowed; the text says why, and what would be."""
 
 
-def allowed_hosts(address: str, port: int) -> frozenset[str]:
-    """Values of the header ``Host`` that name this server, an address or name with its port."""
-    names = {*LOOPBACK, address} if address in ("localhost", "127.0.0.1", "::1") else {address}
-    names = {f"[{name}]" if ":" in name and not name.startswith("[") else name for name in names}
-    return frozenset({f"{name}:{port}" for name in names} | ({*names} if port in (80, 443) else set()))
+def allowed_hosts(address: str, port: int, names: Sequence[str] = ()) -> frozenset[str]:
+    """Values of the header ``Host`` that name this server, an address or name with its port.
+
+    ``names``: more of them. One that listens beyond loopback has the computer's name, too.
+    """
+    if address in ("localhost", "127.0.0.1", "::1"):
+        own = {*LOOPBACK, address}
+    else:
+        computer = socket.gethostname().lower()
+        own = {address, computer, f"{computer.partition('.')[0]}.local"}
+    return frozenset(
+        value for name in own | {name.lower() for name in names} for value in _values(name, port)
+    )
 
 
-def check_host(host: str | None, allowed: frozenset[str]) -> None:
-    """Raises RightsError unless ``host`` names this server: another page's name may resolve to it (DNS rebinding)."""
-    if host is None or host.lower() not in allowed:
-        raise RightsError(f"Host {host!r} is not this server; {', '.join(sorted(allowed))} are")
+def _values(name: str, port: int) -> tuple[str, ...]:
+    """What browsers send as ``Host`` for a name or address; they leave out the ports of http and https."""
+    written = f"[{name}]" if ":" in name and not name.startswith("[") else name
+    return (f"{written}:{port}", written) if port in (80, 443) else (f"{written}:{port}",)
+
+
+def check_host(host: str | None, allowed: frozenset[str], reached: str, port: int) -> None:
+    """Raises RightsError unless ``host`` names this server: another page's name may resolve to it (DNS rebinding).
+
+    ``reached``: the address of this computer at which the request came in, which is a name of it, too; a page of
+    another origin has a name of its own.
+    """
+    if host is None or host.lower() not in {*allowed, *_values(reached, port)}:
+        raise RightsError(
+            f"Host {host!r} is not this server; {', '.join(sorted(allowed))} are, and --host NAME adds others"
+        )
 
 
 def check_origin(origin: str | None, host: str | None, secure: bool) -> None:

@@ -6,14 +6,15 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -26,11 +27,13 @@ from websockets.http11 import Request, Response
 from stereoservo.client import ClientError, SessionError
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.messages.discovery import NotRunningError
-from stereoservo.messages.goals import Goal
+from stereoservo.messages.goals import Goal, UpdateGoal
 from stereoservo.messages.wire import MessageError, Reply
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web import requests as ask
-from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, drag_answer, refusal
+from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, refusal
+from stereoservo.web.leases import LEASE_S
+from stereoservo.web.model_view import ModelView, drag_answer, goal_message
 from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
 
 FILES = {
@@ -51,9 +54,10 @@ MAX_UNDER_WAY, MAX_STOPS = 8, 32
 """Requests of a page that are carried out at a time, and stops, which wait for none of them."""
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
-PING_S = 5.0
+PING_S, SILENT_S = 2.0, 3.0
 """A page is asked every so often whether it is there, and closed where it does not answer for so long; one that holds
-the arm then lets it stop.
+the arm then lets it stop. A browser on a busy computer is late by tenths of a second; a page that is closed in error
+costs a goal.
 """
 EXPECTED = (
     ClientError,
@@ -64,6 +68,30 @@ EXPECTED = (
     RightsError,
     SessionError,
 )
+
+
+class RecordedLink(Protocol):
+    """A recording in the place of a cell, `web.flight_link.FlightLink`: this module knows nothing of recordings."""
+
+    recording: Literal[True]
+    cell: str
+    view: ModelView
+    watched: threading.Event
+
+    def start(self) -> None:
+        """Begin to publish."""
+
+    def close(self) -> None:
+        """End. Idempotent."""
+
+    def end_leases(self) -> None:
+        """There are none."""
+
+    def play(self, playing: bool, speed: float | None) -> dict[str, Any]:
+        """Play or pause."""
+
+    def seek(self, seconds: float) -> dict[str, Any]:
+        """Go to a time [s] after the recording's begin."""
 
 
 class Page:
@@ -116,7 +144,7 @@ class PageServer:
 
     def __init__(
         self,
-        make_link: Callable[[Publish], CellLink],
+        make_link: Callable[[Publish], CellLink | RecordedLink],
         operator: str | None,
         announce: Callable[[str], None],
     ) -> None:
@@ -128,11 +156,14 @@ class PageServer:
         self._work = ThreadPoolExecutor(4, thread_name_prefix="page-command")
         self._stops = ThreadPoolExecutor(4, thread_name_prefix="page-stop")
         self._hosts: frozenset[str] = frozenset()
+        self._port = 0
         self._secure = False
         self.link = make_link(self._publish)
 
-    async def start(self, address: str, port: int, tls: ssl.SSLContext | None = None) -> int:
-        """Listen; returns the port (given as 0: a free one). Raises OSError."""
+    async def start(
+        self, address: str, port: int, tls: ssl.SSLContext | None = None, names: Sequence[str] = ()
+    ) -> int:
+        """Listen; returns the port (given as 0: a free one). ``names``: more names of this server. Raises OSError."""
         self._loop = asyncio.get_running_loop()
         self._secure = tls is not None
         self._server: Server = await serve(
@@ -145,12 +176,12 @@ class PageServer:
             open_timeout=5.0,
             close_timeout=1.0,
             ping_interval=PING_S,
-            ping_timeout=PING_S,
+            ping_timeout=SILENT_S,
             compression=None,
             server_header=None,
         )
         found: int = self._server.sockets[0].getsockname()[1]
-        self._hosts = allowed_hosts(address, found)
+        self._hosts, self._port = allowed_hosts(address, found, names), found
         self.link.start()
         return found
 
@@ -170,7 +201,7 @@ class PageServer:
         hosts = request.headers.get_all("Host")
         host = hosts[0] if len(hosts) == 1 else None
         try:
-            check_host(host, self._hosts)
+            check_host(host, self._hosts, connection.local_address[0].removeprefix("::ffff:"), self._port)
             if request.path == "/socket":
                 origins = request.headers.get_all("Origin")
                 if len(origins) > 1:
@@ -253,8 +284,13 @@ class PageServer:
         """Do what a page asks, as far as it may, and tell it how that went."""
         n = 0
         try:
-            request = ask.decode_request(message.encode() if isinstance(message, str) else message)
-            n = request.n
+            data = message.encode() if isinstance(message, str) else message
+            n = ask.number_of(data)
+            request = ask.decode_request(data)
+            if self.link.recording is True:
+                answer = {"ok": True} | _playback(self.link, request)
+                page.tell({"answer": {"n": n, **answer}})
+                return
             if not isinstance(request, ask.OPEN):
                 self.holder.require(page, str(request.__struct_config__.tag))
             if isinstance(request, ask.Stop):
@@ -282,7 +318,7 @@ class PageServer:
 
     def _do(self, page: Page, request: ask.PageRequest) -> dict[str, Any]:
         """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
-        link = self.link
+        link = self._cell_link
         match request:
             case ask.Stop():
                 return _told(link.stop())
@@ -319,18 +355,33 @@ class PageServer:
                 return self._check(page, request)
             case ask.Go():
                 return self._go(page)
+            case ask.Send():
+                return self._send_goal(msgspec.structs.replace(request.goal, lease_s=LEASE_S, check=False))
+            case ask.Update():
+                link.update(UpdateGoal(request.id, request.target, request.stamp_s))
+                return {"message": "moved"}
+            case ask.Play() | ask.Seek():
+                raise RightsError(
+                    "a live cell is shown, which has no past: `stereoservo web --flight FILE` plays one"
+                )
+
+    @property
+    def _cell_link(self) -> CellLink:
+        """The link to the cell, where no recording is shown."""
+        assert self.link.recording is False
+        return self.link
 
     def _rights_changed(self) -> None:
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self._tell_all_rights)
 
     def _drag(self, page: Page, request: ask.Drag) -> dict[str, Any]:
-        model = self.link.drag_model
+        model = self._cell_link.view.model
         if model is None:
             raise LinkDownError("there is no model of the arm yet: calibrate first")
         if not request.draft or page.draft is None:
             page.draft = None
-            page.base = self.link.joints() if page.base is None else page.base
+            page.base = self._cell_link.joints() if page.base is None else page.base
         base = page.base if page.draft is None else page.draft
         assert base is not None
         found = model.dragged(base, request.camera, request.shift, request.turn, request.nearer)
@@ -343,13 +394,16 @@ class PageServer:
     def _check(self, page: Page, request: ask.Check) -> dict[str, Any]:
         page.changes += 1
         page.checked, change = None, page.changes
-        if request.name is not None:
-            goal = self.link.taught_goal(request.name)
+        link = self._cell_link
+        if request.goal is not None:
+            goal = msgspec.structs.replace(request.goal, lease_s=LEASE_S)
+        elif request.name is not None:
+            goal = link.taught_goal(request.name)
         elif page.draft is not None:
-            goal = self.link.dragged_goal(np.array(page.draft))
+            goal = link.dragged_goal(np.array(page.draft))
         else:
             raise LinkDownError("nothing was dragged yet: drag the outline of the body in a picture")
-        reply = self.link.client.check(goal)
+        reply = link.client.check(goal)
         if page.changes == change:
             page.checked = goal
         return _told(reply) | {"plan": reply.plan}
@@ -358,10 +412,13 @@ class PageServer:
         goal = page.checked
         if goal is None:
             raise LinkDownError("check the goal first: its path is shown before anything moves")
-        reply = self.link.send(goal)
+        found = self._send_goal(goal)
         page.checked = page.draft = page.base = None
-        plan = msgspec.json.encode({"goal": {"id": goal.id, "plan": reply.plan}})
-        self._publish("goal", plan, True)
+        return found
+
+    def _send_goal(self, goal: Goal) -> dict[str, Any]:
+        reply = self._cell_link.send(goal)
+        self._publish("goal", msgspec.json.encode(goal_message(goal, reply.plan)), True)
         return _told(reply) | {"id": goal.id}
 
 
@@ -386,10 +443,24 @@ async def _send(connection: ServerConnection, page: Page) -> None:
         return
 
 
+def _playback(link: RecordedLink, request: ask.PageRequest) -> dict[str, Any]:
+    """Do what a page asks of a recording. Raises RightsError for what would be asked of an arm."""
+    match request:
+        case ask.Play():
+            return link.play(request.playing, request.speed)
+        case ask.Seek():
+            return link.seek(request.at)
+    verb = request.__struct_config__.tag
+    raise RightsError(
+        f"{verb}: a recording is shown, and nothing can be commanded here; play and seek are valid. An arm is stopped "
+        "by `stereoservo stop CELL`, or on the page of its cell"
+    )
+
+
 def _gone(connection: ServerConnection) -> bytes:
     """What pages are told of the one that held the arm and is gone."""
     lost = connection.close_code == CloseCode.ABNORMAL_CLOSURE
-    how = f"lost its connection, or did not answer for {PING_S:g} s" if lost else "was closed"
+    how = f"lost its connection, or did not answer for {SILENT_S:g} s" if lost else "was closed"
     return msgspec.json.encode(
         {"notice": f"The page that held the arm {how}: what it had started stops.", "t_wall": time.time()}
     )

@@ -12,7 +12,7 @@ stats.middle = (camera) => {
   const pixels = views.get(camera)?.predicted ?? [];
   return pixels.length ? [0, 1].map((i) => pixels.reduce((sum, p) => sum + p[i], 0) / pixels.length) : null;
 };
-let socket, number = 0, rights = {}, state, scene, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null;
+let socket, number = 0, rights = {}, state, scene, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null, flight = null, arrived = 0, sought = null;
 let drawDue = false;
 
 function view(camera) {
@@ -86,16 +86,17 @@ function banner(id, text, bad) {
 async function picture(buffer) {
   const size = new DataView(buffer).getUint32(0, true);
   const info = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+  const k = ++arrived; // pictures are decoded in any order
   const image = await createImageBitmap(new Blob([new Uint8Array(buffer, 4 + size)], { type: "image/jpeg" }));
   const v = view(info.camera);
-  if (info.seq < v.seq && info.seq > v.seq - 100) return image.close();
+  if (k < v.arrived) return image.close();
   v.image?.close();
-  Object.assign(v, { image, seq: info.seq, width: info.width, height: info.height });
+  Object.assign(v, { image, arrived: k, t_ns: info.t_shutter_ns, width: info.width, height: info.height });
   const late = Date.now() - 1000 * info.t_wall;
   stats.pictures += 1;
   stats.latencies.push(late);
   if (stats.latencies.length > 600) stats.latencies.shift();
-  v.note.textContent = `frame ${info.seq}, ${late.toFixed(0)} ms old, ${v.features.length} markers`;
+  v.note.textContent = `frame ${info.seq}, ${flight ? "" : `${late.toFixed(0)} ms old, `}${v.features.length} markers`;
   redraw();
 }
 
@@ -106,14 +107,22 @@ function take(message) {
   else if (message.rights) { rights = message.rights; showRights(); }
   else if (message.state) showState(message);
   else if (message.features) {
-    const { camera, ids, pixels } = message.features;
+    const { camera, ids, pixels, t_shutter_ns } = message.features;
     const v = view(camera);
+    if (flight && v.image && Math.abs(t_shutter_ns - v.t_ns) > 1e9) { v.image.close(); v.image = null; } // none was recorded there
     v.features = ids.map((id, i) => [id, ...pixels[i]]);
     v.ids = new Set(ids);
     redraw();
   } else if (message.info) showInfo(message.info);
   else if (message.event) showEvent(message.event);
-  else if (message.goal) showPlan(message.goal.plan, `goal ${message.goal.id.slice(0, 8)}`);
+  else if (message.goal) showGoal(message.goal);
+  else if (message.flight) showFlight(message.flight);
+  else if (message.plots) Object.assign(history, message.plots);
+  else if (message.events) {
+    $("events").replaceChildren();
+    $("calibration").textContent = "";
+    for (const { event } of message.events) showEvent(event);
+  }
   else if ("up" in message) banner("link", message.up ? "" : `The daemon does not answer: ${message.why}`, true);
   else if (message.notice) showNotice(message);
 }
@@ -143,6 +152,8 @@ function showState({ state: s, predicted, scene: shape }) {
     $("reasons").replaceChildren(...(texts.length ? texts : ["none"]).map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   }
   const t = s.t_ns * 1e-9;
+  const last = history.error.at(-1);
+  if (last && t <= last[0]) return redraw(); // the plots hold it
   joints = Object.keys(s.velocities);
   history.error.push([t, s.error_px]);
   history.velocity.push([t, ...Object.values(s.velocities)]);
@@ -171,6 +182,11 @@ function showInfo(info) {
 function list(t_wall, text, attributes = {}) {
   const item = Object.assign(document.createElement("li"), attributes);
   item.textContent = `${new Date(1000 * t_wall).toLocaleTimeString()} ${text}`;
+  if (flight) { // a place in the recording
+    item.tabIndex = 0;
+    item.onclick = () => request({ do: "seek", at: Math.max(0, t_wall - flight.begin) });
+    item.onkeydown = (event) => { if (event.key === "Enter") item.onclick(); };
+  }
   $("events").prepend(item);
   while ($("events").childElementCount > 200) $("events").lastChild.remove();
 }
@@ -181,10 +197,12 @@ function showNotice({ notice, t_wall }) {
 }
 
 function showEvent(event) {
-  const why = [...new Set([event.message, ...event.reasons.map((r) => `${r.code}: ${r.hint}`)])].filter(Boolean).join("\n");
+  const reasons = event.reasons.map((r) => `${r.code}${r.subject ? ` ${r.subject}` : ""}${r.hint && r.hint !== event.message ? `: ${r.hint}` : ""}`);
+  const why = [...new Set([event.message, ...reasons])].filter(Boolean).join("\n") ||
+    (/_aborted$|_failed$/.test(event.kind) ? "the daemon gave no reason, which is a fault of it" : "");
   const what = `${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)}`;
   list(event.t_wall, `${what} ${why}`, { value: event.seq });
-  if (state && /_aborted$|_failed$/.test(event.kind)) banner("answer", `${what}: ${why}`, true);
+  if (state && !flight && /_aborted$|_failed$/.test(event.kind)) banner("answer", `${what}: ${why}`, true);
   stats.events.push([event.kind, event.id, event.error_px, why]);
   const done = event.progress === null ? "" : ` (${Math.round(100 * event.progress)} %)`;
   if (event.kind !== "calibration_report" && /^(calibrat|fit_|check|trial|zeros)/.test(event.kind)) {
@@ -194,6 +212,45 @@ function showEvent(event) {
         Object.entries(c.per_joint_px).map(([name, px]) => `${name} ${px.toFixed(3)} px`).join(", ") + `\nmodel ${c.model}\nreport on the daemon's host: ${c.report}`
       : event.check ? `Check of the model: ${event.message}` : `${event.kind.replaceAll("_", " ")}${done}: ${event.message}`;
   }
+}
+
+function showFlight(now) {
+  // A recording in the place of a live cell: there is nothing to command, and nothing to stop.
+  if (!flight) {
+    $("stop").hidden = $("controls").hidden = true;
+    $("playback").hidden = false;
+    document.body.classList.add("recording");
+    $("loop-title").textContent = "Cycles longer than their period, p99 of the last 250 [µs]";
+  }
+  flight = now;
+  $("play").textContent = now.playing ? "Pause" : "Play";
+  $("time").max = now.seconds;
+  if (document.activeElement !== $("time") || now.playing) $("time").value = sought ?? now.at;
+  if (document.activeElement !== $("speed")) $("speed").value = String(now.speed);
+  $("at").textContent = `${now.at.toFixed(2)} of ${now.seconds.toFixed(2)} s, ${new Date(1000 * (now.begin + now.at)).toLocaleString()}` +
+    (now.reading ? `; read up to ${now.read.toFixed(0)} s` : "");
+  $("flight-notes").textContent = now.notes.join("\n");
+  $("flight-notes").hidden = !now.notes.length;
+}
+
+async function seek() {
+  // One request at a time, as for drags.
+  if (sought !== null) return;
+  while (sought !== Number($("time").value)) {
+    sought = Number($("time").value);
+    const answer = await request({ do: "seek", at: sought });
+    stats.answers.push(["seek", answer.ok, answer.message]);
+  }
+  sought = null;
+}
+
+function showGoal({ id, plan, set_points: stated }) {
+  if (!id) $("plan").textContent = "";
+  else showPlan(plan, `goal ${id.slice(0, 8)}`);
+  for (const v of views.values()) {
+    if (!plan) { v.path = []; v.setPoints = Object.values(stated[v.camera] ?? {}); }
+  }
+  redraw();
 }
 
 function showPlan(plan, what) {
@@ -284,7 +341,7 @@ async function go() {
 
 const stop = () => command({ do: "stop" });
 $("stop").onclick = stop;
-addEventListener("keydown", (event) => { if (event.key === "Escape") { event.preventDefault(); stop(); } });
+addEventListener("keydown", (event) => { if (event.key === "Escape" && !flight) { event.preventDefault(); stop(); } });
 for (const button of document.querySelectorAll("[data-do]")) {
   const verb = button.dataset.do;
   button.onclick = () => command(verb === "check-model" ? { do: "calibrate", check: true } : { do: verb });
@@ -297,6 +354,9 @@ $("nearer").onclick = () => changed({ nearer: 0.98 });
 $("farther").onclick = () => changed({ nearer: 1 / 0.98 });
 $("take").onsubmit = (event) => { event.preventDefault(); command({ do: "take", token: $("token").value.trim() }); $("token").value = ""; };
 $("teach").onsubmit = (event) => { event.preventDefault(); command({ do: "teach", name: $("teach-name").value }); };
+$("play").onclick = () => command({ do: "play", playing: !flight.playing });
+$("speed").onchange = () => request({ do: "play", playing: flight.playing, speed: Number($("speed").value) });
+$("time").oninput = seek;
 let orbit = null;
 $("scene").onpointerdown = (event) => { orbit = [event.clientX, event.clientY]; $("scene").setPointerCapture(event.pointerId); };
 $("scene").onpointermove = (event) => {
