@@ -19,7 +19,9 @@ from stereoservo_drivers.canopen.cia402_configuration import (
 from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
+from stereoservo_drivers.canopen.discovery import stated_limits
 from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions
+from stereoservo_drivers.canopen.units import JointScale
 
 MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "homing", 7: "interpolated position",
               8: "cyclic position", 9: "cyclic velocity", 10: "cyclic torque"}  # fmt: skip
@@ -43,6 +45,9 @@ def examine_nodes(
                 yield _identity(drive, axis.joint)
                 yield _state(drive)
                 yield _modes(drive, options)
+                yield from limits_findings(
+                    axis.joint, drive.read_if_there(0x607D, 1), drive.read_if_there(0x607D, 2)
+                )
             except DriverError as error:
                 yield ExaminationFinding(axis.name, False, str(error))
     if unknown_nodes:
@@ -97,6 +102,26 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
             name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}"
         )
     return ExaminationFinding(name, True, message)
+
+
+def limits_findings(joint: CanJoint, low: int | None, high: int | None) -> Iterator[ExaminationFinding]:
+    """Finding on the cell file's position limits against the drive's own (0x607D) [counts]; none where it has none."""
+    limits = stated_limits(low, high)
+    if limits is None:
+        return
+    scale = JointScale.of(joint)
+    own_low, own_high = sorted(scale.position(counts) for counts in limits)
+    unit = "rad" if joint.kind == "revolute" else "m"
+    own = f"the drive's own (0x607D) are {own_low:.4g} to {own_high:.4g} {unit}"
+    step = scale.resolution
+    if own_low - step <= joint.position_min and joint.position_max <= own_high + step:
+        yield ExaminationFinding(f"{joint.name} limits", True, f"within the drive's: {own}")
+        return
+    yield ExaminationFinding(
+        f"{joint.name} limits", False,
+        f"{joint.position_min:.4g} to {joint.position_max:.4g} {unit} reach beyond the drive: {own}",
+        f"position_min and position_max of {joint.name!r} and its [[safety.limit]] within these; or the drive's 0x607D",
+    )  # fmt: skip
 
 
 def _state(drive: RemoteDrive) -> ExaminationFinding:

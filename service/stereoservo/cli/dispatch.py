@@ -44,6 +44,7 @@ COMMANDS: dict[str, str] = {
     "export": "export:export",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",
+    "setup": "setup.command:setup",
     "init": "init:init",
     "ls": "ls:ls",
     "warmup": "warmup:warmup",
