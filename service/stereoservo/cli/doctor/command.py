@@ -107,7 +107,7 @@ def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPla
 
 def examine_pictures(
     plan: RunPlan, directories: CellDirectories, seconds: float, pictures: Path | None = None
-) -> Iterator[ExaminationFinding]:
+) -> Generator[ExaminationFinding, None, None]:
     """Findings on the cameras, watched for ``seconds``; ``pictures``: directory for what they see."""
     settings = plan.settings()
     model, _ = ModelStore(directories.models).newest_fitting(settings)

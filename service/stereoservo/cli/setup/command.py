@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,10 +26,12 @@ from stereoservo.cli.setup.first_goal import arm_is_off, calibrated, first_goal,
 from stereoservo.cli.setup.interview import interview
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.gateway.persistence import ModelStore
-from stereoservo.messages.cell_file import CellFile
+from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.messages.directories import CELL_NAME, CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import holder
-from stereoservo.ports.devices import ExaminationFinding
+from stereoservo.ports import plugins
+from stereoservo.ports.devices import DriverError, ExaminationFinding
+from stereoservo.ports.discovery import DriveFinder
 
 WATCH_S = 2.0
 
@@ -159,18 +162,34 @@ def _examined(
             except StopIteration as end:
                 plan, directories = end.value
                 return plan, directories
+            except DriverError as error:
+                findings.append(ExaminationFinding("drivers", False, str(error)))
+                findings += bus_findings(load_cell_file(file))
+                _stop_where_failed(findings, dialogue, file)
+                raise
             findings.append(finding)
             dialogue.say(line_of(finding))
 
 
+def bus_findings(cell: CellFile) -> tuple[ExaminationFinding, ...]:
+    """Findings on the bus that a cell file names, whose further options its driver refuses: what may be behind that."""
+    finder = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)
+    if not isinstance(finder, DriveFinder):
+        return ()
+    try:
+        return tuple(finder.scan_bus(cell.joints.options).findings)
+    except DriverError as error:
+        return (ExaminationFinding("bus", False, str(error)),)
+
+
 def _all(
-    found: Iterator[ExaminationFinding],
+    found: Generator[ExaminationFinding, None, None],
     dialogue: Dialogue,
     findings: list[ExaminationFinding],
     sound: list[bool],
 ) -> None:
     """Tell findings as they come."""
-    with dialogue.doing("checking"):
+    with dialogue.doing("checking"), closing(found):
         for finding in found:
             findings.append(finding)
             sound.append(finding.ok is not False)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack
 
 from stereoservo.cli.doctor.camera_findings import CameraRecord
@@ -78,7 +78,7 @@ class Cameras:
 
 def commission(
     plan: RunPlan, dialogue: Dialogue, sound: Sequence[bool], names: Sequence[str]
-) -> Iterator[ExaminationFinding]:
+) -> Generator[ExaminationFinding, None, None]:
     """Findings on the drives, then on each joint's first motion, which the person permits once, and nobody where
     something was found wrong before. ``sound``: whether all findings so far are; it grows with those that come.
 
