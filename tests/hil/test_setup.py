@@ -47,7 +47,8 @@ def _joint(name: str, key: str, value: str) -> tuple[str, str]:
     return rf'(\nname = "{name}" *\n(?:(?!name =).*\n)*?{key} = )\S+', rf"\g<1>{value}"
 
 
-YES = {"move": "yes"}
+YES = {"move": "yes", "reset": "yes"}
+"""A machine that stalls leaves a drive in the fault of its watch, which another case then finds."""
 MISTAKES = {
     "wrong node id": Mistake("node 9 (j3): no answer", (_joint("j3", "node_id", "9"),)),
     "wrong bit rate": Mistake(
@@ -203,7 +204,7 @@ def test_a_scripted_person_gets_from_nothing_to_a_goal(box: CanBench, run: Run, 
         "velocity_units": "counts counts counts 60000 counts counts",
         "limits": "-50:50 20:140 -70:60 -60:120 -110:60 -120:60",
         "speed": "45",
-        "move": "yes",
+        **YES,
         "calibrate": "yes",
     }
     options = [word for option in PATIENT for word in ("--option", option)]

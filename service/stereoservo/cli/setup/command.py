@@ -20,7 +20,7 @@ import typer
 from stereoservo.cli.doctor.command import examine_file, examine_pictures, line_of
 from stereoservo.cli.init import toml_options
 from stereoservo.cli.output import CommandError, JsonOption, emit
-from stereoservo.cli.setup.commissioning import commission
+from stereoservo.cli.setup.commissioning import commission, in_fault, reset_drives
 from stereoservo.cli.setup.dialogue import Dialogue, answers_text, read_answers
 from stereoservo.cli.setup.first_goal import arm_is_off, calibrated, first_goal, running
 from stereoservo.cli.setup.interview import interview
@@ -132,7 +132,17 @@ def _commissioned(
         dialogue.say("   the joints were commissioned before, with cameras and drives as the file has them")
         return
     names = [joint.name for joint in plan.joints.joints]
-    _all(commission(plan, dialogue, sound, names), dialogue, findings, sound)
+    found: list[ExaminationFinding] = []
+    _all(commission(plan, dialogue, sound, names), dialogue, found, sound)
+    fault = in_fault(found)
+    if fault is not None and dialogue.confirm(
+        "reset", "Is the cause of that fault gone: reset the drives?", False
+    ):
+        with dialogue.doing("resetting the drives"):
+            reset_drives(plan)
+        found, sound = [], [not _failed(findings)]
+        _all(commission(plan, dialogue, sound, names), dialogue, found, sound)
+    findings += found
     moved = {finding.jogged[0] for finding in findings if finding.jogged is not None}
     if _failed(findings):
         return

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import ExitStack
 
 from stereoservo.cli.doctor.camera_findings import CameraRecord
@@ -16,6 +16,8 @@ from stereoservo.cli.doctor.plate_motion import judge_turn, turn_between
 from stereoservo.cli.setup.dialogue import Dialogue
 from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.pacing import ordinary_for_a_while
+from stereoservo.daemon.plant_driver import make_driver
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError, ExaminationFinding
 
@@ -108,40 +110,56 @@ def commission(
             yield finding
             if finding.jogged is None:
                 continue
-            with dialogue.doing("looking at the plate"):
+            with dialogue.doing("looking at the plate"), ordinary_for_a_while():
                 after = cameras.look()
-            yield from judged(plan, dialogue, finding, before, after, names)
+                seen = seen_by_pictures(plan, finding.jogged, before, after)
+            yield seen
+            if finding.ok is not False and seen.ok is not False:
+                yield asked_of_a_person(dialogue, finding.jogged, names)
             before = after
 
 
-def judged(
-    plan: RunPlan,
-    dialogue: Dialogue,
-    finding: ExaminationFinding,
-    before: list[CameraRecord],
-    after: list[CameraRecord],
-    names: Sequence[str],
-) -> Iterator[ExaminationFinding]:
-    """Findings on a jog by the pictures and, where these and the encoder are content, by the person's eyes."""
-    assert finding.jogged is not None
-    joint, travel = finding.jogged
+def in_fault(findings: Sequence[ExaminationFinding]) -> ExaminationFinding | None:
+    """The finding that drives stand in a fault, which only a reset ends; None where they do not."""
+    return next((finding for finding in findings if finding.name == "fault" and finding.ok is False), None)
+
+
+def reset_drives(plan: RunPlan) -> None:
+    """Clear the drives' faults; nothing is enabled. Raises DriverError where one stays."""
+    driver = make_driver(plan, MonotonicClock())
+    try:
+        driver.configure()
+        driver.configure()  # the first call reports what it finds, the next one clears it
+    finally:
+        driver.close()
+
+
+def seen_by_pictures(
+    plan: RunPlan, jogged: tuple[str, float], before: list[CameraRecord], after: list[CameraRecord]
+) -> ExaminationFinding:
+    """Finding on a jog, a joint and its travel [rad or m], by the pictures before and after it."""
+    joint, travel = jogged
     kind = next(spec.kind for spec in plan.joints.joints if spec.name == joint)
-    seen = ExaminationFinding(
+    if kind == "revolute":
+        return judge_turn(joint, travel, turn_between(before, after))
+    return ExaminationFinding(
         f"{joint} pictures", None, "a slide turns nothing: its travel is not judged by pictures"
     )
-    if kind == "revolute":
-        seen = judge_turn(joint, travel, turn_between(before, after))
-    yield seen
-    if finding.ok is False or seen.ok is False:
-        return
-    sign = "+" if travel > 0 else "-"
+
+
+def asked_of_a_person(
+    dialogue: Dialogue, jogged: tuple[str, float], names: Sequence[str]
+) -> ExaminationFinding:
+    """Finding on a jog by what a person saw."""
+    joint, travel = jogged
+    wanted = f"{joint}{'+' if travel > 0 else '-'}"
     answer = dialogue.ask(
         f"moved.{joint}",
-        f"Which joint moved, and which way (NAME+ or NAME-, or nothing)? {joint}{sign} was asked for",
-        f"{joint}{sign}",
+        f"Which joint moved, and which way (NAME+ or NAME-, or nothing)? {wanted} was asked for",
+        wanted,
         lambda text: _eye(text, names),
     )
-    yield eye_finding(joint, travel, answer)
+    return eye_finding(joint, travel, answer)
 
 
 def _eye(text: str, names: Sequence[str]) -> tuple[str, str]:
