@@ -12,12 +12,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+import typer
 
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor.camera_findings import CameraRecord
 from stereoservo.cli.doctor.plate_motion import examine_sides, judge_turn, turn_between
 from stereoservo.cli.doctor.view_consistency import same_camera_twice
-from stereoservo.cli.output import CommandError
+from stereoservo.cli.output import CommandError, shipped_or_path
 from stereoservo.cli.setup.commissioning import eye_finding
 from stereoservo.cli.setup.dialogue import Dialogue
 from stereoservo.cli.setup.interview import chosen_cameras, chosen_order, chosen_ranges, joint_position
@@ -275,6 +276,13 @@ def test_a_shipped_cell_is_copied_by_its_name(name: str, tmp_path: Path) -> None
     assert cli.invoke(["init", str(copy), "--from", name]) == 0
     assert load_cell_file(copy).cell.name == "mine"
     assert cli.invoke(["init", str(tmp_path / "b.toml"), "--from", "nowhere"]) != 0
+
+
+def test_a_cell_that_is_run_is_a_file_or_a_shipped_one() -> None:
+    assert shipped_or_path("demo").name == "demo.toml"
+    assert shipped_or_path("nowhere.toml") == Path("nowhere.toml")
+    with pytest.raises(typer.BadParameter, match="hil-can"):
+        shipped_or_path("nowhere")
 
 
 def test_setup_without_a_terminal_or_answers_says_so(
