@@ -25,7 +25,7 @@ from stereoservo.cli.setup.interview import chosen_cameras, chosen_order, chosen
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.ports.devices import CameraDescription, CameraObservation
 from stereoservo.ports.discovery import BusScan, FoundCamera, FoundDrive, JointChoice
-from stereoservo_drivers.canopen.discovery import found_buses, proposed_options, stated_limits
+from stereoservo_drivers.canopen.nodes import found_buses, proposed_options, stated_limits
 from stereoservo_drivers.video.discovery import found_cameras, modes_told, usual_rate
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell
 

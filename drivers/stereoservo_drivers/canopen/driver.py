@@ -240,21 +240,21 @@ class CanJointDriver:
     @classmethod
     def find_buses(cls) -> tuple[FoundBus, ...]:
         """CAN adapters and USB serial ports of this computer."""
-        from stereoservo_drivers.canopen.discovery import found_buses  # for `stereoservo setup` alone
+        from stereoservo_drivers.canopen.nodes import found_buses  # for `stereoservo setup` alone
 
         return found_buses()
 
     @classmethod
     def scan_bus(cls, options: Mapping[str, Any]) -> BusScan:
         """CiA 402 drives on a bus. Raises DriverError."""
-        from stereoservo_drivers.canopen.discovery import scan_bus
+        from stereoservo_drivers.canopen.nodes import scan_bus
 
         return scan_bus(options)
 
     @classmethod
     def options_of(cls, scan: BusScan, joints: Sequence[JointChoice]) -> dict[str, Any]:
         """Options for the drives of a scan."""
-        from stereoservo_drivers.canopen.discovery import proposed_options
+        from stereoservo_drivers.canopen.nodes import proposed_options
 
         return proposed_options(scan, joints)
 

@@ -18,8 +18,7 @@ from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import listening
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
-from stereoservo_drivers.canopen.discovery import other_bitrate
-from stereoservo_drivers.canopen.node_checks import examine_nodes, scan
+from stereoservo_drivers.canopen.nodes import examine_nodes, other_bitrate, scan
 from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions

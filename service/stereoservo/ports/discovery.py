@@ -32,7 +32,7 @@ class FoundBus(msgspec.Struct, frozen=True):
 class FoundDrive(msgspec.Struct, frozen=True):
     """A drive on a bus. ``address``: its number there. ``options``: what it tells of itself under the names of the
     driver's options of a joint (identity, counts). ``limits``: its own limits of the position [counts]; None: it has
-    none. ``position`` [counts], ``speed``: largest [its own units]; None: not told.
+    none. ``position`` [counts]; None: not told.
     """
 
     address: int
@@ -40,7 +40,6 @@ class FoundDrive(msgspec.Struct, frozen=True):
     options: dict[str, Any]
     limits: tuple[int, int] | None = None
     position: int | None = None
-    speed: int | None = None
 
 
 class BusScan(msgspec.Struct, frozen=True):

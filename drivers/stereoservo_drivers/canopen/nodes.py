@@ -1,12 +1,14 @@
-"""Discovery on CAN: adapters of this computer, the bit rate of a bus, and the CiA 402 drives on it with what they tell
-of themselves. Nothing is written to a drive.
+"""CiA 402 drives on a bus before anything is configured. For `stereoservo setup`: adapters of this computer, the bit
+rate of a bus, the drives on it, what they tell of themselves. For ``doctor``: presence, identity, state and limits of a
+cell's drives. Nothing is written to a drive.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import can
@@ -16,18 +18,26 @@ from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo.ports.discovery import BusScan, FoundBus, FoundDrive, JointChoice
 from stereoservo_drivers.can.channel import Channel, ChannelSettings
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Subscriptions
-from stereoservo_drivers.canopen.cia402 import DriveAxis
+from stereoservo_drivers.can.socketcan import read_state
+from stereoservo_drivers.canopen.bringup import Link, Subscriptions
+from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
-    DEADLINE,
+    GUARD_TIME,
     HEARTBEAT_CONSUMER,
+    MODES,
     SHIPPED_EDS,
+    capabilities,
+    compose,
+    eds_path,
+    lead_words,
     load_eds,
 )
 from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
 from stereoservo_drivers.canopen.option_checks import bus_load
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions
+from stereoservo_drivers.canopen.units import JointScale
 from stereoservo_drivers.options import decode_options
 
 BITRATES = (1_000_000, 500_000, 250_000, 125_000, 800_000, 100_000, 50_000, 20_000)
@@ -38,7 +48,7 @@ HARDLY_LIMITS = 2**31 - 2**16
 """[counts] Limits that are as wide as the counter are none."""
 ENCODER, TURNS = (0x608F, 1), (0x608F, 2)
 POSITION_LIMITS = ((0x607D, 1), (0x607D, 2))
-MOTOR_SPEED, POSITION = (0x6080, 0), (0x6064, 0)
+POSITION = (0x6064, 0)
 SLCAN, SLCAN_SOCKET = "stereoservo_slcan", "socket://"
 
 
@@ -116,7 +126,7 @@ def scan_bus(options: Mapping[str, Any], bitrates: Sequence[int] = BITRATES) -> 
     Where nothing answers at the stated bit rate, the others are tried, and one at which drives answer is a finding.
     Raises DriverError.
     """
-    stated = int(options.get("bitrate", BITRATES[0]))
+    stated = int(options.get("bitrate", _kernels_bitrate(options) or BITRATES[0]))
     rates = [stated, *(rate for rate in bitrates if rate != stated)]
     if options["interface"] == "socketcan":  # its bit rate is the kernel's, and checked when it is opened
         rates = [stated]
@@ -136,6 +146,12 @@ def scan_bus(options: Mapping[str, Any], bitrates: Sequence[int] = BITRATES) -> 
         "power of the drives, cable, 120 ohm at both ends, the adapter's other channel",
     )  # fmt: skip
     return BusScan(dict(options), (), (nobody,))
+
+
+def _kernels_bitrate(options: Mapping[str, Any]) -> int | None:
+    """Bit rate that the kernel has of a socketcan interface; None of others, or where it tells none."""
+    state = read_state(str(options["channel"])) if options["interface"] == "socketcan" else None
+    return None if state is None else state.bitrate
 
 
 def wrong_bitrate(nodes: Sequence[int], rate: int, stated: int) -> ExaminationFinding:
@@ -163,10 +179,10 @@ def other_bitrate(options: Mapping[str, Any]) -> ExaminationFinding | None:
 
 
 def answering(settings: ChannelSettings) -> list[int]:
-    """Numbers of the nodes that answer, each as often as it does. Raises DriverError."""
+    """Numbers of the nodes that answer at a bit rate. Raises DriverError."""
     channel = Channel(settings)
     try:
-        return _answering(ScanLink(channel))
+        return list(scan(ScanLink(channel)))
     except DriverError as error:
         if error.code in ("bus_off", "send_timeout", "send_refused"):  # as a wrong bit rate ends
             return []
@@ -175,22 +191,21 @@ def answering(settings: ChannelSettings) -> list[int]:
         channel.close()
 
 
-def _answering(link: ScanLink) -> list[int]:
-    answers = ask(link, list(ALL_NODES), 0x1000, 0)
-    return [node for node, frames in answers.items() for _ in frames]
-
-
 def _scan_at(settings: ChannelSettings) -> tuple[list[FoundDrive], list[ExaminationFinding]]:
     channel = Channel(settings)
     try:
         link = ScanLink(channel)
-        nodes = _answering(link)
         drives, findings = [], []
-        for node in dict.fromkeys(nodes):
-            if nodes.count(node) > 1:
-                findings.append(duplicate(node, nodes.count(node)))
+        for node, count in scan(link).items():
+            if count > 1:
+                findings.append(_duplicate(f"node {node}", node, count))
                 continue
-            found = _asked(link, node)
+            try:
+                found = _asked(link, node)
+            except DriverError as error:
+                if error.code not in ("sdo_abort", "sdo_timeout"):
+                    raise
+                found = ExaminationFinding(f"node {node}", False, str(error))
             if isinstance(found, FoundDrive):
                 drives.append(found)
             else:
@@ -204,10 +219,9 @@ def _scan_at(settings: ChannelSettings) -> tuple[list[FoundDrive], list[Examinat
         channel.close()
 
 
-def duplicate(node: int, count: int) -> ExaminationFinding:
-    """Finding on several drives of one number."""
+def _duplicate(name: str, node: int, count: int) -> ExaminationFinding:
     return ExaminationFinding(
-        f"node {node}", False, f"{count} drives answer as node {node}",
+        name, False, f"{count} drives answer as node {node}",
         "give each drive a node id of its own (switches on the drive, or its vendor's tool, one drive at a time)",
     )  # fmt: skip
 
@@ -232,7 +246,7 @@ def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
         counts, turns = drive.read_if_there(*ENCODER), drive.read_if_there(*TURNS)
         if counts and turns:
             told["counts_per_rev"] = counts / turns
-        watched = any(drive.read_if_there(*key) is not None for key in (HEARTBEAT_CONSUMER, DEADLINE))
+        watched = any(drive.read_if_there(*key) is not None for key in (HEARTBEAT_CONSUMER, GUARD_TIME))
         low, high = (drive.read_if_there(*key) for key in POSITION_LIMITS)
         serial = f", serial number {told['serial_number']}" if "serial_number" in told else ""
         return FoundDrive(
@@ -242,7 +256,6 @@ def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
             told,
             stated_limits(low, high),
             drive.read_if_there(*POSITION),
-            drive.read_if_there(*MOTOR_SPEED),
         )
 
 
@@ -289,3 +302,159 @@ def proposed_options(scan: BusScan, joints: Sequence[JointChoice]) -> dict[str, 
         if bus_load(decoded).share <= decoded.max_bus_load:
             break
     return options
+
+
+# -- the drives of a cell file -----------------------------------------------------------------------------------
+
+MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "homing", 7: "interpolated position",
+              8: "cyclic position", 9: "cyclic velocity", 10: "cyclic torque"}  # fmt: skip
+_WIRING = "is it powered, is its cable in, are its bit rate and its node id those of the cell file?"
+
+
+def examine_nodes(
+    link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path
+) -> Iterator[ExaminationFinding]:
+    """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
+    answers = scan(link)
+    unknown_nodes = [node for node in answers if node not in {axis.node_id for axis in codec.axes}]
+    dictionary = load_eds(eds_path(options, cell_dir))
+    for axis in codec.axes:
+        count = answers.get(axis.node_id, 0)
+        if count != 1:
+            yield _not_one(axis, count, unknown_nodes)
+            continue
+        with RemoteDrive(link, axis, dictionary) as drive:
+            try:
+                yield _identity(drive, axis.joint)
+                yield _state(drive)
+                yield _modes(drive, options)
+                yield from limits_findings(
+                    axis.joint, drive.read_if_there(0x607D, 1), drive.read_if_there(0x607D, 2)
+                )
+            except DriverError as error:
+                yield ExaminationFinding(axis.name, False, str(error))
+    if unknown_nodes:
+        words = ", ".join(str(node) for node in unknown_nodes)
+        yield ExaminationFinding(
+            "other nodes", None, f"{words} answer too, and no joint of the cell file has them"
+        )
+
+
+def scan(link: Link) -> dict[int, int]:
+    """Query every node id for its device type; returns the number of replies from each that replied."""
+    answers = ask(link, list(ALL_NODES), 0x1000, 0)
+    return {node: len(frames) for node, frames in answers.items() if frames}
+
+
+def _not_one(axis: DriveAxis, count: int, unknown_nodes: list[int]) -> ExaminationFinding:
+    if count > 1:
+        return _duplicate(axis.name, axis.node_id, count)
+    remedy = _WIRING
+    if unknown_nodes:
+        remedy += (
+            f" Nodes {', '.join(map(str, unknown_nodes))} answer, which no joint has: is it one of them?"
+        )
+    return ExaminationFinding(axis.name, False, "no answer", remedy)
+
+
+def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
+    name = drive.axis.name
+    device = drive.read(0x1000)
+    values = {what: drive.read_if_there(0x1018, k + 1) for k, what in enumerate(IDENTITY)}
+    reported = ", ".join(
+        f"{what} {value:#x}" if value is not None else f"no {what}" for what, value in values.items()
+    )
+    message = f"answers once; device type {device:#010x}, {reported}"
+    if device & 0xFFFF != CIA_402:
+        return ExaminationFinding(
+            name, False, f"{message}: device profile {device & 0xFFFF} is not CiA 402",
+            "another device has this node id; or protocol of the cell file",
+        )  # fmt: skip
+    wrong = [
+        (what, value)
+        for what, value in values.items()
+        if getattr(joint, what) is not None and getattr(joint, what) != value
+    ]
+    if wrong:
+        asked = ", ".join(f"{what} is {getattr(joint, what):#x} in the cell file" for what, _ in wrong)
+        mended = ", ".join(f"{what} = {value:#x}" for what, value in wrong if value is not None)
+        return ExaminationFinding(
+            name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}"
+        )
+    return ExaminationFinding(name, True, message)
+
+
+def limits_findings(joint: CanJoint, low: int | None, high: int | None) -> Iterator[ExaminationFinding]:
+    """Finding on the cell file's position limits against the drive's own (0x607D) [counts]; none where it has none."""
+    limits = stated_limits(low, high)
+    if limits is None:
+        return
+    scale = JointScale.of(joint)
+    own_low, own_high = sorted(scale.position(counts) for counts in limits)
+    unit = "rad" if joint.kind == "revolute" else "m"
+    own = f"the drive's own (0x607D) are {own_low:.4g} to {own_high:.4g} {unit}"
+    step = scale.resolution
+    if own_low - step <= joint.position_min and joint.position_max <= own_high + step:
+        yield ExaminationFinding(f"{joint.name} limits", True, f"within the drive's: {own}")
+        return
+    yield ExaminationFinding(
+        f"{joint.name} limits", False,
+        f"{joint.position_min:.4g} to {joint.position_max:.4g} {unit} reach beyond the drive: {own}",
+        f"position_min and position_max of {joint.name!r} and its [[safety.limit]] within these; or the drive's 0x607D",
+    )  # fmt: skip
+
+
+def _state(drive: RemoteDrive) -> ExaminationFinding:
+    name = f"{drive.axis.name} state"
+    state = drive_state(drive.read(0x6041))
+    register = drive.read(0x1001)
+    past = _past_errors(drive)
+    texts = [state.value]
+    volts = drive.read_if_there(0x6079)
+    if volts is not None:
+        texts.append(f"supply {volts * 1e-3:.1f} V")
+    switches = drive.read_if_there(0x60FD) or 0
+    texts += [
+        f"{what} limit switch active"
+        for bit, what in enumerate(("negative", "positive"))
+        if switches >> bit & 1
+    ]
+    texts.append(f"error register {register:#04x}" if register else "no error")
+    if past:
+        texts.append(f"history {', '.join(error_words(code) for code in past)}")
+    message = "; ".join(texts)
+    if state in FAULTY or register:
+        code = drive.read_if_there(0x603F) or (past[0] if past else 0)
+        words = f" ({error_words(code)})" if code else ""
+        remedy = error_hint(code) if code else "look its error up in the drive's manual"
+        return ExaminationFinding(
+            name, False, f"{message}{words}", f"{remedy}; then `stereoservo reset` clears it"
+        )
+    return ExaminationFinding(name, None if switches & 3 else True, message)
+
+
+def _past_errors(drive: RemoteDrive) -> list[int]:
+    """Error history 0x1003, newest first."""
+    count = drive.read_if_there(0x1003, 0) or 0
+    read = (drive.read_if_there(0x1003, k) for k in range(1, min(count, 4) + 1))
+    return [value & 0xFFFF for value in read if value]
+
+
+def _modes(drive: RemoteDrive, options: CanOptions) -> ExaminationFinding:
+    """Modes, watches and what is lost, as the drive would be configured; raises DriverError as that does."""
+    name = f"{drive.axis.name} modes"
+    supported = drive.read_if_there(0x6502)
+    if supported is None:
+        message = "0x6502 is not there"
+    else:
+        modes = [mode for mode in range(1, 33) if supported >> (mode - 1) & 1]
+        message = ", ".join(f"{mode} {MODE_NAMES.get(mode, '')}".strip() for mode in modes) or "none"
+    try:
+        setup = compose(drive, options, capabilities(drive))
+    except DriverError as error:
+        return ExaminationFinding(name, False, f"{message}; {error}")
+    chosen = setup.modes[0]
+    message += f"; used: {MODES[chosen]} ({chosen}); {setup.safety()}"
+    if chosen in POSITION_MODES:
+        message += f"; {lead_words(drive.axis.joint)}"
+    return ExaminationFinding(name, None if setup.losses else True, message)
