@@ -113,7 +113,7 @@ def test_init_with_a_driver_that_needs_options_says_where_to_begin(tmp_path: Pat
     code, result, _ = run("init", str(tmp_path / "x.toml"), "--joint-driver", "canopen")
     assert (code, result["error"]["code"]) == (1, "option")
     assert "interface is missing" in result["error"]["message"]
-    assert "hil-can.toml" in result["error"]["message"]
+    assert "--from hil-can" in result["error"]["message"]
     assert not (tmp_path / "x.toml").exists()
 
 

@@ -104,6 +104,21 @@ def test_the_cure_is_printed_and_what_was_found_well(
     assert err.strip() == "error: node 2: is silent"
 
 
+def test_each_line_is_printed_as_soon_as_it_is_known(
+    cell: Path, examination: Examination, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    printed = []
+
+    def asked(_question: str) -> bool:
+        printed.append(capfd.readouterr().out)
+        return False
+
+    monkeypatch.setattr(command, "permission", lambda jog, yes: asked)
+    assert cli.invoke(["doctor", str(cell), "--seconds", "0"]) == 1
+    assert "ok     node 1       answers" in printed[0]
+    assert "node 2" not in printed[0]
+
+
 def test_a_jog_is_allowed_by_yes_or_a_person_and_by_nobody_else(
     doctor: Doctor, examination: Examination, cell: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

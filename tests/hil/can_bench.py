@@ -29,9 +29,9 @@ STANDS = 2e-4
 RANGE = 0.15
 
 
-def cell_text(name: str, *, joints: str = "") -> str:
+def cell_text(name: str, *, joints: str = "", drives: str = "") -> str:
     """The shipped cell of CAN drives and MJPEG cameras as ``name``, before a plain background and with a quick
-    calibration. ``joints``: another ``[joints]`` section instead of the CAN bus.
+    calibration. ``joints``: another ``[joints]`` section instead of the CAN bus. ``drives``: of ``[emulate.drives]``.
     """
     text = shipped_cell_path("hil-video").read_text(encoding="utf-8")
     head, _, tail = text.partition("# Trial motions")
@@ -41,6 +41,8 @@ def cell_text(name: str, *, joints: str = "") -> str:
     calibration = f"[calibration]\n{base}\nrange = {{ {ranges} }}\n{speed}"
     head = head.replace('name = "hil-video"', f'name = "{name}"', 1)
     head = re.sub(r'(?m)^background = "pybullet"', 'background = "plain"', head)
+    if drives:
+        head = head.replace("[emulate.drives]\n", f"[emulate.drives]\n{drives}\n", 1)
     if joints:
         front, cameras = head.index("[joints]"), head.index("[emulate.cameras]")
         head = f"{head[:front]}{joints}\n{head[cameras:]}"
@@ -68,16 +70,16 @@ class CanBench:
         self.name = load_cell_file(self.cell).cell.name
 
     @classmethod
-    def emulated(cls, folder: Path, *, joints: str = "") -> CanBench:
+    def emulated(cls, folder: Path, *, joints: str = "", drives: str = "") -> CanBench:
         """Emulated drives and cameras on free ports, no daemon yet; the cell has the folder's name.
 
-        ``joints``: another ``[joints]`` section instead of the CAN bus.
+        ``joints``: another ``[joints]`` section instead of the CAN bus. ``drives``: lines of ``[emulate.drives]``.
         """
         shutil.rmtree(folder, ignore_errors=True)  # of a fixture that failed, and is tried again
         for made in (folder, folder / "bus", folder / "streams"):
             made.mkdir()
         path = folder / "cell.toml"
-        path.write_text(cell_text(folder.name, joints=joints), encoding="utf-8")
+        path.write_text(cell_text(folder.name, joints=joints, drives=drives), encoding="utf-8")
         cameras = EmulatorProcess(
             path, what="cameras", options=("--channel", ANY_SERVER), log=folder / "cameras.log"
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,9 @@ from stereoservo.ports.devices import (
     ExaminationFinding,
     JointDriverDescription,
     JointState,
+    MayMove,
 )
+from stereoservo.ports.discovery import BusScan, FoundBus, JointChoice
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.canopen.bringup import Bringup
 from stereoservo_drivers.canopen.bus_thread import BusThread
@@ -235,7 +237,28 @@ class CanJointDriver:
             self.bus.end()
             self.bus = None
 
-    def examine(self, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
+    @classmethod
+    def find_buses(cls) -> tuple[FoundBus, ...]:
+        """CAN adapters and USB serial ports of this computer."""
+        from stereoservo_drivers.canopen.nodes import found_buses  # for `stereoservo setup` alone
+
+        return found_buses()
+
+    @classmethod
+    def scan_bus(cls, options: Mapping[str, Any]) -> BusScan:
+        """CiA 402 drives on a bus. Raises DriverError."""
+        from stereoservo_drivers.canopen.nodes import scan_bus
+
+        return scan_bus(options)
+
+    @classmethod
+    def options_of(cls, scan: BusScan, joints: Sequence[JointChoice]) -> dict[str, Any]:
+        """Options for the drives of a scan."""
+        from stereoservo_drivers.canopen.nodes import proposed_options
+
+        return proposed_options(scan, joints)
+
+    def examine(self, may_move: MayMove) -> Iterator[ExaminationFinding]:
         """Findings on bus and drives for `stereoservo doctor`; closes the driver."""
         from stereoservo_drivers.canopen.examination import examine  # for this one command
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import DriverError, ExaminationFinding
+from stereoservo.ports.devices import DriverError, ExaminationFinding, MayMove
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bringup import listening
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
-from stereoservo_drivers.canopen.node_checks import examine_nodes
+from stereoservo_drivers.canopen.nodes import examine_nodes, other_bitrate, scan
 from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
@@ -40,7 +41,6 @@ SETTLE_S = 0.4
 MISSED_SHARE = 0.01
 LATE_SHARE = 0.5
 HEARTBEAT_SHARE = 0.6
-MayMove = Callable[[str], bool]
 
 
 def examine(driver: CanJointDriver, cell_dir: Path, may_move: MayMove) -> Iterator[ExaminationFinding]:
@@ -86,11 +86,18 @@ def _examine_bus(driver: CanJointDriver, channel: Channel, cell_dir: Path) -> It
         remedy = f"bit rate of every node ({driver.options.bitrate}), terminators, cable"
         yield ExaminationFinding("bus errors", False, "; ".join(dict.fromkeys(errors)), remedy)
     bus = BusThread(channel, driver.master)
+    silent = False
     try:
         if isinstance(driver.master.codec, Cia402Codec):
-            yield from examine_nodes(bus, driver.options, driver.master.codec, cell_dir)
+            silent = not scan(bus)
+            if not silent:
+                yield from examine_nodes(bus, driver.options, driver.master.codec, cell_dir)
     finally:
         bus.end()
+    if silent:
+        elsewhere = other_bitrate(msgspec.structs.asdict(driver.options))
+        if elsewhere is not None:
+            yield elsewhere
 
 
 def _listen(channel: Channel) -> list[CanFrame]:
@@ -248,12 +255,13 @@ def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> I
             continue
         middle = (joint.position_min + joint.position_max) / 2
         sign = 1.0 if float(driver.read_state().positions[k]) <= middle else -1.0
-        if not may_move(_question(joint, sign)):
+        share = min(float(may_move(_question(joint, sign))), 1.0)
+        if share <= 0.0:
             yield ExaminationFinding(name, None, "not jogged: not allowed (--jog asks)")
             continue
-        trace, error = _jog(driver, k, sign)
+        trace, error = _jog(driver, k, sign * share)
         if error is None:
-            yield jog_finding(trace)
+            yield msgspec.structs.replace(jog_finding(trace), jogged=(joint.name, trace.travel))
             continue
         remedy = jog_finding(trace).remedy if trace.asked else ""
         yield ExaminationFinding(name, False, str(error), remedy)
@@ -272,15 +280,15 @@ def _question(joint: CanJoint, sign: float) -> str:
     )
 
 
-def _jog(driver: CanJointDriver, k: int, sign: float) -> tuple[JogTrace, DriverError | None]:
-    """Enable, move joint ``k``, wait for rest, switch off; returns what ended it early, if anything."""
+def _jog(driver: CanJointDriver, k: int, share: float) -> tuple[JogTrace, DriverError | None]:
+    """Enable, move joint ``k`` by ``share`` of the usual jog, rest, switch off; returns what ended it early."""
     joint = driver.options.joint[k]
     trace = JogTrace(joint, float(driver.read_state().positions[k]))
     try:
         driver.activate()
         _hold(driver, trace, k, SETTLE_S)  # released brakes let an arm sink a little: that is not the jog
         trace = JogTrace(joint, float(driver.read_state().positions[k]))
-        _move(driver, trace, k, sign)
+        _move(driver, trace, k, share)
         if not trace.runs_away():
             _hold(driver, trace, k, SETTLE_S)
     except DriverError as error:
@@ -290,10 +298,10 @@ def _jog(driver: CanJointDriver, k: int, sign: float) -> tuple[JogTrace, DriverE
     return trace, None
 
 
-def _move(driver: CanJointDriver, trace: JogTrace, k: int, sign: float) -> None:
+def _move(driver: CanJointDriver, trace: JogTrace, k: int, share: float) -> None:
     start = time.monotonic()
     while not trace.runs_away():
-        velocity = jog_velocity(trace.joint, time.monotonic() - start, sign)
+        velocity = jog_velocity(trace.joint, time.monotonic() - start, share)
         if velocity is None:
             return
         _step(driver, trace, k, velocity)

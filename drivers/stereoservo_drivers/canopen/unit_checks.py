@@ -88,8 +88,12 @@ def resolution_finding(joint: CanJoint) -> ExaminationFinding:
     )
 
 
-def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
-    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: slow, doubling, constant; None: finished."""
+def jog_velocity(joint: CanJoint, t_s: float, share: float) -> float | None:
+    """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: slow, doubling, constant; None: finished.
+
+    ``share`` of ``JOG``, with its sign, is how far it goes.
+    """
+    sign = math.copysign(1.0, share)
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
     slowest = max(SLOWEST_SHARE * fastest, 1.0 / abs(JointScale.of(joint).velocity_units_per_unit))
     slowest = min(slowest, fastest)
@@ -98,7 +102,7 @@ def jog_velocity(joint: CanJoint, t_s: float, sign: float) -> float | None:
     risen = (fastest - slowest) / growth
     if t_s < rise_s:
         return sign * slowest * math.exp(growth * t_s)
-    if t_s < rise_s + max(JOG[joint.kind] - risen, 0.0) / fastest:
+    if t_s < rise_s + max(abs(share) * JOG[joint.kind] - risen, 0.0) / fastest:
         return sign * fastest
     return None
 

@@ -12,6 +12,7 @@ from stereoservo.ports.devices import (
     DriverError,
     Frame,
 )
+from stereoservo.ports.discovery import FoundCamera
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, decode_video_options
@@ -80,6 +81,20 @@ class VideoCameraDriver:
             delivers="frames",
             call_budget_us=LIVE_BUDGET_US if self._place.live else RECORDED_BUDGET_US,
         )
+
+    @classmethod
+    def find_cameras(cls) -> tuple[FoundCamera, ...]:
+        """V4L2 cameras of this computer."""
+        from stereoservo_drivers.video.discovery import found_cameras  # for `stereoservo setup` alone
+
+        return found_cameras()
+
+    @classmethod
+    def probe_camera(cls, options: Mapping[str, Any]) -> tuple[int, int, float]:
+        """Width, height [px] and rate [Hz] of a source's pictures. Raises DriverError."""
+        from stereoservo_drivers.video.discovery import probed
+
+        return probed(options)
 
     def configure(self) -> None:
         """Open the source and receive a first image, within ``open_timeout_s``; also after :meth:`close`.

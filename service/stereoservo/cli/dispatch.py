@@ -45,6 +45,7 @@ COMMANDS: dict[str, str] = {
     "ik": "ik:ik",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",
+    "setup": "setup.command:setup",
     "init": "init:init",
     "ls": "ls:ls",
     "warmup": "warmup:warmup",

@@ -6,14 +6,15 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Mapping, Sequence
 from json import dumps as json_text
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit
-from stereoservo.messages.cell_file import check_joints, load_cell_file
+from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
+from stereoservo.messages.cell_file import CameraSection, check_joints, load_cell_file
 from stereoservo.messages.directories import CELL_NAME
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.ports import plugins
@@ -36,6 +37,14 @@ def init(
             metavar="KEY=VALUE", help="An option of the joint driver, its value as in TOML; repeatable."
         ),
     ] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="NAME|PATH",
+            help="Begin with a copy of a cell, shipped (hil-can, hil-video, demo, …) or your own, and its comments.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over an existing file.")] = False,
     json: JsonOption = False,
 ) -> None:
@@ -47,8 +56,12 @@ def init(
         )
     if file.exists() and not force:
         raise CommandError("exists", f"{file} exists already; --force writes over it")
+    if source is not None:
+        _copy(source, file, cell, camera or option or joint_driver != "fake" or camera_driver != "fake")
+        emit({"cell": cell, "file": str(file)}, f"wrote {file}; next: stereoservo doctor {file}", json)
+        return
     cameras = camera or ["left", "right"]
-    options = _options(option or [])
+    options = toml_options(option or [])
     context = DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent)
     try:
         joints: JointDriverDescription = plugins.load(plugins.JOINT_DRIVERS, joint_driver)(
@@ -60,8 +73,9 @@ def init(
         raise CommandError(
             "option",
             f"{error}. Driver {joint_driver!r} tells its joints only once it knows [joints.options]: give them "
-            "(--option 'servo=[{name=\"j1\", id=1}]' --option port=/dev/ttyUSB0), or copy a cell file that uses it "
-            "(deploy/cells/ in the source, e.g. hil-can.toml for 'canopen') and change it",
+            "(--option 'servo=[{name=\"j1\", id=1}]' --option port=/dev/ttyUSB0), begin with a copy of a shipped cell "
+            "that uses it (--from hil-can for 'canopen', --from hil-video for 'canopen' and 'video'), or let "
+            "`stereoservo setup` find the drives",
         ) from error
     described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
         {},
@@ -70,15 +84,37 @@ def init(
         ),
     ).describe()
     detector_name = detector if described.delivers == "frames" else ""
+    sections = [CameraSection(name, camera_driver, detector_name) for name in cameras]
     try:
-        file.write_text(_text(cell, joint_driver, options, joints, camera_driver, detector_name, cameras))
+        file.write_text(cell_text(cell, joint_driver, options, joints, sections))
     except OSError as error:
         raise CommandError("file", f"{file}: {error.strerror}") from error
     check_joints(load_cell_file(file), tuple(joint.name for joint in joints.joints), file)
     emit({"cell": cell, "file": str(file)}, f"wrote {file}; next: stereoservo doctor {file}", json)
 
 
-def _options(given: list[str]) -> str:
+def _copy(source: str, file: Path, cell: str, contradicted: object) -> None:
+    """Write a copy of a cell file, shipped or of a path, as ``cell``. Raises CommandError, CellFileError."""
+    if contradicted:
+        raise CommandError(
+            "argument", "--from copies a cell as it is; drivers, cameras and options are changed in the copy"
+        )
+    path = shipped_or_path(source)
+    load_cell_file(path)
+    text = path.read_text(encoding="utf-8")
+    renamed, count = re.subn(
+        r'(?m)^(\[cell\]\s*\n(?:[^\[\n]*\n)*?name\s*=\s*)"[^"]*"', rf'\g<1>"{cell}"', text
+    )
+    if count != 1:
+        raise CommandError("file", f'{path}: no line name = "…" under [cell], which is changed in a copy')
+    try:
+        file.write_text(renamed, encoding="utf-8")
+    except OSError as error:
+        raise CommandError("file", f"{file}: {error.strerror}") from error
+    load_cell_file(file)
+
+
+def toml_options(given: list[str]) -> str:
     """Lines of ``[joints.options]``; a value that is no TOML is a string. Raises CommandError."""
     lines = []
     for text in given:
@@ -98,15 +134,15 @@ def _options(given: list[str]) -> str:
     return "\n".join(lines)
 
 
-def _text(
+def cell_text(
     cell: str,
     driver: str,
     options: str,
     joints: JointDriverDescription,
-    camera_driver: str,
-    detector: str,
-    cameras: list[str],
+    cameras: list[CameraSection],
+    base: Sequence[float] = (),
 ) -> str:
+    """A cell file with comments. ``options``: lines of ``[joints.options]``; ``base``: of calibration [rad or m]."""
     lines = [
         "schema = 1",
         "",
@@ -123,11 +159,13 @@ def _text(
         "# [joints.home]                 # home position by joint [rad or m]; default: calibration.base",
         "",
     ]
-    for name in cameras:
-        lines += ["[[camera]]", f'name = "{name}"', f'driver = "{camera_driver}"']
-        if detector:
-            lines.append(f'detector = "{detector}"')
-        lines += ['mount = "eye_to_hand"         # or "eye_in_hand"', ""]
+    for camera in cameras:
+        lines += ["[[camera]]", f'name = "{camera.name}"', f'driver = "{camera.driver}"']
+        if camera.detector:
+            lines.append(f'detector = "{camera.detector}"')
+        lines += [f'mount = "{camera.mount}"         # eye_to_hand, or eye_in_hand', ""]
+        if camera.options:
+            lines += ["[camera.options]", *toml_lines(camera.options, "camera.options"), ""]
     lines += [
         "[servo]",
         f"rate_hz = {min(joints.rate_hz, 250.0):g}                 # cycles of the loop a second",
@@ -169,13 +207,35 @@ def _text(
         "",
         "[calibration.base]",
     ]
-    base = joints.home or [_base(joint.position_min, joint.position_max) for joint in joints.joints]
+    base = base or joints.home or [_base(joint.position_min, joint.position_max) for joint in joints.joints]
     lines += [f"{joint.name} = {round(q, 4)!r}" for joint, q in zip(joints.joints, base, strict=True)]
     lines += ["", "# [calibration.range]           # state it where something stands in the way [rad or m]"]
     lines += [
         f"# {joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints
     ]
     return "\n".join(lines) + "\n"
+
+
+def toml_lines(table: Mapping[str, Any], section: str) -> list[str]:
+    """Lines of a table of a TOML file, below the heading ``section``: its values, then its lists of tables."""
+    lines, below = [], []
+    for key, value in table.items():
+        if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
+            for row in value:
+                below += ["", f"[[{section}.{key}]]", *toml_lines(row, f"{section}.{key}")]
+        elif isinstance(value, dict):
+            below += ["", f"[{section}.{key}]", *toml_lines(value, f"{section}.{key}")]
+        else:
+            lines.append(f"{key} = {_toml_value(value)}")
+    return lines + below
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return json_text(value) if isinstance(value, str) else repr(value)
 
 
 def _base(low: float, high: float) -> float:

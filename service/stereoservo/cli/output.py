@@ -114,5 +114,20 @@ def read_file(path: Path) -> bytes:
         raise CommandError("file", f"{path}: {error.strerror}") from error
 
 
+def shipped_or_path(cell: str) -> Path:
+    """Path of a cell file, or of the shipped one of that name. Raises BadParameter, PluginError."""
+    from stereoservo.ports import plugins  # not for verbs that need no file
+
+    if cell.endswith(".toml") or Path(cell).exists():
+        return Path(cell)
+    found: list[str] = []
+    for provider in plugins.names(plugins.CELLS):
+        try:
+            return Path(plugins.load(plugins.CELLS, provider)(cell))
+        except ValueError as error:
+            found.append(str(error))
+    raise typer.BadParameter("; ".join(found) or f"{cell!r} is no .toml file", param_hint="CELL")
+
+
 def _snake(name: str) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", name.removesuffix("Error")).lower()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, JsonOption, emit, note, shipped_or_path
 from stereoservo.messages.servo_state import COMMISSIONING_SPEED
 
 if TYPE_CHECKING:
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 
 def run(
-    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Path of a cell file.")],
+    cell: Annotated[
+        str, typer.Argument(metavar="NAME|PATH", help="A cell file (.toml), or the name of a shipped one.")
+    ],
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Compute everything, write nothing to the drives.")
     ] = False,
@@ -38,12 +40,13 @@ def run(
         mode = " (dry run: nothing is written to the drives)" if dry_run else ""
         note(f"cell {plan.cell.cell.name!r} is up{mode}")
 
+    path = shipped_or_path(cell)
     file = record if record in ("", "auto") else str(Path(record).absolute())
     if file not in ("", "auto") and Path(file).exists():
         raise CommandError("exists", f"{file} exists already; a recording is not written over")
     ended_by = run_cell(
-        cell, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready
+        path, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready
     )
     if ended_by == signal.SIGINT:
         raise KeyboardInterrupt
-    emit({"cell": str(cell), "ended_by": signal.Signals(ended_by).name if ended_by else ""}, "", json)
+    emit({"cell": str(path), "ended_by": signal.Signals(ended_by).name if ended_by else ""}, "", json)

@@ -189,3 +189,14 @@ def realtime_for_a_while(priority: int) -> Iterator[list[str]]:
         # The flag may be set, and not be cleared, without privileges.
         os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
         gc.unfreeze()
+
+
+@contextmanager
+def ordinary_for_a_while() -> Iterator[None]:
+    """Context manager: this thread without a real-time priority, for work that others must not wait for."""
+    before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)

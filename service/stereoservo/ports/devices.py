@@ -270,20 +270,27 @@ class AuxiliaryDriver(Protocol):
 class ExaminationFinding(msgspec.Struct, frozen=True):
     """One result of an examination of a cell. ``ok``: passed, failed, or None for a remark without a verdict.
 
-    ``remedy``: the setting or act that removes the cause; ``cure`` in JSON.
+    ``remedy``: the setting or act that removes the cause; ``cure`` in JSON. ``jogged``: the joint moved for it, and
+    its travel by its encoder [rad or m].
     """
 
     name: str
     ok: bool | None
     message: str
     remedy: str = msgspec.field(default="", name="cure")
+    jogged: tuple[str, float] | None = None
+
+
+MayMove = Callable[[str], float]
+"""Asked, with a question for a person, before a joint is moved: the share of the usual jog (one degree, 2 mm) that is
+allowed, up to 1; 0 or False: none."""
 
 
 @runtime_checkable
 class ExaminableJointDriver(Protocol):
     """A joint driver that can examine its machine for `stereoservo doctor`; the driver is not configured then."""
 
-    def examine(self, may_move: Callable[[str], bool]) -> Iterator[ExaminationFinding]:
+    def examine(self, may_move: MayMove) -> Iterator[ExaminationFinding]:
         """Findings on the machine: connect, examine, release. ``may_move`` is asked before any joint is moved.
 
         Never raises on what the machine does: a failure is a finding.

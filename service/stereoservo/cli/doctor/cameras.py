@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 
 from stereoservo.cli.doctor.camera_findings import CameraRecord, examine_record, examine_skew, near_border
-from stereoservo.cli.doctor.view_consistency import examine_coverage, examine_views
+from stereoservo.cli.doctor.plate_motion import examine_sides
+from stereoservo.cli.doctor.view_consistency import examine_coverage, examine_views, same_camera_twice
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.ipc_messages import RunPlan
@@ -139,6 +140,10 @@ def examine_cameras(
         if (finding := near_border(record)) is not None:
             yield finding
     yield from examine_skew(records)
+    if (same := same_camera_twice(records)) is not None:
+        yield same
+    elif (sides := examine_sides(records)) is not None:
+        yield sides
     yield from examine_views(records, model)
     if model is not None and settings.trials is not None:
         yield from examine_coverage(model, settings.trials, records)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import resource
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,7 @@ import typer
 
 from stereoservo.cli.doctor.cameras import examine_cameras
 from stereoservo.cli.doctor.joints import examine_joints, permission
-from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
 from stereoservo.client import SessionError
 from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
 from stereoservo.daemon.ipc_messages import RunPlan
@@ -26,8 +26,7 @@ from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import holder
-from stereoservo.ports import plugins
-from stereoservo.ports.devices import ExaminationFinding
+from stereoservo.ports.devices import ExaminationFinding, MayMove
 
 LOW_DISK_BYTES = 500_000_000
 
@@ -59,50 +58,64 @@ def doctor(
     ``--jog``; drives and cameras are asked only while no daemon has them.
     """
     may_move = permission(jog, yes)
-    path = _path_of(cell)
-    loaded = load_cell_file(path)
-    findings = [ExaminationFinding("cell file", True, f"{path} is valid")]
-    directories = cell_directories(loaded.cell.name)
-    create_directories(directories)
-    plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
-    findings.append(ExaminationFinding("drivers", True, _drivers(plan)))
-    findings += [check(plan, directories) for check in CHECKS]
-    signal.signal(
-        signal.SIGPIPE, signal.SIG_IGN
-    )  # an adapter that hangs up is a finding, no end without a word
-    findings += examine_joints(plan, may_move)
-    if seconds > 0:
-        settings = plan.settings()
-        model, _ = ModelStore(directories.models).newest_fitting(settings)
-        findings += examine_cameras(plan, settings, model, seconds, pictures or directories.state / "doctor")
-    failed = [finding for finding in findings if finding.ok is False]
-    text = "\n".join(_line(finding) for finding in findings)
-    if failed:
+    path = shipped_or_path(cell)
+    findings = []
+    for finding in examine_cell(path, may_move, seconds, pictures):
+        findings.append(finding)
         if not json:
-            emit(None, text, False)
+            emit(None, line_of(finding), False)
+    failed = [finding for finding in findings if finding.ok is False]
+    if failed:
         tree = msgspec.to_builtins(findings)
         raise CommandError(
             "checks_failed",
             "; ".join(f"{finding.name}: {finding.message}" for finding in failed),
             checks=tree,
         )
-    emit({"checks": findings}, text, json)
+    emit({"checks": findings}, "", json)
 
 
-def _path_of(cell: str) -> Path:
-    """Path of a cell file, or of the shipped one of that name. Raises BadParameter, PluginError."""
-    if cell.endswith(".toml") or Path(cell).exists():
-        return Path(cell)
-    found: list[str] = []
-    for provider in plugins.names(plugins.CELLS):
-        try:
-            return Path(plugins.load(plugins.CELLS, provider)(cell))
-        except ValueError as error:
-            found.append(str(error))
-    raise typer.BadParameter("; ".join(found) or f"{cell!r} is no .toml file", param_hint="CELL")
+def examine_cell(
+    path: Path, may_move: MayMove, seconds: float, pictures: Path | None
+) -> Iterator[ExaminationFinding]:
+    """Findings on a cell, each as soon as it is known: its file, this computer, drives, cameras.
+
+    ``seconds``: how long the cameras are watched; 0: not at all. Raises CellFileError, PluginError, DriverError where
+    the file cannot be used.
+    """
+    plan, directories = yield from examine_file(path)
+    yield from examine_joints(plan, may_move)
+    if seconds > 0:
+        yield from examine_pictures(plan, directories, seconds, pictures)
 
 
-def _line(finding: ExaminationFinding) -> str:
+def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPlan, CellDirectories]]:
+    """Findings on a cell file and this computer; returns the plan of a run. Raises as :func:`examine_cell`."""
+    loaded = load_cell_file(path)
+    yield ExaminationFinding("cell file", True, f"{path} is valid")
+    directories = cell_directories(loaded.cell.name)
+    create_directories(directories)
+    plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
+    yield ExaminationFinding("drivers", True, _drivers(plan))
+    for check in CHECKS:
+        yield check(plan, directories)
+    signal.signal(
+        signal.SIGPIPE, signal.SIG_IGN
+    )  # an adapter that hangs up is a finding, no end without a word
+    return plan, directories
+
+
+def examine_pictures(
+    plan: RunPlan, directories: CellDirectories, seconds: float, pictures: Path | None = None
+) -> Generator[ExaminationFinding, None, None]:
+    """Findings on the cameras, watched for ``seconds``; ``pictures``: directory for what they see."""
+    settings = plan.settings()
+    model, _ = ModelStore(directories.models).newest_fitting(settings)
+    yield from examine_cameras(plan, settings, model, seconds, pictures or directories.state / "doctor")
+
+
+def line_of(finding: ExaminationFinding) -> str:
+    """A finding as text for a terminal."""
     mark = {True: "ok", False: "FAILED", None: "note"}[finding.ok]
     remedy = f"\n{'':20}cure: {finding.remedy}" if finding.remedy else ""
     return f"{mark:6} {finding.name:12} {finding.message}{remedy}"

@@ -5,7 +5,7 @@ permission.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 
 import typer
@@ -17,9 +17,7 @@ from stereoservo.daemon.pacing import realtime_for_a_while
 from stereoservo.daemon.plant_driver import make_driver
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path, holder
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import DriverError, ExaminableJointDriver, ExaminationFinding
-
-MayMove = Callable[[str], bool]
+from stereoservo.ports.devices import DriverError, ExaminableJointDriver, ExaminationFinding, MayMove
 
 
 def permission(jog: bool, yes: bool) -> MayMove:

@@ -25,6 +25,8 @@ FITS_PX = 0.5
 MATCHES = 10
 """Markers seen by two cameras that the epipolar constraint needs for a test: 7 are used up."""
 WORKSPACE_SHARE = 0.9
+SAME_PX = 0.5
+"""Two cameras that show every marker this close to where the other does are one."""
 
 
 def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[ExaminationFinding]:
@@ -120,6 +122,23 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFindin
         name, False, f"{summary}; markers {off} do not",
         "are they mistaken for others, or is there a second plate in view?",
     )  # fmt: skip
+
+
+def same_camera_twice(records: Sequence[CameraRecord], pixels: float = SAME_PX) -> ExaminationFinding | None:
+    """Finding on two cameras that show one picture: every marker within ``pixels`` [px] of the other's."""
+    for k, first in enumerate(records):
+        for second in records[k + 1 :]:
+            ids, at, _ = mean_observations(first)
+            others, where, _ = mean_observations(second)
+            if len(ids) < 4 or list(ids) != list(others):
+                continue
+            if abs(at - where).max() <= pixels:
+                return ExaminationFinding(
+                    f"cameras {first.name}-{second.name}", False,
+                    f"{first.name!r} and {second.name!r} show one and the same picture: one camera given twice",
+                    "camera.options of one of them: source",
+                )  # fmt: skip
+    return None
 
 
 def examine_coverage(

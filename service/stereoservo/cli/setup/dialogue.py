@@ -1,0 +1,162 @@
+"""Dialogue of `stereoservo setup` with a person: lines as things happen, questions with defaults, answers that may come
+from a file and are written down, so that the whole can be repeated.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from json import dumps as toml_string
+from pathlib import Path
+from typing import TextIO, TypeVar
+
+from stereoservo.cli.output import CommandError
+
+QUIET_S = 2.0
+"""After so long without a line, what is under way is told again: a person takes 3 s of silence for the end."""
+_LOOK_S = 0.2
+T = TypeVar("T")
+
+
+class Dialogue:
+    """Lines and questions. ``answers``: by the question's key; None: they are typed. A context manager.
+
+    ``asked``: questions and their answers so far. ``longest_silence_s``: between two lines, waits for a person aside.
+    """
+
+    def __init__(self, out: TextIO, answers: dict[str, str] | None = None) -> None:
+        self.asked: dict[str, str] = {}
+        self.longest_silence_s = 0.0
+        self._out = out
+        self._answers = answers
+        self._doing = ""
+        self._since_s = self._said_s = time.monotonic()
+        self._waits = False
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._ticker = threading.Thread(target=self._tick, name="setup-ticker", daemon=True)
+
+    def __enter__(self) -> Dialogue:
+        self._ticker.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._ticker.join()
+
+    def say(self, line: str) -> None:
+        """One line, or more."""
+        with self._lock:
+            self._write(line)
+
+    def heading(self, line: str) -> None:
+        """The beginning of a step."""
+        self.say(f"\n== {line}")
+
+    @contextmanager
+    def doing(self, what: str) -> Iterator[None]:
+        """Something that may take long: told again and again while nothing else is said."""
+        before = self._doing, self._since_s
+        self._doing, self._since_s = what, time.monotonic()
+        try:
+            yield
+        finally:
+            self._doing, self._since_s = before
+
+    def now(self, what: str) -> None:
+        """What is under way from now on, in place of what was."""
+        self._doing = what
+
+    def ask(self, key: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
+        """The answer to a question, as ``parse`` understands it, which raises ValueError with what would be valid.
+
+        ``default``: what an empty answer means. Raises CommandError: no terminal and no answer, a scripted answer that
+        is not valid.
+        """
+        shown = f"{question}{'' if default is None else f' [{default}]'}: "
+        while True:
+            text = self._answer(key, shown, default)
+            try:
+                understood = parse(text)
+            except ValueError as error:
+                if self._answers is not None:
+                    raise CommandError("answer", f"answer {key} = {text!r}: {error}") from error
+                self.say(f"   {error}")
+                continue
+            self.asked[key] = text
+            return understood
+
+    def confirm(self, key: str, question: str, default: bool) -> bool:
+        """Whether the answer is yes."""
+        return self.ask(key, f"{question} (yes or no)", "yes" if default else "no", _yes_or_no)
+
+    def _answer(self, key: str, shown: str, default: str | None) -> str:
+        if self._answers is not None:
+            text = self._answers.get(key, default)
+            if text is None:
+                raise CommandError("answer", f"the answers have no {key!r}, and it has no default: {shown}")
+            self.say(f"?  {shown}{text}")
+            return text
+        if not sys.stdin.isatty():
+            raise CommandError(
+                "terminal",
+                "setup asks on the terminal, and there is none; --answers FILE answers for a person",
+            )
+        with self._lock:
+            self._write(f"?  {shown}", end="")
+            self._waits = True
+        try:
+            line = sys.stdin.readline()
+        finally:
+            self._waits = False
+            self._said_s = time.monotonic()
+        if not line:
+            raise CommandError("terminal", f"the terminal was closed before this was answered: {shown}")
+        return line.strip() or (default if default is not None else "")
+
+    def _write(self, text: str, end: str = "\n") -> None:
+        now = time.monotonic()
+        self.longest_silence_s = max(self.longest_silence_s, now - self._said_s)
+        self._said_s = now
+        self._out.write(text + end)
+        self._out.flush()
+
+    def _tick(self) -> None:
+        while not self._ended.wait(_LOOK_S):
+            with self._lock:
+                now = time.monotonic()
+                if not self._waits and now - self._said_s > QUIET_S:
+                    what = self._doing or "working"
+                    self._write(f"   … {what}, {now - self._since_s:.0f} s")
+
+
+def _yes_or_no(text: str) -> bool:
+    match text.lower():
+        case "y" | "yes":
+            return True
+        case "n" | "no":
+            return False
+    raise ValueError("yes or no")
+
+
+def read_answers(path: Path) -> dict[str, str]:
+    """Answers by key, from a TOML file of strings. Raises CommandError."""
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CommandError("file", f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise CommandError("file", f"{path}: is not TOML: {error}") from error
+    wrong = [key for key, value in tree.items() if not isinstance(value, str)]
+    if wrong:
+        raise CommandError("file", f'{path}: {wrong[0]}: answers are strings, KEY = "ANSWER"')
+    return tree
+
+
+def answers_text(asked: dict[str, str]) -> str:
+    """Answers as the file that :func:`read_answers` reads."""
+    return "".join(f"{toml_string(key)} = {toml_string(text)}\n" for key, text in asked.items())

@@ -1,0 +1,110 @@
+"""What drivers find of the hardware of a computer, for `stereoservo setup`: records, and protocols of the drivers that
+can look. A driver class that has the methods is asked; the others are set up by their options alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import msgspec
+
+from stereoservo.ports.devices import ExaminationFinding, JointKindName
+
+
+class FoundCamera(msgspec.Struct, frozen=True):
+    """A camera that a computer has: its name for people, the driver's options that choose it, its picture sizes with
+    rates ``(width [px], height [px], rate [Hz])``, best first; none where it must be opened to know.
+    """
+
+    name: str
+    options: dict[str, Any]
+    modes: tuple[tuple[int, int, float], ...] = ()
+
+
+class FoundBus(msgspec.Struct, frozen=True):
+    """An adapter or serial port that a bus of drives may be behind: its name for people, and the driver's options."""
+
+    name: str
+    options: dict[str, Any]
+
+
+class FoundDrive(msgspec.Struct, frozen=True):
+    """A drive on a bus. ``address``: its number there. ``options``: what it tells of itself under the names of the
+    driver's options of a joint (identity, counts). ``limits``: its own limits of the position [counts]; None: it has
+    none. ``position`` [counts]; None: not told.
+    """
+
+    address: int
+    name: str
+    options: dict[str, Any]
+    limits: tuple[int, int] | None = None
+    position: int | None = None
+
+
+class BusScan(msgspec.Struct, frozen=True):
+    """Result of a scan: the bus's options by which drives answered, the drives by address, and what is wrong."""
+
+    options: dict[str, Any]
+    drives: tuple[FoundDrive, ...]
+    findings: tuple[ExaminationFinding, ...] = ()
+
+
+class JointChoice(msgspec.Struct, frozen=True):
+    """What a person has said of the joint that a drive moves, base first [rad, s; m for prismatic joints].
+
+    ``counts_per_rev``: of the motor; ``gear_ratio``: motor turns per joint turn, or per metre;
+    ``velocity_units_per_rev_s``: the drive's velocity at one motor turn a second, None: counts/s. ``low``, ``high``,
+    ``velocity``: limits.
+    """
+
+    name: str
+    drive: FoundDrive
+    kind: JointKindName
+    counts_per_rev: float
+    gear_ratio: float
+    velocity_units_per_rev_s: float | None
+    low: float
+    high: float
+    velocity: float
+
+
+@runtime_checkable
+class CameraFinder(Protocol):
+    """A camera driver class that finds the cameras of a computer."""
+
+    @classmethod
+    def find_cameras(cls) -> tuple[FoundCamera, ...]:
+        """Cameras of this computer; those on a network are not looked for. Opens none for longer than a question."""
+        ...
+
+    @classmethod
+    def probe_camera(cls, options: Mapping[str, Any]) -> tuple[int, int, float]:
+        """Open a source by ``options`` and look at its pictures: width, height [px] and rate [Hz] that it delivers.
+
+        Raises DriverError.
+        """
+        ...
+
+
+@runtime_checkable
+class DriveFinder(Protocol):
+    """A joint driver class that finds buses and the drives on them."""
+
+    @classmethod
+    def find_buses(cls) -> tuple[FoundBus, ...]:
+        """Adapters and serial ports of this computer; nothing is sent."""
+        ...
+
+    @classmethod
+    def scan_bus(cls, options: Mapping[str, Any]) -> BusScan:
+        """Ask a bus, whose ``options`` need not name any joint, which drives are on it; nothing is written to a drive.
+
+        Raises DriverError where the bus cannot be opened, or is lost.
+        """
+        ...
+
+    @classmethod
+    def options_of(cls, scan: BusScan, joints: Sequence[JointChoice]) -> dict[str, Any]:
+        """The driver's options, ``[joints.options]`` of a cell file, for drives that a scan has found."""
+        ...
