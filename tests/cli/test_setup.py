@@ -128,6 +128,25 @@ def test_a_scripted_dialogue_takes_answers_and_defaults_and_refuses_what_is_not_
     assert "How many [5]: 5" in out.getvalue()
 
 
+class Terminal(io.StringIO):
+    """A person who types."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_on_a_terminal_what_is_not_valid_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", Terminal("many\n7\n\n"))
+    out = io.StringIO()
+    with Dialogue(out, {"a": "2"}) as dialogue:
+        assert dialogue.ask("a", "How many", None, int) == 2  # by the answers
+        assert dialogue.ask("b", "How many", None, int) == 7  # what they lack is asked
+        assert dialogue.ask("c", "How many", "5", int) == 5
+        with pytest.raises(CommandError, match="the terminal was closed"):
+            dialogue.ask("d", "How many", None, int)
+    assert "invalid literal" in out.getvalue()
+
+
 # -- what a computer has -------------------------------------------------------------------------------------------
 
 

@@ -193,6 +193,7 @@ def test_a_drive_that_lacks_something_is_named_before_anything_moves(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_scripted_person_gets_from_nothing_to_a_goal(
     box: CanBench, run: Run, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

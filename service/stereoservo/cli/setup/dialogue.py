@@ -16,14 +16,15 @@ from typing import TextIO, TypeVar
 
 from stereoservo.cli.output import CommandError
 
-QUIET_S = 2.0
+QUIET_S = 1.5
 """After so long without a line, what is under way is told again: a person takes 3 s of silence for the end."""
 _LOOK_S = 0.2
 T = TypeVar("T")
 
 
 class Dialogue:
-    """Lines and questions. ``answers``: by the question's key; None: they are typed. A context manager.
+    """Lines and questions. ``answers``: by the question's key; what they lack is asked on a terminal, or its default
+    where there is none; None: all are typed. A context manager.
 
     ``asked``: questions and their answers so far. ``longest_silence_s``: between two lines, waits for a person aside.
     """
@@ -83,7 +84,7 @@ class Dialogue:
             try:
                 understood = parse(text)
             except ValueError as error:
-                if self._answers is not None:
+                if self._scripted(key):
                     raise CommandError("answer", f"answer {key} = {text!r}: {error}") from error
                 self.say(f"   {error}")
                 continue
@@ -94,8 +95,13 @@ class Dialogue:
         """Whether the answer is yes."""
         return self.ask(key, f"{question} (yes or no)", "yes" if default else "no", _yes_or_no)
 
+    def _scripted(self, key: str) -> bool:
+        """Whether a question is answered by the answers that were given, and what they lack by its default."""
+        return self._answers is not None and (key in self._answers or not sys.stdin.isatty())
+
     def _answer(self, key: str, shown: str, default: str | None) -> str:
-        if self._answers is not None:
+        if self._scripted(key):
+            assert self._answers is not None
             text = self._answers.get(key, default)
             if text is None:
                 raise CommandError("answer", f"the answers have no {key!r}, and it has no default: {shown}")
