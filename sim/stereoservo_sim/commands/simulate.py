@@ -61,17 +61,27 @@ class PointsOption(StrEnum):
     TRIANGULATED = "triangulated"
 
 
+TaskFile = Annotated[Path | None, typer.Argument(metavar="TASKS.csv", help="A task file; or --draw.")]
+ArmChoice = Annotated[
+    ArmOption,
+    typer.Option(
+        help="free: six Cartesian generators; rx90: six revolute joints; twist: the same arm behind an "
+        "interface of Cartesian velocities."
+    ),
+]
+Draw = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=100_000,
+        help="In place of a file: so many random tasks, up to 150° and 0.4 m, by --seed.",
+    ),
+]
+
+
 def simulate(
-    tasks: Annotated[
-        Path | None, typer.Argument(metavar="[TASKS.csv]", help="A task file; or --draw.")
-    ] = None,
-    arm: Annotated[
-        ArmOption,
-        typer.Option(
-            help="free: six Cartesian generators; rx90: six revolute joints; twist: the same arm behind an "
-            "interface of Cartesian velocities."
-        ),
-    ] = ArmOption.FREE,
+    tasks: TaskFile = None,
+    arm: ArmChoice = ArmOption.FREE,
     calibration: Annotated[
         CalibrationOption,
         typer.Option(
@@ -111,14 +121,7 @@ def simulate(
             help="The law alone, without goal, monitors and safety stage; the arm free has no others."
         ),
     ] = False,
-    draw: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            max=100_000,
-            help="In place of a file: so many random tasks, up to 150° and 0.4 m, by --seed.",
-        ),
-    ] = None,
+    draw: Draw = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
     ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import msgspec
@@ -23,7 +24,13 @@ from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import DriverError
 from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, mechanics_of, rx90_reach
-from stereoservo_sim.tasks.calibrations import CalibrationName, Knowledge, TaskCalibration, known_at_start
+from stereoservo_sim.tasks.calibrations import (
+    CalibrationName,
+    Knowledge,
+    TaskCalibration,
+    calibrate,
+    known_at_start,
+)
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
 from stereoservo_sim.tasks.core_controller import CoreController
 from stereoservo_sim.tasks.ground_truth import (
@@ -153,12 +160,26 @@ def _placed_arm(task: AlignmentTask, calibration: TaskCalibration, settings: Loo
     if settings.arm == "free":
         return FreeArm(task.start)
     if settings.arm == "twist":
-        start = twist_start(task.start, task.goal)
+        start = twist_start(_way(task, settings))
         return None if start is None else TwistArm(start)
     reach = rx90_reach(calibration.cell, task.start, task.goal)
     return (
         None if reach is None else SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
     )
+
+
+def _way(task: AlignmentTask, settings: LoopSettings) -> FloatArray:
+    """The way (k, 4, 4) on which the law leads the plate of an arm that can do everything, from exact images; where it
+    does not get there, the straight one.
+    """
+    free = LoopSettings(law=settings.law, jacobian=settings.jacobian, noise_px=0.0, calibration="exact")
+    result, trace = run_task(task, _known_free_arm(), free)
+    return trace.poses if result.success else np.array([task.start, task.goal])
+
+
+@cache
+def _known_free_arm() -> TaskCalibration:
+    return calibrate("free", "exact", 0.0, 0)
 
 
 class Controller:

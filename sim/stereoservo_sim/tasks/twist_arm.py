@@ -39,8 +39,8 @@ JOINT_SPEED, JOINT_ACCELERATION = 4.0, 20.0
 """Of the RX 90's own joints [rad/s, rad/s²]."""
 RATE_HZ = 250.0
 """Of the interface."""
-REHEARSED = 48
-"""Poses of a rehearsed way."""
+STRIDE = 0.02, 0.08
+"""Between poses of a rehearsed way at most [m, rad]."""
 CLEAR_OF_LIMIT, CLEAR_OF_SINGULARITY = LIMIT_MARGIN + 0.05, 3.0 * SINGULAR
 """What a rehearsed way keeps, beyond where the controller stops [rad; smallest over largest singular value]."""
 
@@ -138,29 +138,36 @@ def twist_cell() -> SyntheticCell:
     )
 
 
-def twist_start(start: FloatArray, goal: FloatArray) -> FloatArray | None:
-    """The RX 90's joints (6,) for a task from pose to pose (4, 4) of the plate; None where it cannot go the straight
-    way, by whichever configuration, clear of its limits and singularities.
+def twist_start(way: FloatArray) -> FloatArray | None:
+    """The RX 90's joints (6,) at the beginning of a way (k, 4, 4) of the plate.
 
-    Of several the one that stays farthest from singularities.
+    Of several configurations the one that stays farthest from singularities; None where none can go the way clear of
+    its limits and singularities.
     """
     rig, robot = _placed()
-    base = np.linalg.inv(rig)
-    way = straight_way(base @ start, base @ goal)
-    found = inverse_kinematics(way[0] @ np.linalg.inv(PLATE_ON_FLANGE), RX90_LIMITS)
-    clear = [_clearance(robot, q, way) for q in found]
+    rehearsed = np.linalg.inv(rig) @ _dense(way)
+    found = inverse_kinematics(rehearsed[0] @ np.linalg.inv(PLATE_ON_FLANGE), RX90_LIMITS)
+    clear = [_clearance(robot, q, rehearsed) for q in found]
     best = int(np.argmax(clear)) if clear else -1
     return found[best] if clear and clear[best] > 0.0 else None
 
 
-def straight_way(start: FloatArray, goal: FloatArray) -> FloatArray:
-    """Poses (`REHEARSED`, 4, 4) from ``start`` to ``goal`` (4, 4), on a line and about one axis."""
-    shares = np.linspace(0.0, 1.0, REHEARSED)
-    turn = Rotation.from_matrix(goal[:3, :3] @ start[:3, :3].T).as_rotvec()
-    poses = np.tile(np.eye(4), (REHEARSED, 1, 1))
-    poses[:, :3, :3] = Rotation.from_rotvec(shares[:, None] * turn).as_matrix() @ start[:3, :3]
-    poses[:, :3, 3] = start[:3, 3] + shares[:, None] * (goal[:3, 3] - start[:3, 3])
-    return poses
+def _dense(way: FloatArray) -> FloatArray:
+    """Poses on a way (k, 4, 4) that are no farther apart than `STRIDE`, on a line and about an axis between two."""
+    poses, last = [way[0]], way[0]
+    for pose in way[1:]:
+        turn = Rotation.from_matrix(pose[:3, :3] @ last[:3, :3].T).as_rotvec()
+        shift = pose[:3, 3] - last[:3, 3]
+        parts = max(np.linalg.norm(shift) / STRIDE[0], np.linalg.norm(turn) / STRIDE[1])
+        if parts < 0.5 and pose is not way[-1]:
+            continue
+        for share in np.linspace(0.0, 1.0, int(np.ceil(parts)) + 1)[1:]:
+            between = np.eye(4)
+            between[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ last[:3, :3]
+            between[:3, 3] = last[:3, 3] + share * shift
+            poses.append(between)
+        last = pose
+    return np.array(poses)
 
 
 def _clearance(robot: Robot, q: FloatArray, way: FloatArray) -> float:

@@ -21,17 +21,21 @@ def twist():
     return calibrate("twist", "exact", 0.1, 0)
 
 
+def straight(task):
+    return np.array([task.start, task.goal])
+
+
 def placed(tasks, count):
     """Tasks that the arm can do, the smallest turns first."""
     by_angle = sorted(tasks, key=lambda task: task.angle_deg)
-    return list(islice((t for t in by_angle if twist_start(t.start, t.goal) is not None), count))
+    return list(islice((t for t in by_angle if twist_start(straight(t)) is not None), count))
 
 
 def test_the_plate_is_where_six_exact_joints_would_have_it():
     """The controller's own inverse kinematics leaks; what it tells does not."""
     cell = twist_cell()
     np.testing.assert_allclose(cell.flange(cell.home), MID_RANGE, atol=1e-12)
-    start = twist_start(MID_RANGE, MID_RANGE)
+    start = twist_start(MID_RANGE[None])
     assert start is not None
     arm = TwistArm(start)
     np.testing.assert_allclose(arm.joints, cell.home, atol=1e-5)
@@ -48,17 +52,17 @@ def test_what_the_arm_cannot_do_is_out_of_reach(public_kind):
     """Too far; and from the start's posture only by another one, to which no straight way leads."""
     far = MID_RANGE.copy()
     far[2, 3] = 4.0
-    assert twist_start(MID_RANGE, far) is None
+    assert twist_start(np.array([MID_RANGE, far])) is None
     cell = rx90_cell()
     assert any(
-        rx90_reach(cell, task.start, task.goal) is not None and twist_start(task.start, task.goal) is None
+        rx90_reach(cell, task.start, task.goal) is not None and twist_start(straight(task)) is None
         for task in public_kind
     )
 
 
 def test_a_controller_that_stops_the_arm_is_told_in_its_own_words(public_kind, twist, monkeypatch):
     """A goal on whose way a joint of the arm ends, of which the service knows nothing."""
-    start = twist_start(MID_RANGE, MID_RANGE)
+    start = twist_start(MID_RANGE[None])
     arm = TwistArm(start)
     with pytest.raises(DriverError, match=r"joint j\d of the arm at its limit|near a singularity") as caught:
         arm.move(np.array([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]), 8.0)
