@@ -174,7 +174,8 @@ def _clearance(robot: Robot, q: FloatArray, way: FloatArray) -> float:
     """Least ratio of the arm's singular values on a way (k, 4, 4) from ``q`` (6,) on; 0 where it is not clear."""
     low, high = RX90_LIMITS[:, 0] + CLEAR_OF_LIMIT, RX90_LIMITS[:, 1] - CLEAR_OF_LIMIT
     least = 1.0
-    for pose in way:  # so near to the one before that a step of Newton's brings the arm there
+    # So near to each other that a step of Newton's brings the arm to the next; it is looked at in the last one, too.
+    for pose in [*way, way[-1]]:
         there = flange_pose(robot, q)
         u, values, vt = np.linalg.svd(body_jacobian(robot, q, there[:3, 3]))
         least = min(least, float(values[-1] / values[0]))
