@@ -8,7 +8,7 @@ arm's own joints. A driver of a real one: `kit.cartesian`, docs/extending.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -66,6 +66,17 @@ class TwistOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=
     speeds: tuple[Positive, Positive] = (0.25, 1.0)
 
 
+class _Posture(NamedTuple):
+    """The arm at its joints ``q`` (n,): the tool's pose in its base frame, and its motion's Jacobian (6, n) in the
+    world with that one's singular values and vectors.
+    """
+
+    q: FloatArray
+    pose: FloatArray
+    J: FloatArray
+    parts: tuple[FloatArray, FloatArray, FloatArray]
+
+
 class SimulatedController:
     """A :class:`CartesianArm` over a simulated arm. What it tells is the kinematics of its encoders' readings."""
 
@@ -83,6 +94,7 @@ class SimulatedController:
         )  # commanded, and where its ramp is; turns times LEVER
         self._deadline_ns = self._driven_ns = 0
         self._stopped = ""
+        self._here: _Posture | None = None
         ends = [(j.position_min, j.position_max, j.velocity_max) for j in robot.joints]
         self._low, self._high, self._fastest = np.array(ends).T
 
@@ -101,16 +113,15 @@ class SimulatedController:
         state = self._inner.read_state()
         if self._stopped:
             raise DriverError("protective_stop", self._stopped)
-        pose = tool_pose(self._robot, self._tool, state.positions)
-        J = self._jacobian(state.positions)
-        self._drive(state.positions, J)
-        told = J @ state.velocities
+        here = self._posture(state.positions)
+        self._drive(here)
+        told = here.J @ state.velocities
         R = self._robot.mounted[:3, :3].T  # the robot tells everything in its own base frame
-        return CartesianState(state.t_ns, pose, R @ told[:3], R @ told[3:] / LEVER)
+        return CartesianState(state.t_ns, here.pose, R @ told[:3], R @ told[3:] / LEVER)
 
     def write(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Follow a twist until the time-out, scaled down to the controller's speeds."""
-        q = self._inner.read_state().positions
+        here = self._posture(self._inner.read_state().positions)
         scale = min(1.0, *(
             speed / max(float(np.linalg.norm(part)), 1e-12)
             for speed, part in zip(self._speeds, (v, w), strict=True)
@@ -118,10 +129,10 @@ class SimulatedController:
         v, w = scale * v, scale * w
         R = self._robot.mounted[:3, :3]
         if self._frame == "tool":
-            R = R @ tool_pose(self._robot, self._tool, q)[:3, :3]
+            R = R @ here.pose[:3, :3]
         self._twist = np.concatenate([R @ v, LEVER * (R @ w)])
         self._deadline_ns = self._clock.now_ns() + self._timeout_ns
-        share = self._drive(q, self._jacobian(q))
+        share = self._drive(here)
         return share * v, share * w
 
     def stop(self) -> None:
@@ -138,11 +149,16 @@ class SimulatedController:
         """Release."""
         self._inner.close()
 
-    def _jacobian(self, q: FloatArray) -> FloatArray:
-        point = (flange_pose(self._robot, q) @ self._tool)[:3, 3]
-        return body_jacobian(self._robot, q, point)
+    def _posture(self, q: FloatArray) -> _Posture:
+        """The arm at its joints ``q`` (n,); computed once, for several calls of a cycle ask for it."""
+        if self._here is None or not np.array_equal(q, self._here.q):
+            pose = tool_pose(self._robot, self._tool, q)
+            J = body_jacobian(self._robot, q, (self._robot.mounted @ pose)[:3, 3])
+            u, values, vt = np.linalg.svd(J, full_matrices=False)
+            self._here = _Posture(q, pose, J, (u, values, vt))
+        return self._here
 
-    def _drive(self, q: FloatArray, J: FloatArray) -> float:
+    def _drive(self, here: _Posture) -> float:
         """One cycle: the arm's joint velocities for the twist in force, or a stop of its own. Returns the share of the
         twist that the arm's joints are fast enough for.
         """
@@ -154,9 +170,9 @@ class SimulatedController:
         self._driven_ns = now_ns
         if not self._at.any():
             if moved:
-                self._inner.write_velocity(np.zeros(len(q)))
+                self._inner.write_velocity(np.zeros(len(here.q)))
             return 1.0
-        u, values, vt = np.linalg.svd(J, full_matrices=False)
+        q, (u, values, vt) = here.q, here.parts
         if values[-1] < SINGULAR * values[0]:
             self._protect("near a singularity of the arm")
             return 0.0

@@ -11,11 +11,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.law import Options, Scene, Task
-from stereoservo.control.law_registry import LAWS
-from stereoservo.kinematics.composition import Composition
-from stereoservo.kinematics.kernels import chain_forward
-from stereoservo.kinematics.screw_transfer import (
+from oracles.screw_transfer import (
     base_from_hand,
     base_link,
     cartesian_velocity,
@@ -28,6 +24,10 @@ from stereoservo.kinematics.screw_transfer import (
     seen_from_other_end,
     tool_frame,
 )
+from stereoservo.control.law import Options, Scene, Task
+from stereoservo.control.law_registry import LAWS
+from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.kernels import chain_forward
 
 DT = 0.04
 

@@ -7,11 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import DriverContext, DriverError, JointDriver
 from stereoservo_drivers.contracts import JointDriverContract
+from stereoservo_drivers.kit.cartesian import CartesianArm, CartesianState
+from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
 from stereoservo_drivers.kit.virtual_joints import positions_of, turn, twist_of, velocities_of
 from stereoservo_drivers.twist import TwistJointDriver, seen_as_joints, virtual_positions
 from stereoservo_sim.cells import shipped_cell_path
@@ -151,3 +155,70 @@ def test_a_robot_that_tells_no_numbers_is_not_driven_by_them_and_nothing_of_them
     assert np.isfinite(driver.read_state().positions).all()
     driver.write_velocity(np.full(6, 0.01))
     assert np.isfinite(written).all()
+
+
+class MisreadArm:
+    """The simulated controller as somebody's `CartesianArm` that reads or commands it wrongly, as ``wrong`` says."""
+
+    def __init__(self, arm: CartesianArm, wrong: str) -> None:
+        self._arm, self._wrong = arm, wrong
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arm, name)
+
+    def read(self) -> CartesianState:
+        told = self._arm.read()
+        pose, attitude = told.pose.copy(), Rotation.from_matrix(told.pose[:3, :3])
+        v, w = told.v, told.w
+        if self._wrong == "millimetres":
+            pose[:3, 3], v = 1e3 * pose[:3, 3], 1e3 * v
+        elif self._wrong == "degrees":
+            pose[:3, :3] = Rotation.from_rotvec(np.degrees(attitude.as_rotvec())).as_matrix()
+            w = np.degrees(w)
+        elif self._wrong == "rotation vector taken for angles":
+            pose[:3, :3] = Rotation.from_euler("xyz", attitude.as_rotvec()).as_matrix()
+        elif self._wrong == "tool from base":
+            pose[:3, :3] = pose[:3, :3].T
+        return told._replace(pose=pose, v=v, w=w)
+
+    def write(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self._wrong != "commands in millimetres":
+            return self._arm.write(v, w)
+        carried, turned = self._arm.write(1e-3 * v, w)
+        return 1e3 * carried, turned
+
+
+@pytest.mark.parametrize(
+    ("wrong", "check"),
+    [
+        ("nothing", ""),
+        ("millimetres", "moves as told"),
+        ("commands in millimetres", "moves as told"),
+        ("degrees", "moves as told"),
+        ("rotation vector taken for angles", "agrees with its velocities"),
+        ("tool from base", "moves as told"),
+        ("twists in the tool's axes", "moves as told"),
+    ],
+)
+def test_the_drivers_checks_tell_a_wrong_unit_or_frame_of_a_cartesian_arm(
+    tmp_path: Path, wrong: str, check: str
+) -> None:
+    """Without cameras: `driver-check` is where a base link that is wrong shows."""
+
+    class Setup(JointDriverContract):
+        def make_driver(self, context: DriverContext) -> JointDriver:
+            near = {"box": [0.04, 0.04, 0.04], "turns": [0.1, 0.1, 0.1], "arm": "fake"}
+            frame = "tool" if wrong == "twists in the tool's axes" else "base"
+            driver = TwistJointDriver(OPTIONS | near | {"frame": frame}, context)
+            driver._arm, driver._frame = MisreadArm(driver._arm, wrong), "base"
+            return driver
+
+    names = ("moves as told", "agrees with its velocities")
+    found = []
+    for number, each in enumerate(c for c in JOINT_CHECKS if c.name in names):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        found.append(run_check(each, Setup(), folder))
+    failed = {result.name: result.remedy for result in found if result.verdict == "failed"}
+    assert (check in failed) if check else not failed, found
+    assert all("of a Cartesian arm" in remedy for remedy in failed.values())

@@ -16,9 +16,10 @@ from oracles.rigid_velocities import (
     spatial_velocity,
     transfer_velocity,
 )
+from oracles.screw_transfer import twist_vectors
 from stereoservo.geometry.displacements import conjugate, exp_rotation
 from stereoservo.geometry.homogeneous import GeometryError, move_points
-from stereoservo.geometry.screws import twist_matrix, twist_vectors
+from stereoservo.geometry.screws import twist_matrix
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,10 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.composition import Composition, displacement
-from stereoservo.kinematics.kernels import chain_forward
-from stereoservo.kinematics.screw_transfer import (
+from oracles.screw_transfer import (
     Screw,
     StratumError,
     base_from_hand,
@@ -28,6 +25,9 @@ from stereoservo.kinematics.screw_transfer import (
     seen_from_other_end,
     tool_frame,
 )
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.kinematics.composition import Composition, displacement
+from stereoservo.kinematics.kernels import chain_forward
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import gantry_with_wrist, rx90
 

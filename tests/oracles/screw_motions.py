@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from oracles.displacement_logarithms import log_rotation, rotation_angle
+from oracles.screw_transfer import twist_vectors
 from stereoservo.geometry.displacements import conjugate, nearest_rotation_generator
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.screws import (
     _sine_excess,
     twist_angle,
-    twist_vectors,
 )
 from stereoservo.numerics.arrays import FloatArray
 

@@ -6,14 +6,16 @@ read back. Nothing here enables a drive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.auxiliary.gripper import Gripper
+from stereoservo_drivers.canopen.auxiliary.outputs import DigitalOutputs
 from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
@@ -58,9 +60,8 @@ from stereoservo_drivers.canopen.cia402_words import (
     is_communication_error,
 )
 from stereoservo_drivers.canopen.option_checks import check_load
-from stereoservo_drivers.canopen.options import CanOptions, CanOutput, CommandMode
+from stereoservo_drivers.canopen.options import CanOptions, CommandMode
 from stereoservo_drivers.canopen.units import wrap_int32
-from stereoservo_drivers.kit.auxiliary import verify_order
 
 if TYPE_CHECKING:
     import canopen
@@ -78,120 +79,24 @@ SETTLE_S = 0.03
 """A cause that is still there trips a drive again within this time."""
 STANDS_SHARE = 0.01
 """Of the largest velocity: slower than this a drive is at rest."""
-SDO_ORDER_ID, SDO_ANSWER_ID = 0x600, 0x580
-DOWNLOAD_OUTPUTS = bytes([0x23, 0xFE, 0x60, 1])
-"""Head of an SDO download of four bytes to 0x60FE:1 (CiA 301, 7.2.4.3.3)."""
-DOWNLOADED = 0x60
-OUTPUT_ANSWER_NS = 500_000_000
-"""After which the answer to an order of outputs is taken for lost, and what is ordered is sent again."""
 LOOK_S = 0.02
 """Time over which the positions of a drive that reports no velocity tell whether it is at rest."""
 
 
-OUTPUTS, OUTPUT_MASK = (0x60FE, 1), (0x60FE, 2)
-
-
-class DigitalOutputs:
-    """Digital outputs of the drives, written without waiting for the drives' answers; ``options``: their cell file's.
-
-    A drive is written one order at a time, for its answer does not say to which it belongs; what is ordered meanwhile
-    follows. ``values``: by name, as the drives have confirmed them. Other bits of 0x60FE stay as they were found.
-    """
-
-    def __init__(self, outputs: tuple[CanOutput, ...]) -> None:
-        self._outputs = {output.name: output for output in outputs}
-        self._specs = tuple(output.spec() for output in outputs)
-        self._ordered: dict[int, int] = {}
-        self._confirmed: dict[int, int] = {}
-        self._due: set[int] = set()
-        self._sent: dict[int, tuple[int, int]] = {}
-        self._answers: dict[int, list[CanFrame]] = {}
-        self._link: Link | None = None
-
-    def prepare(self, drive: RemoteDrive) -> None:
-        """Read the outputs of a drive, and enable those that are used. Raises DriverError (``outputs``)."""
-        used = [output for output in self._outputs.values() if output.node_id == drive.node_id]
-        if not used:
-            return
-        found = drive.read_if_there(*OUTPUTS)
-        if found is None:
-            names = ", ".join(output.name for output in used)
-            raise DriverError(
-                "outputs",
-                f"{drive.name} has no digital outputs (0x60FE:1); leave out: {names}",
-                node_id=drive.node_id,
-            )
-        mask = drive.read_if_there(*OUTPUT_MASK)
-        if mask is not None:
-            drive.write(*OUTPUT_MASK, mask | sum(1 << output.bit for output in used), "output")
-        self._ordered[drive.node_id] = self._confirmed[drive.node_id] = found
-        self._due.discard(drive.node_id)
-        self._sent.pop(drive.node_id, None)
-
-    def listen(self, link: Link) -> None:
-        """Take the drives' answers on ``link`` from now on."""
-        self._link = link
-        for node in self._ordered:
-            self._answers[node] = []
-            link.subscribe(SDO_ANSWER_ID + node, self._answers[node])
-
-    def write(self, link: Link, values: Mapping[str, float]) -> None:
-        """Switch outputs by name. Raises DriverError (``auxiliary``, ``connection_lost``)."""
-        verify_order(values, self._specs)
-        for name, value in values.items():
-            output = self._outputs[name]
-            rest = self._ordered[output.node_id] & ~(1 << output.bit)
-            self._ordered[output.node_id] = rest | int(value) << output.bit
-            self._due.add(output.node_id)
-        self._exchange(link)
-
-    def values(self) -> dict[str, float]:
-        """What the drives have confirmed, by name; sends what is still to be sent. Never raises."""
-        if self._link is not None:
-            with suppress(DriverError):  # a bus that is lost is a fault of its own
-                self._exchange(self._link)
-        return {
-            name: float(self._confirmed.get(output.node_id, 0) >> output.bit & 1)
-            for name, output in self._outputs.items()
-        }
-
-    def _exchange(self, link: Link) -> None:
-        """Take the drives' answers, then send each drive what is due. Raises DriverError."""
-        now_ns = link.now_ns()
-        for node, answers in self._answers.items():
-            while answers:
-                self._take(node, answers.pop(0).data)
-            if now_ns - self._sent.get(node, (0, now_ns))[1] > OUTPUT_ANSWER_NS:
-                del self._sent[node]  # its answer is lost: whether it was taken is not known
-                self._due.add(node)
-        for node in sorted(self._due - self._sent.keys()):
-            bits = self._ordered[node]
-            link.send([CanFrame(SDO_ORDER_ID + node, DOWNLOAD_OUTPUTS + bits.to_bytes(4, "little"))])
-            self._due.discard(node)
-            self._sent[node] = bits, now_ns
-
-    def _take(self, node: int, data: bytes) -> None:
-        """An answer of a drive: to its order, which is confirmed or, where nothing was ordered since, taken back."""
-        if node not in self._sent or data[1:4] != DOWNLOAD_OUTPUTS[1:]:
-            return  # to what bring-up has asked
-        bits, _ = self._sent.pop(node)
-        if data[0] == DOWNLOADED:
-            self._confirmed[node] = bits
-        elif node not in self._due:
-            self._ordered[node] = self._confirmed[node]
-
-
 class Cia402Bringup:
-    """Bring-up of the drives of one bus. ``identities``, ``setups``: by node id, once connected."""
+    """Bring-up of the drives of one bus. ``identities``, ``setups``: by node id, once connected; ``outputs``,
+    ``grippers``: what is there beside the joints.
+    """
 
     def __init__(self, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> None:
         self.codec = codec
         self.identities: dict[int, Identity] = {}
         self.setups: dict[int, Setup] = {}
         self.outputs = DigitalOutputs(options.output)
+        self.grippers = {g.node_id: Gripper(options, g, cell_dir) for g in options.gripper}
         self._options = options
         self._eds = eds_path(options, cell_dir)
-        self._dictionary: canopen.ObjectDictionary | None = None
+        self._dictionaries: dict[Path, canopen.ObjectDictionary] = {}
 
     # -- what the driver asks for ---------------------------------------------------------------------------
 
@@ -203,7 +108,7 @@ class Cia402Bringup:
         ``option``, ``sdo_abort``, ``sdo_timeout``, ``read_back``, ``not_off``, ``not_operational``,
         ``second_master``, ``rebooted``.
         """
-        self.codec.ignore()
+        self._ignore()
         with self._drives(link) as drives:
             alone(link, drives)
             # Whom a master that died has left moving: before anything that can fail, and while they take process data.
@@ -215,6 +120,9 @@ class Cia402Bringup:
                 self._prepare(link, drives)
                 self._start(link, drives)
         self.outputs.listen(link)
+        for gripper in self.grippers.values():
+            gripper.listen(link)
+            gripper.watch(link)
 
     def reset(self, link: Link) -> None:
         """Configure again and clear the faults of all drives, by NMT reset communication where they were bus
@@ -222,7 +130,7 @@ class Cia402Bringup:
 
         Ends in switch on disabled. Raises DriverError: as ``connect``; ``fault_stays`` where one cannot be cleared.
         """
-        self.codec.ignore()
+        self._ignore()
         with self._drives(link) as drives:
             self._quiet(drives)
             find(link, drives, self._options)
@@ -239,13 +147,15 @@ class Cia402Bringup:
                 self._start(link, drives)  # with a fault, too: the arm's positions are needed
                 if stays is not None:
                     raise stays
+        for gripper in self.grippers.values():
+            gripper.watch(link)
 
     def release(self, link: Link) -> None:
         """Stop process data and the drives' monitoring of this master. Raises one DriverError for all.
 
         A drive that is still enabled is stopped and switched off first; one that cannot be keeps its watch.
         """
-        self.codec.ignore()
+        self._ignore()
         failed: list[DriverError] = []
         with self._drives(link) as drives:
             for drive in drives:
@@ -278,10 +188,20 @@ class Cia402Bringup:
         # canopen takes long to import: only who talks to drives pays for it
         from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 
-        if self._dictionary is None:
-            self._dictionary = load_eds(self._eds)
+        beside = [(gripper.axis, gripper.eds) for gripper in self.grippers.values()]
+        known = [*((axis, self._eds) for axis in self.codec.axes), *beside]
+        for eds in {eds for _, eds in known} - self._dictionaries.keys():
+            self._dictionaries[eds] = load_eds(eds)
         with ExitStack() as stack:
-            yield [stack.enter_context(RemoteDrive(link, axis, self._dictionary)) for axis in self.codec.axes]
+            yield [
+                stack.enter_context(RemoteDrive(link, axis, self._dictionaries[eds])) for axis, eds in known
+            ]
+
+    def _ignore(self) -> None:
+        """What bring-up does to the drives is no fault."""
+        self.codec.ignore()
+        for gripper in self.grippers.values():
+            gripper.ignore()
 
     def _quiet(self, drives: list[RemoteDrive]) -> None:
         for drive in drives:
@@ -294,14 +214,19 @@ class Cia402Bringup:
                 drive.write(0x6040, 0, ControlWord.QUICK_STOP)
         found: list[Capabilities] = []
         for drive in drives:
-            self.identities[drive.node_id] = identify(drive, self._eds)
+            gripper = self.grippers.get(drive.node_id)
+            self.identities[drive.node_id] = identify(drive, self._eds if gripper is None else gripper.eds)
             self._power_off(link, drive)
-            found.append(capabilities(drive))
-            self.setups[drive.node_id] = compose(drive, self._options, found[-1])
+            has = capabilities(drive)
+            if gripper is None:
+                found.append(has)
+                self.setups[drive.node_id] = compose(drive, self._options, has)
+            else:
+                self.setups[drive.node_id] = gripper.compose(drive, has)
         check_load(self._options, sum("guarding" in setup.watches for setup in self.setups.values()))
         feedback = available_feedback(self._options, found)
         self.codec.arrange(feedback)
-        for drive, sent in zip(drives, feedback, strict=True):
+        for drive, sent in zip(drives, [*feedback, *([()] * len(self.grippers))], strict=True):
             self._configure(link, drive, sent)
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
@@ -322,8 +247,11 @@ class Cia402Bringup:
 
     def _configure(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> None:
         """Write the whole configuration, then read it back. Raises DriverError (``read_back``)."""
-        options, joint, setup = self._options, drive.axis.joint, self.setups[drive.node_id]
-        parameters = [write for write in parameter_writes(options, joint, setup) if not _fixed(drive, write)]
+        gripper, setup = self.grippers.get(drive.node_id), self.setups[drive.node_id]
+        asked = parameter_writes(self._options, drive.axis.joint, setup)
+        if gripper is not None:
+            asked = gripper.parameters(setup)
+        parameters = [write for write in asked if not _fixed(drive, write)]
         identifiers = [write for write in identifier_writes(drive.node_id) if self._differs(drive, write)]
         unused = unused_pdos(feedback, drive.dictionary)
         off = [write for index in unused for write in self._off(drive, index)]
@@ -331,17 +259,25 @@ class Cia402Bringup:
         first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
         for write in (*first, *identifiers, *off, *parameters):
             drive.write(write.index, write.subindex, write.value, write.option)
+        if gripper is None:
+            rest = self._take_mode(link, drive, setup, feedback)
+        else:
+            rest = gripper.take_mode(link, drive)
+        for write in {write.key: write for write in (*identifiers, *off, *parameters, *rest)}.values():
+            self._compare(drive, write)
+        self.outputs.prepare(drive)
+
+    def _take_mode(
+        self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]
+    ) -> list[Write]:
+        """Write mode, period and PDOs of a joint's drive; returns what is to be read back. Raises DriverError."""
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)
-        pdos = pdo_writes(options, drive.node_id, setup, mode, feedback)
+        pdos = pdo_writes(self._options, drive.node_id, setup, mode, feedback)
         for write in pdos:
             drive.write(write.index, write.subindex, write.value, write.option)
-        for write in {
-            write.key: write for write in (*identifiers, *off, *parameters, *period, *pdos)
-        }.values():
-            self._compare(drive, write)
         self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
-        self.outputs.prepare(drive)
+        return [*period, *pdos]
 
     def _write_period(self, drive: RemoteDrive, mode: CommandMode) -> list[Write]:
         """Write the period of set-points; returns what was written.

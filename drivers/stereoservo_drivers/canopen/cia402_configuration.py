@@ -118,7 +118,7 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
         losses.append("0x605E is fixed at 0: at a fault of its own it lets its axis run out")
     if "switches" in options.feedback and not has.has((FEEDBACK_INDEX["switches"], 0)):
         losses.append(NO_SWITCHES)
-    watches = _watches(options, has)
+    watches = watches_of(options, has)
     if not set(watches) - {"deadline"}:
         unwatched = NO_WATCH + ONLY_DEADLINE * bool(watches)
         if "watch" not in joint.accept_missing:
@@ -133,7 +133,7 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
     return Setup(has, _modes(drive, options, has), watches, tuple(losses))
 
 
-def _watches(options: CanOptions, has: Capabilities) -> tuple[Watch, ...]:
+def watches_of(options: CanOptions, has: Capabilities) -> tuple[Watch, ...]:
     """The drive's own watches of this computer, of which heartbeat and guarding exclude each other (CiA 301)."""
     watches: list[Watch] = []
     if has.has(HEARTBEAT_CONSUMER):
@@ -334,7 +334,7 @@ def unwatch_writes(setup: Setup) -> list[Write]:
     return [Write(*LIFE_FACTOR, 0), Write(*GUARD_TIME, 0)] if "guarding" in setup.watches else []
 
 
-def _pdo_writes(
+def one_pdo_writes(
     number: int,
     base: tuple[int, int],
     cob_id: int,
@@ -361,9 +361,9 @@ def pdo_writes(
     index, subindex = TARGETS[mode]
     command = (CONTROL_WORD, index << 16 | subindex << 8 | 32)
     deadline_ms = options.rpdo_deadline_ms if "deadline" in setup.watches else 0
-    writes = _pdo_writes(0, rpdo, RPDO_IDS[0] + node_id, command, AT_ONCE, deadline_ms)
+    writes = one_pdo_writes(0, rpdo, RPDO_IDS[0] + node_id, command, AT_ONCE, deadline_ms)
     for number, mapping in enumerate(tpdo_mappings(feedback)):
-        writes += _pdo_writes(number, tpdo, TPDO_IDS[number] + node_id, mapping, ON_EVERY_SYNC, 0)
+        writes += one_pdo_writes(number, tpdo, TPDO_IDS[number] + node_id, mapping, ON_EVERY_SYNC, 0)
     return writes
 
 

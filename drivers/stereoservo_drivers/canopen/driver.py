@@ -7,6 +7,7 @@ and by ``write_velocity`` and ``activate`` until ``configure()`` clears it: rese
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +29,7 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.ports.discovery import BusScan, FoundBus, JointChoice
 from stereoservo_drivers.can.channel import Channel
+from stereoservo_drivers.canopen.auxiliary.gripper import Gripper
 from stereoservo_drivers.canopen.bringup import Bringup
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import Cia402Codec
@@ -37,9 +39,9 @@ from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFau
 from stereoservo_drivers.canopen.odrive import OdriveCodec
 from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
 from stereoservo_drivers.canopen.option_checks import check_options
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions, can_options
+from stereoservo_drivers.kit.auxiliary import verify_order
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
-from stereoservo_drivers.options import decode_options
 
 DRIVER = "canopen"
 CALL_BUDGET_US = 500.0
@@ -59,12 +61,15 @@ class CanJointDriver:
     """An arm of CiA 402 drives or ODrives. Options: :class:`~stereoservo_drivers.canopen.options.CanOptions`."""
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
-        self.options = decode_options(CanOptions, options, DRIVER)
+        self.options = can_options(options, context.cell_dir)
         check_options(self.options)
         self._context = context
         self._life = DriverLifecycle(f"joint driver {DRIVER!r}")
         self._codec = make_codec(self.options)
         self.bringup = make_bringup(self.options, self._codec, context.cell_dir)
+        self._grippers: dict[str, Gripper] = {}
+        if isinstance(self.bringup, Cia402Bringup):
+            self._grippers = {each.gripper.name: each for each in self.bringup.grippers.values()}
         self.master = Master(self._codec, MasterSettings.of(self.options))
         self.bus: BusThread | None = None
         self._reported_fault: MasterFault | None = None
@@ -80,7 +85,10 @@ class CanJointDriver:
             effort_units=tuple(_effort_unit(joint, self.options.protocol) for joint in self.options.joint),
             lacks=tuple(what for what, needed in _LOADS.items() if needed not in self.options.feedback),
             command_timeout_s=self.options.command_timeout_s,
-            auxiliary=tuple(output.spec() for output in self.options.output),
+            auxiliary=(
+                *(output.spec() for output in self.options.output),
+                *(gripper.spec() for gripper in self.options.gripper),
+            ),
             call_budget_us=CALL_BUDGET_US,
         )
 
@@ -188,6 +196,9 @@ class CanJointDriver:
             self.master.request_disable()
             raise DriverError("enable_timeout", f"the CAN bus's thread is stuck in mode {self.master.mode}")
         self._require_no_fault()
+        assert self.bus is not None  # its master runs
+        for gripper in self._grippers.values():
+            gripper.enable(self.bus.now_ns())
         self._life.state = LifecycleState.ACTIVE
 
     def deactivate(self) -> None:
@@ -197,6 +208,7 @@ class CanJointDriver:
         if self._life.state is not LifecycleState.ACTIVE:
             return
         self._life.state = LifecycleState.CONFIGURED
+        self.stop_auxiliary()
         self.master.request_disable()
         limit_s = self.master.stop_limit_s + OFF_MARGIN_S
         if not self._wait(self._is_off, limit_s):
@@ -213,6 +225,7 @@ class CanJointDriver:
 
     def stop(self) -> None:
         """Command velocity zero from the next cycle on; the drives stay enabled. Any state, never raises."""
+        self.stop_auxiliary()
         self.master.set_command(np.zeros(len(self.options.joint)), time.monotonic_ns())
 
     def close(self) -> None:
@@ -271,6 +284,7 @@ class CanJointDriver:
         """The newest complete set, stamped with its poll. Raises DriverError, for a latched fault once."""
         self._life.require("read_state()", LifecycleState.CONFIGURED, LifecycleState.ACTIVE)
         self.master.port_called(time.monotonic_ns())
+        self._poll_grippers()
         if self.master.fault is not self._reported_fault:
             self._require_no_fault()
         sample = self.master.sample()
@@ -299,19 +313,45 @@ class CanJointDriver:
         return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
-        """Switch digital outputs. Raises DriverError: not active, a latched fault, no such output."""
+        """Order grippers and switch digital outputs. Raises DriverError: not active, a latched fault, no such name, or
+        outside its limits.
+        """
         self._life.require("write_auxiliary()", LifecycleState.ACTIVE)
         self._require_no_fault()
         assert self.bus is not None
-        if isinstance(self.bringup, Cia402Bringup):
-            self.bringup.outputs.write(self.bus, values)
+        verify_order(values, self.describe().auxiliary)
+        for name in values.keys() & self._grippers.keys():
+            self._grippers[name].order(values[name], self.bus.now_ns())
+        switched = {name: value for name, value in values.items() if name not in self._grippers}
+        if switched and isinstance(self.bringup, Cia402Bringup):
+            self.bringup.outputs.write(self.bus, switched)
 
     def read_auxiliary(self) -> dict[str, float]:
-        """Digital outputs as the drives have confirmed them."""
-        return self.bringup.outputs.values() if isinstance(self.bringup, Cia402Bringup) else {}
+        """Grippers' positions, and digital outputs as the drives have confirmed them."""
+        outputs = self.bringup.outputs.values() if isinstance(self.bringup, Cia402Bringup) else {}
+        return outputs | {name: gripper.position for name, gripper in self._grippers.items()}
 
     def stop_auxiliary(self) -> None:
-        """Digital outputs keep their state."""
+        """Grippers stand where they are, powered; digital outputs keep their state."""
+        for gripper in self._grippers.values():
+            if self.bus is not None:
+                with contextlib.suppress(DriverError):  # a bus that is lost is a fault of its own
+                    gripper.stop(self.bus)
+
+    def _poll_grippers(self) -> None:
+        """Go on with the grippers' orders; what is wrong with one stops the arm, with its name."""
+        if self.bus is None or not self.bus.alive:
+            return
+        if self.master.fault is not None:
+            self.stop_auxiliary()
+        for name, gripper in self._grippers.items():
+            with contextlib.suppress(DriverError):  # as above
+                fault = gripper.poll(self.bus)
+                if fault is not None:
+                    told = MasterFault(
+                        fault.code, fault.message, axis=name, value=fault.value, hint=fault.hint
+                    )
+                    self.master.latch(told)
 
     def _require_no_fault(self) -> None:
         fault = self.master.fault

@@ -19,6 +19,7 @@ from stereoservo.ports.discovery import BusScan, FoundBus, FoundDrive, JointChoi
 from stereoservo_drivers.can.channel import Channel, ChannelSettings
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.socketcan import read_state
+from stereoservo_drivers.canopen.auxiliary.gripper import Gripper
 from stereoservo_drivers.canopen.bringup import Link, Subscriptions
 from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
@@ -316,17 +317,22 @@ def examine_nodes(
 ) -> Iterator[ExaminationFinding]:
     """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
     answers = scan(link)
-    unknown_nodes = [node for node in answers if node not in {axis.node_id for axis in codec.axes}]
+    grippers = {each.node_id: Gripper(options, each, cell_dir) for each in options.gripper}
+    known = [*codec.axes, *(gripper.axis for gripper in grippers.values())]
+    unknown_nodes = [node for node in answers if node not in {axis.node_id for axis in known}]
     dictionary = load_eds(eds_path(options, cell_dir))
-    for axis in codec.axes:
-        count = answers.get(axis.node_id, 0)
+    for axis in known:
+        count, gripper = answers.get(axis.node_id, 0), grippers.get(axis.node_id)
         if count != 1:
             yield _not_one(axis, count, unknown_nodes)
             continue
-        with RemoteDrive(link, axis, dictionary) as drive:
+        with RemoteDrive(link, axis, dictionary if gripper is None else load_eds(gripper.eds)) as drive:
             try:
                 yield _identity(drive, axis.joint)
                 yield _state(drive)
+                if gripper is not None:
+                    yield _gripper(drive, gripper)
+                    continue
                 yield _modes(drive, options)
                 yield from limits_findings(
                     axis.joint, drive.read_if_there(0x607D, 1), drive.read_if_there(0x607D, 2)
@@ -338,6 +344,14 @@ def examine_nodes(
         yield ExaminationFinding(
             "other nodes", None, f"{words} answer too, and no joint of the cell file has them"
         )
+
+
+def _gripper(drive: RemoteDrive, gripper: Gripper) -> ExaminationFinding:
+    """Finding on a gripper's mode and on what it does where this computer is gone. Raises DriverError."""
+    setup = gripper.compose(drive, capabilities(drive))
+    return ExaminationFinding(
+        f"{drive.name} mode", None if setup.losses else True, f"profile position (1); {setup.safety()}"
+    )
 
 
 def scan(link: Link) -> dict[int, int]:

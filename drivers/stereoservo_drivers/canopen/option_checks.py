@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from stereoservo.ports.devices import DriverError
@@ -21,6 +21,10 @@ FASTEST_TURN = 4.0 * math.pi
 """[rad/s] No joint of an arm is meant to be faster; the number is in degrees."""
 SDO_KEY = re.compile(r"0[xX][0-9A-Fa-f]{1,4}:([0-9]{1,3}|0[xX][0-9A-Fa-f]{1,2})")
 ODRIVE_HEARTBEATS_S = 10.0
+GRIPPER_HZ = 50.0
+"""How often a gripper's drive tells its state."""
+LAST_SYNCHRONOUS = 240
+"""Largest transmission type that counts SYNCs (CiA 301)."""
 
 
 def parse_sdo_key(key: str) -> tuple[int, int]:
@@ -38,9 +42,10 @@ def check_options(options: CanOptions) -> None:
         raise _refusal("joint", "[]", "at least one [[joints.options.joint]] with its name and node_id")
     _check_bus(options)
     _check_protocol(options)
-    _check_unique(options, "node_id", lambda joint: joint.node_id)
-    _check_unique(options, "name", lambda joint: joint.name)
-    for joint in options.joint:
+    drives = (*options.joint, *(gripper.joint() for gripper in options.gripper))
+    _check_unique(drives, "node_id", lambda joint: joint.node_id)
+    _check_unique(drives, "name", lambda joint: joint.name)
+    for joint in drives:
         if joint.node_id == options.master_id:
             valid = f"an id that is not master_id ({options.master_id}), which is this computer's"
             raise _refusal("node_id", joint.node_id, valid, joint)
@@ -91,6 +96,10 @@ def _check_protocol(options: CanOptions) -> None:
         raise _refusal(
             "output", [output.name for output in options.output], "left out: they are a CiA 402 drive's"
         )
+    if options.gripper and options.protocol != "cia402":
+        raise _refusal(
+            "gripper", [gripper.name for gripper in options.gripper], "left out: only CiA 402 drives are"
+        )
     nodes = [joint.node_id for joint in options.joint]
     for k, output in enumerate(options.output):
         who, before = f"output {output.name!r}", options.output[:k]
@@ -98,10 +107,15 @@ def _check_protocol(options: CanOptions) -> None:
             raise _refusal(
                 f"{who}: node_id", output.node_id, f"that of a joint: {', '.join(map(str, nodes))}"
             )
-        if any(other.name == output.name for other in before):
-            raise _refusal("output name", output.name, "one that no other output has")
+        if output.name in (*(b.name for b in before), *(gripper.name for gripper in options.gripper)):
+            raise _refusal("output name", output.name, "one that no other output or gripper has")
         if any((other.node_id, other.bit) == (output.node_id, output.bit) for other in before):
             raise _refusal(f"{who}: bit", output.bit, "one that no other output of this drive has")
+
+
+def syncs_of_gripper(rate_hz: float) -> int:
+    """Cycles in which a gripper's drive tells its state once."""
+    return min(max(round(rate_hz / GRIPPER_HZ), 1), LAST_SYNCHRONOUS)
 
 
 def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:
@@ -117,13 +131,15 @@ def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:
         for pdo in tpdo_feedback(options.feedback)
     ]
     per_second = 1000.0 / options.heartbeat_ms
-    beside = [(1, (n + 1) * per_second), (0, guarded * per_second)]
+    grippers = len(options.gripper)
+    beside = [(1, (n + grippers + 1) * per_second), (0, guarded * per_second)]
+    beside.append((6, grippers * options.rate_hz / syncs_of_gripper(options.rate_hz)))
     return cycle_load([0, *[6, 6, *further] * n], options.rate_hz, options.bitrate, beside)
 
 
-def _check_unique(options: CanOptions, option: str, of: Callable[[CanJoint], Any]) -> None:
+def _check_unique(drives: Sequence[CanJoint], option: str, of: Callable[[CanJoint], Any]) -> None:
     seen: dict[Any, CanJoint] = {}
-    for joint in options.joint:
+    for joint in drives:
         other = seen.setdefault(of(joint), joint)
         if other is not joint:
             who = f"joint {other.name!r} (node {other.node_id})"

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from stereoservo.messages.goals import AuxiliarySpec
-from stereoservo.ports.devices import JointSpec
+from stereoservo.ports.devices import DriverError, JointSpec
+from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.position_output import LEAD_S, LOAD_OFFSET
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -98,6 +102,50 @@ class CanOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return AuxiliarySpec(self.name, "digital")
 
 
+class CanGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One ``[[joints.options.gripper]]``: an auxiliary joint on a CiA 402 drive of its own [m, s; rad where revolute].
+
+    The drive goes to ordered positions by itself (profile position, mode 1) at ``velocity`` with ``acceleration``.
+    Scales and identity as of `CanJoint`. ``torque_limit``: permille of the motor's rated torque (0x6072), with which it
+    grips. ``quick_stop_option``, ``abort_option``: what it does where this computer stops it or is gone; as they are,
+    it brakes and keeps its torque, so that it holds its part. ``eds``: of its drive, beside the cell file. ``profile``:
+    a TOML file there with any of these keys, which those in the cell file override.
+    """
+
+    name: str
+    node_id: NodeId
+    kind: Literal["revolute", "prismatic"] = "prismatic"
+    counts_per_rev: Positive
+    gear_ratio: Positive = 1.0
+    direction: Literal[1, -1] = 1
+    offset_rad: float = 0.0
+    velocity_units_per_rev_s: Positive | None = None
+    velocity: Positive
+    acceleration: Positive
+    quick_stop_deceleration: Positive
+    position_min: float
+    position_max: float
+    torque_limit: Annotated[int, Meta(ge=1, le=5000)] | None = None
+    quick_stop_option: Literal[1, 2, 3, 4, 5, 6, 7, 8] = 6
+    abort_option: Literal[1, 2, 3] = 3
+    vendor_id: int | None = None
+    product_code: int | None = None
+    revision: int | None = None
+    serial_number: int | None = None
+    sdo: dict[str, int] = {}
+    eds: str = ""
+    profile: str = ""
+
+    def spec(self) -> AuxiliarySpec:
+        """The gripper in the form of the joint driver port."""
+        return AuxiliarySpec(self.name, self.kind, self.position_min, self.position_max, self.velocity)
+
+    def joint(self) -> CanJoint:
+        """Its drive, scales and limits in the form of a joint's."""
+        shared = {key: getattr(self, key) for key in CanJoint.__struct_fields__ if hasattr(self, key)}
+        return CanJoint(**shared, max_velocity=self.velocity, max_acceleration=self.acceleration)
+
+
 class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[joints.options]`` of driver ``canopen``.
 
@@ -108,7 +156,7 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     emergency codes that do not trip.
     ``endpoints``: of protocol ``odrive``, ``flat_endpoints.json`` of the releases that the drives run, beside the cell
     file.
-    ``output``: digital outputs of the drives.
+    ``output``: digital outputs of the drives. ``gripper``: auxiliary joints on drives of their own.
     ``command_timeout_s``: without a command for so long the joints are brought to rest (they stay enabled);
     ``loop_timeout_ms``: without any call for so long, while enabled, the driver latches a fault.
     """
@@ -136,3 +184,30 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     loop_timeout_ms: Annotated[int, Meta(ge=20, le=5000)] = 100
     joint: tuple[CanJoint, ...]
     output: tuple[CanOutput, ...] = ()
+    gripper: tuple[CanGripper, ...] = ()
+
+
+def can_options(options: Mapping[str, Any], cell_dir: Path) -> CanOptions:
+    """``[joints.options]`` with the grippers' profile files, which lie in ``cell_dir``. Raises DriverError."""
+    grippers = options.get("gripper")
+    if isinstance(grippers, list | tuple):
+        options = {**options, "gripper": [_with_profile(gripper, cell_dir) for gripper in grippers]}
+    return decode_options(CanOptions, options, "canopen")
+
+
+def _with_profile(gripper: Any, cell_dir: Path) -> Any:
+    name = gripper.get("profile") if isinstance(gripper, Mapping) else None
+    if not name or not isinstance(name, str):
+        return gripper
+    path = cell_dir / name
+    try:
+        profile = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DriverError(
+            "option",
+            f"driver 'canopen': gripper {gripper.get('name', '')!r}: profile = {name!r}: {error}; a TOML file beside "
+            "the cell file with keys of [[joints.options.gripper]] is valid",
+            option="profile",
+            path=str(path),
+        ) from error
+    return {**profile, **gripper}

@@ -98,7 +98,8 @@ JOINT_CHECKS = (
     JointCheck(
         "moves as told",
         motion.moves_as_told,
-        "units [rad, m], gear, and the sign of commands against positions",
+        "units [rad, m], gear, and the sign of commands against positions; of a Cartesian arm, whose axes its twists "
+        "are in, and whether its pose is base from tool",
     ),
     JointCheck(
         "stops",
@@ -121,7 +122,8 @@ JOINT_CHECKS = (
     JointCheck(
         "agrees with its velocities",
         lifecycle.agrees_with_its_velocities,
-        "units [rad/s, m/s] and sign of the velocities",
+        "units [rad/s, m/s] and sign of the velocities; of a Cartesian arm, whether its three angles are a rotation "
+        "vector or turns in some order",
     ),
     JointCheck(
         "states its resolution",

@@ -74,26 +74,3 @@ def twist_matrix(w: FloatArray, v: FloatArray) -> FloatArray:
     T[..., :3, :3] = cross_matrix(w)
     T[..., :3, 3] = v
     return T
-
-
-def twist_vectors(T: FloatArray, tolerance: float = 1e-9) -> tuple[FloatArray, FloatArray]:
-    """``w`` [rad/s] and ``v`` [m/s] (..., 3) of Euclidean twists (..., 4, 4): the reverse of `twist_matrix`.
-
-    Raises GeometryError where one is no twist: its last row or its block's symmetric part is above ``tolerance`` of
-    its norm; then it is in another frame.
-    """
-    T = np.asarray(T, dtype=np.float64)
-    block = T[..., :3, :3]
-    symmetric = block + np.swapaxes(block, -1, -2)
-    excess = np.sqrt((T[..., 3, :] ** 2).sum(axis=-1) + 0.25 * (symmetric**2).sum(axis=(-2, -1)))
-    size = np.linalg.norm(T, axis=(-2, -1))
-    if not (excess <= tolerance * size).all():
-        worst = float(np.max(excess / np.where(size > 0, size, 1.0)))
-        raise GeometryError(
-            "degenerate",
-            f"a matrix is no Euclidean twist: {worst:.3g} of it is not; conjugate it by H_PE first",
-            excess=worst,
-        )
-    odd_part = 0.5 * (block - np.swapaxes(block, -1, -2))
-    w = np.stack([odd_part[..., 2, 1], odd_part[..., 0, 2], odd_part[..., 1, 0]], axis=-1)
-    return w, T[..., :3, 3].copy()

@@ -125,7 +125,7 @@ def _serve(
     from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
     with _named(path, "joints.options"):
-        options, drives = drives_of_cell(cell)
+        options, drives = drives_of_cell(cell, path.parent)
     if settings.bit_time is not None:
         drives = msgspec.structs.replace(drives, bit_time=settings.bit_time)
     endpoint = open_endpoint(settings.channel or served_channel(options), options.bitrate)

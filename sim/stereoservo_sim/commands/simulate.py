@@ -34,6 +34,7 @@ class ArmOption(StrEnum):
 
     FREE = "free"
     RX90 = "rx90"
+    TWIST = "twist"
 
 
 class CalibrationOption(StrEnum):
@@ -60,11 +61,27 @@ class PointsOption(StrEnum):
     TRIANGULATED = "triangulated"
 
 
+TaskFile = Annotated[Path | None, typer.Argument(metavar="TASKS.csv", help="A task file; or --draw.")]
+ArmChoice = Annotated[
+    ArmOption,
+    typer.Option(
+        help="free: six Cartesian generators; rx90: six revolute joints; twist: the same arm behind an "
+        "interface of Cartesian velocities."
+    ),
+]
+Draw = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=100_000,
+        help="In place of a file: so many random tasks, up to 150° and 0.4 m, by --seed.",
+    ),
+]
+
+
 def simulate(
-    tasks: Annotated[Path, typer.Argument(metavar="TASKS.csv", help="A task file.")],
-    arm: Annotated[
-        ArmOption, typer.Option(help="free: six Cartesian generators; rx90: six revolute joints.")
-    ] = ArmOption.FREE,
+    tasks: TaskFile = None,
+    arm: ArmChoice = ArmOption.FREE,
     calibration: Annotated[
         CalibrationOption,
         typer.Option(
@@ -104,13 +121,14 @@ def simulate(
             help="The law alone, without goal, monitors and safety stage; the arm free has no others."
         ),
     ] = False,
+    draw: Draw = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
     ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
     """Run every task of a file in closed loop; the controller sees noisy pixels only, the judge the truth.
 
-    The arm rx90 is driven by the servo core, as in the daemon, the arm free by the law alone.
+    The arms rx90 and twist are driven by the servo core, as in the daemon, the arm free by the law alone.
     """
     # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -131,26 +149,36 @@ def simulate(
         mechanics=_mechanics(mechanics, arm),
         core=_by_core(arm, law_only, calibration, centre),
     )
-    answer = _answer(tasks, limit, ids, settings, jobs)
+    answer = _answer(_given(tasks, draw, seed), limit, ids, settings, jobs)
+    answer = {"file": None if tasks is None else str(tasks), "draw": draw, **answer}
     if as_json:
         sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
     else:
         _show(answer, Console(markup=False, highlight=False))
 
 
+def _given(file: Path | None, draw: int | None, seed: int) -> tuple[AlignmentTask, ...]:
+    """Tasks of a file, or drawn."""
+    from stereoservo_sim.tasks.random_tasks import random_tasks
+    from stereoservo_sim.tasks.task_file import read_tasks
+
+    if (file is None) == (draw is None):
+        raise SettingsError("either a task file or --draw N is needed")
+    return random_tasks(seed, draw) if file is None and draw is not None else read_tasks(file)
+
+
 def _answer(
-    tasks: Path, limit: int | None, ids: str | None, settings: LoopSettings, jobs: int
+    tasks: tuple[AlignmentTask, ...], limit: int | None, ids: str | None, settings: LoopSettings, jobs: int
 ) -> dict[str, Any]:
     """What the tasks came to."""
     from stereoservo_sim.tasks.campaign import default_jobs, run_campaign
-    from stereoservo_sim.tasks.task_file import read_tasks
 
-    chosen = _chosen(read_tasks(tasks), limit, ids)
+    chosen = _chosen(tasks, limit, ids)
     with progress_bar() as progress:
         answer = run_campaign(
             chosen, settings, jobs or default_jobs(), lambda done, total: progress("tasks", done, total)
         )
-    return {"file": str(tasks), **answer}
+    return answer
 
 
 def _usable(law: LawOption) -> str:
@@ -167,7 +195,7 @@ def _mechanics(chosen: MechanicsChoice | None, arm: ArmOption) -> MechanicsPrese
     if chosen is None:
         return None
     if arm is not ArmOption.RX90:
-        raise SettingsError(f"--mechanics {chosen.value}: --arm {arm.value} has no joints; take --arm rx90")
+        raise SettingsError(f"--mechanics {chosen.value}: --arm {arm.value} has none; take --arm rx90")
     return chosen.value
 
 
@@ -231,7 +259,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         )
         for task in failed:
             table.add_row(
-                str(task["id"]), task["refused"] or task["reason"], str(task["iterations"]),
+                str(task["id"]), task["refused"] or task["stopped"] or task["reason"], str(task["iterations"]),
                 _number(task["final_error_px"]), str(task["back_face"]), str(task["out_of_view"]),
                 _number(task["line_deviation_mm"]),
             )  # fmt: skip

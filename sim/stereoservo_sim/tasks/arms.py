@@ -1,7 +1,8 @@
 """Simulated arms of the alignment tasks: the plate's true pose, and its motion by joint velocities.
 
 ``free`` is a virtual arm of six Cartesian generators that act at once; ``rx90`` a serial arm of six revolute joints
-with limits. The controller has the readings of their joints only.
+with limits; ``twist`` the same behind an interface of Cartesian velocities (`twist_arm`). The controller has the
+readings of their joints only.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from stereoservo_sim.world.synthetic import (
     translation,
 )
 
-ArmName = Literal["free", "rx90"]
+ArmName = Literal["free", "rx90", "twist"]
 
 MID_RANGE = translation(0.0, 0.0, 1.1) @ rotation("y", 15) @ rotation("x", -10)
 """The plate's pose (4, 4) at which the arms learn."""
@@ -62,7 +63,7 @@ class TaskArm(Protocol):
     limits: FloatArray
 
     def move(self, velocity: FloatArray, dt_s: float) -> None:
-        """Move at ``velocity`` (n,) for ``dt_s``, exactly."""
+        """Move at ``velocity`` (n,) for ``dt_s``. Raises DriverError where the arm has stopped by itself."""
         ...
 
 

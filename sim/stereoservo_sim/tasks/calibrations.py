@@ -9,6 +9,7 @@ free arm's operators are re-based to a task's start by the displacement that its
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -25,7 +26,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, Reach, free_cell, mechanics_of, rx90_cell
+from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, free_cell, mechanics_of, rx90_cell
 from stereoservo_sim.tasks.options import FRAMES, STOPS
 from stereoservo_sim.tasks.setting import (
     FOCAL_ERROR,
@@ -35,12 +36,18 @@ from stereoservo_sim.tasks.setting import (
     cartesian_twists,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
+from stereoservo_sim.tasks.twist_arm import twist_cell
 from stereoservo_sim.world.exact_model import exact_model, twists
 from stereoservo_sim.world.mechanical_trials import mechanical_trials
 from stereoservo_sim.world.presets import MechanicsPreset
-from stereoservo_sim.world.synthetic import SyntheticCell
+from stereoservo_sim.world.synthetic import Kind, SyntheticCell
 
 CalibrationName = Literal["self", "exact", "coarse"]
+CELLS: dict[ArmName, Callable[[], SyntheticCell]] = {
+    "free": free_cell,
+    "rx90": rx90_cell,
+    "twist": twist_cell,
+}
 
 """Of a joint's trial motion, and averaged at a stop."""
 LEAST_SIGMA_PX = 1e-3
@@ -71,7 +78,8 @@ class Knowledge:
 
     ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4) and ``points`` (m, 4) of height ``plane_at_infinity @ M = 1``; the
     points by kinematics alone, None where the markers' places on the body are unknown. ``basis`` (r, 4, 4): operators
-    that span the displacements; of a serial arm those at its ``zero`` (n,), None where they stay.
+    that span the displacements; of a serial arm those at its ``zero`` (n,), None where they stay. ``kinds``: of the
+    joints.
     """
 
     composition: Composition
@@ -80,13 +88,14 @@ class Knowledge:
     plane_at_infinity: FloatArray
     basis: FloatArray
     points: FloatArray | None
+    kinds: tuple[Kind, ...]
     zero: FloatArray | None = None
 
     def operators(self, joints: FloatArray) -> FloatArray:
         """(n, 4, 4) at the arm's readings (n,) (5.21)."""
         if self.zero is None:
             return self.basis
-        kinds = np.zeros(len(self.basis), dtype=np.uint8)
+        kinds = np.array([kind == "prismatic" for kind in self.kinds], dtype=np.uint8)
         found: FloatArray = chain_forward(self.basis, kinds, self.zero, joints)[1]
         return found
 
@@ -99,7 +108,7 @@ def calibrate(
     mechanics: MechanicsPreset | None = None,
 ) -> TaskCalibration:
     """Calibrate once per file and seed. Raises CalibrationError where the trial motions give no model."""
-    cell = free_cell() if arm == "free" else rx90_cell()
+    cell = CELLS[arm]()
     if calibration == "coarse":
         return metric_model(arm, cell, FOCAL_ERROR, HAND_EYE_ERROR_DEG)
     if calibration == "exact":
@@ -171,26 +180,27 @@ def _shows_face(cell: SyntheticCell, positions: FloatArray) -> npt.NDArray[np.bo
     return np.asarray((cosine > np.cos(np.radians(TRIAL_ANGLE_DEG))).all(axis=0))
 
 
-def known_at_start(calibration: TaskCalibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
-    """The controller's knowledge at the start of ``task``; ``reach``: of a serial arm."""
+def known_at_start(calibration: TaskCalibration, task: AlignmentTask, joints: FloatArray | None) -> Knowledge:
+    """The controller's knowledge at the start of ``task``; ``joints`` (n,): readings of a serial arm there."""
     if calibration.model is None:
-        return _coarse(calibration, task, reach)
+        return _coarse(calibration, task, serial=joints is not None)
     model = calibration.model
     matrices = np.array([camera.matrix for camera in model.cameras])
     infinity = model.plane_at_infinity
     centres = _camera_centres(matrices, infinity)
-    if reach is not None:
+    if joints is not None:
         chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
-        points = model.marker_points @ chain.displacement(reach.start).T
+        points = model.marker_points @ chain.displacement(joints).T
         return Knowledge(
-            Composition.BASE_FIRST, matrices, centres, infinity, model.generators, points, model.zero
-        )
+            Composition.BASE_FIRST, matrices, centres, infinity, model.generators, points, model.joint_kinds,
+            model.zero,
+        )  # fmt: skip
     shift, turn = readings(task.start)
     moved = exp_twist(np.tensordot(shift, model.generators[:3], axes=1))
     turned = exp_twist(np.tensordot(turn, model.generators[3:], axes=1))
     basis = np.concatenate([model.generators[:3], conjugate(moved, model.generators[3:])])
     points = model.marker_points @ (moved @ turned).T
-    return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, points, None)
+    return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, points, model.joint_kinds)
 
 
 def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -202,7 +212,7 @@ def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
     return start[:3, 3] - MID_RANGE[:3, 3], turn
 
 
-def _coarse(calibration: TaskCalibration, task: AlignmentTask, reach: Reach | None) -> Knowledge:
+def _coarse(calibration: TaskCalibration, task: AlignmentTask, serial: bool) -> Knowledge:
     """Metric model in the rig's frame: focal lengths too long, the arm rotated about the plate's centre at the
     start.
     """
@@ -211,14 +221,18 @@ def _coarse(calibration: TaskCalibration, task: AlignmentTask, reach: Reach | No
     centres = _camera_centres(matrices, infinity)
     middle = task.start[:3, 3]
     turn = Rotation.from_rotvec(np.radians(calibration.hand_eye_error_deg) * task.error_axis).as_matrix()
-    if reach is None:
+    if not serial:
         basis = cartesian_twists(middle, turn)
-        return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, None)
+        return Knowledge(
+            Composition.SIMULTANEOUS, matrices, centres, infinity, basis, None, calibration.cell.kinds
+        )
     error = np.eye(4)
     error[:3, :3], error[:3, 3] = turn, middle - turn @ middle
     cell = calibration.cell
     generators = conjugate(error, twists(cell, cell.home))
-    return Knowledge(Composition.BASE_FIRST, matrices, centres, infinity, generators, None, cell.home)
+    return Knowledge(
+        Composition.BASE_FIRST, matrices, centres, infinity, generators, None, cell.kinds, cell.home
+    )
 
 
 def _camera_centres(matrices: FloatArray, infinity: FloatArray) -> FloatArray:

@@ -7,7 +7,8 @@ points are computed from them with the controller's model.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import msgspec
@@ -21,8 +22,15 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import triangulate
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import DriverError
 from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, mechanics_of, rx90_reach
-from stereoservo_sim.tasks.calibrations import CalibrationName, Knowledge, TaskCalibration, known_at_start
+from stereoservo_sim.tasks.calibrations import (
+    CalibrationName,
+    Knowledge,
+    TaskCalibration,
+    calibrate,
+    known_at_start,
+)
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
 from stereoservo_sim.tasks.core_controller import CoreController
 from stereoservo_sim.tasks.ground_truth import (
@@ -43,6 +51,7 @@ from stereoservo_sim.tasks.setting import (
     SUCCESS_PX,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
+from stereoservo_sim.tasks.twist_arm import TwistArm, twist_start
 from stereoservo_sim.world.presets import MechanicsPreset
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
@@ -61,8 +70,8 @@ class LoopSettings:
     ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws that could correct
     their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
     ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
-    of the markers or the number of one. ``mechanics``: of the serial arm; None: it is perfect. ``core``: the servo
-    core drives it, which needs a serial arm and its model; else the law alone.
+    of the markers or the number of one. ``mechanics``: of the arm ``rx90``; None: it is perfect. ``core``: the servo
+    core drives the arm, which needs joints and a model; else the law alone.
     """
 
     law: str = DEFAULT_LAW
@@ -90,7 +99,7 @@ class TaskResult(msgspec.Struct, frozen=True):
     used; ``floor_px``: what image noise leaves of it to this loop. ``line_deviation_mm``: the largest distance of
     the plate's middle from the straight path. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
     ``closest_view_px``: least distance of a marker from an image's border, on the whole path. ``reason``: why it
-    failed.
+    failed; ``refused``, ``stopped``: in the words of who refused it, or of the arm's controller that stopped.
     """
 
     id: int
@@ -107,6 +116,7 @@ class TaskResult(msgspec.Struct, frozen=True):
     closest_view_px: float | None
     reason: str = ""
     refused: str = ""
+    stopped: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,17 +138,9 @@ def run_task(
     task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings
 ) -> tuple[TaskResult, Trace]:
     """Run one task; deterministic given task, calibration and settings."""
-    reach = None
-    if settings.arm == "rx90":
-        reach = rx90_reach(calibration.cell, task.start, task.goal)
-        if reach is None:
-            return _unreachable(task, settings)
-    arm: TaskArm
-    if reach is None:
-        arm = FreeArm(task.start)
-    else:
-        arm = SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
-        reach = replace(reach, start=arm.joints)
+    arm = _placed_arm(task, calibration, settings)
+    if arm is None:
+        return _unreachable(task, settings)
     controller: Controller | CoreController
     if settings.core:
         assert calibration.model is not None
@@ -147,9 +149,37 @@ def run_task(
             rate_hz=settings.rate_hz, noise_px=settings.noise_px, time_limit_s=TIME_LIMIT_S,
         )  # fmt: skip
     else:
-        controller = Controller(known_at_start(calibration, task, reach), task, settings, arm.limits)
+        joints = None if settings.arm == "free" else arm.joints
+        controller = Controller(known_at_start(calibration, task, joints), task, settings, arm.limits)
     rng = np.random.default_rng([settings.seed, task.id])
     return _run(task, arm, controller, settings, rng)
+
+
+def _placed_arm(task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings) -> TaskArm | None:
+    """The arm with the plate at the task's start; None where it cannot do the task."""
+    if settings.arm == "free":
+        return FreeArm(task.start)
+    if settings.arm == "twist":
+        start = twist_start(_way(task, settings))
+        return None if start is None else TwistArm(start)
+    reach = rx90_reach(calibration.cell, task.start, task.goal)
+    return (
+        None if reach is None else SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
+    )
+
+
+def _way(task: AlignmentTask, settings: LoopSettings) -> FloatArray:
+    """The way (k, 4, 4) on which the law leads the plate of an arm that can do everything, from exact images; where it
+    does not get there, the straight one.
+    """
+    free = LoopSettings(law=settings.law, jacobian=settings.jacobian, noise_px=0.0, calibration="exact")
+    result, trace = run_task(task, _known_free_arm(), free)
+    return trace.poses if result.success else np.array([task.start, task.goal])
+
+
+@cache
+def _known_free_arm() -> TaskCalibration:
+    return calibrate("free", "exact", 0.0, 0)
 
 
 class Controller:
@@ -188,7 +218,7 @@ class Controller:
     def step(self, pixels: FloatArray, seen: FloatArray, joints: FloatArray) -> FloatArray:
         """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,).
 
-        Raises RefusedError where a path must be planned and there is none.
+        Raises NoPathError where a path must be planned and there is none.
         """
         knowledge = self._knowledge
         self._operators = knowledge.operators(joints)
@@ -206,7 +236,7 @@ class Controller:
         )  # fmt: skip
         if self._plans:
             if self._path is None:
-                self._path = plan_task_path(scene, task, joints, self._limits)
+                self._path = plan_task_path(scene, task, joints, self._limits, knowledge.kinds)
             task = self._path.task_now(scene, task, joints, self._dt_s)
         step = self._law(scene, task, self._options)
         self.task_error = step.error
@@ -216,7 +246,7 @@ class Controller:
         return np.asarray(step.velocity * (self._joint_speed / max(fastest, self._joint_speed)))
 
     def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
-        """Move the arm for a step from a frame; why it cannot be, or ''. Raises NoPathError."""
+        """Move the arm for a step from a frame; why it cannot be, or ''. Raises NoPathError, DriverError."""
         velocity = self.step(pixels, seen, arm.joints)
         if not np.isfinite(velocity).all():
             return "NO_COMMAND"
@@ -313,7 +343,7 @@ def _run(
         np.empty((limit + 1, len(arm.joints))),
         np.empty((limit, len(controller.task_error))),
     )
-    margin, back_face, out_of_view, reason, refused = np.inf, False, False, "", ""
+    margin, back_face, out_of_view, reason, refused, stopped = np.inf, False, False, "", "", ""
     steps = 0
     for k in range(limit + 1):
         truth = sight(arm.pose, used)
@@ -333,6 +363,8 @@ def _run(
             reason = controller.advance(frame, _seen(truth, settings, k * dt_s), arm)
         except NoPathError as error:
             reason, refused = "REFUSED", error.reason
+        except DriverError as error:
+            reason, stopped = error.code.upper(), str(error)
         if refused:
             break
         task_errors[k] = controller.task_error
@@ -342,7 +374,8 @@ def _run(
         poses[:steps], errors[:steps], facing[:steps], joints[:steps], task_errors[: max(steps - 1, 0)]
     )
     flags = (back_face, out_of_view)
-    return _judged(task, settings, trace, flags, margin, (reason, refused), window), trace
+    result = _judged(task, settings, trace, flags, margin, (reason, refused), window)
+    return msgspec.structs.replace(result, stopped=stopped), trace
 
 
 def _seen(truth: PlateView, settings: LoopSettings, time_s: float) -> FloatArray:

@@ -28,8 +28,9 @@ from stereoservo_sim.tasks.task_file import AlignmentTask
 CORE_RATE_HZ = 250.0
 TOLERANCE_PX = 0.6 * SUCCESS_PX
 HOLD_FRAMES = 5
-SPEED, ACCELERATION = 1.0, 4.0
-"""[rad/s], [rad/s²] of every joint at most."""
+SPEED = {"revolute": 1.0, "prismatic": 0.25}
+ACCELERATION = {"revolute": 4.0, "prismatic": 1.0}
+"""Of every joint at most, by its kind: [rad/s or m/s], [rad/s² or m/s²]."""
 LEAST_SIGMA_PX = 0.01
 LOST = ("goal_aborted", "goal_cancelled", "fault")
 
@@ -63,7 +64,7 @@ class CoreController:
 
     def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
         """Move the arm until the next frame after this one, (c, m, 2) with ``seen`` (c, m) 1 or 0; why the goal was
-        lost, or ''. Raises NoPathError where it is refused.
+        lost, or ''. Raises NoPathError where it is refused, DriverError where the arm has stopped by itself.
         """
         frame = self._observations(pixels, seen)
         self._looks -= 1
@@ -128,7 +129,8 @@ def _settings(
             for camera in model.cameras
         ),
         limits=LimitSettings(
-            limits[:, 0].copy(), limits[:, 1].copy(), np.full(n, SPEED), np.full(n, ACCELERATION), 0.01,
+            limits[:, 0].copy(), limits[:, 1].copy(), np.array([SPEED[kind] for kind in model.joint_kinds]),
+            np.array([ACCELERATION[kind] for kind in model.joint_kinds]), 0.01,
             np.zeros((0, n, 2)), (), 0.5, 0.1, 1.0,
         ),
         trials=None,

@@ -12,6 +12,7 @@ from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanReq
 from stereoservo.planning.planner import plan
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 from stereoservo_sim.tasks.setting import FACE, HEIGHT, WIDTH
+from stereoservo_sim.world.synthetic import Kind
 
 LOOK_S = 0.4
 """The controller looks at the plate for so long before it plans."""
@@ -69,13 +70,12 @@ class PlannedPath:
         return np.asarray(pixels + share * (self._task.set_points - goal))
 
 
-def plan_task_path(scene: Scene, task: Task, joints: FloatArray, limits: FloatArray) -> PlannedPath:
-    """Path from ``scene`` to ``task``; ``limits`` (n, 2) of the joints. Raises RefusedError."""
+def plan_task_path(
+    scene: Scene, task: Task, joints: FloatArray, limits: FloatArray, kinds: tuple[Kind, ...]
+) -> PlannedPath:
+    """Path from ``scene`` to ``task``; ``limits`` (n, 2) and ``kinds`` of the joints. Raises NoPathError."""
     n, cameras = len(joints), len(scene.matrices)
-    # The free arm's first three joints are lengths; a serial arm's are all angles.
-    speeds = np.full(n, SPEED_RAD)
-    if not np.isfinite(limits).any():
-        speeds[:3] = SPEED_M
+    speeds = np.array([SPEED_M if kind == "prismatic" else SPEED_RAD for kind in kinds])
     request = PlanRequest(
         operators=scene.operators,
         composition=scene.composition,

@@ -97,6 +97,9 @@ class MakerDrive:
         self.guarded_ns: int | None = None
         self.rpdo_ns: int | None = None
         self._toggle = 0
+        self._syncs = [0] * 4
+        self._goal: int | None = None
+        self._taken = False
         self.reason = ""
         self.cut = False
 
@@ -126,6 +129,8 @@ class MakerDrive:
 
     def _status(self) -> int:
         following = 0x1000 if self.state == 0x27 and self.get(0x6060) in (7, 8, 9) else 0
+        if self.get(0x6060) == 1:
+            following = 0x1000 * self._taken
         return (
             self.state
             | 0x10 * (self.state != 0x40)
@@ -168,12 +173,11 @@ class MakerDrive:
     def _answer_sync(self, operational: bool) -> None:
         for number in range(4):
             cob_id = self.get(0x1800 + number, 1)
-            if (
-                not operational
-                or cob_id >> 31
-                or not self.get(0x1A00 + number)
-                or self.get(0x1800 + number, 2) != 1
-            ):
+            every = self.get(0x1800 + number, 2)
+            if not operational or cob_id >> 31 or not self.get(0x1A00 + number) or not 1 <= every <= 240:
+                continue
+            self._syncs[number] += 1
+            if self._syncs[number] % every:
                 continue
             data = b""
             for sub in range(1, self.get(0x1A00 + number) + 1):
@@ -206,6 +210,12 @@ class MakerDrive:
             self.state = 0x23
         elif word & 0x0F == 0x0F and self.state in (0x23, 0x27):
             self.state = 0x27
+        strobe = bool(word & 0x10) and self.state == 0x27
+        if self.get(0x6060) == 1 and strobe and not self._taken:  # CiA 402-2, profile position
+            self._goal = self.get(0x607A)
+        self._taken = strobe
+        if self.state != 0x27:
+            self._goal = None
 
     # -- time -----------------------------------------------------------------------------------------------
 
@@ -232,7 +242,9 @@ class MakerDrive:
         )
         for name, heard_ns, limit_ms in limits:
             if limit_ms and heard_ns is not None and t_ns - heard_ns > limit_ms * 1_000_000:
-                self.reason, self.state = name, 0x08
+                self.reason = name
+                quick = self.get(0x6007) == 3 and self.get(0x605A) > 4 and name == "heartbeat"
+                self.state = 0x07 if quick else 0x08
 
     def _move(self, dt: float) -> None:
         mode = self.get(0x6060)
@@ -242,11 +254,15 @@ class MakerDrive:
         elif self.state == 0x27 and (mode == 8 or (mode == 7 and self.get(0x6040) & 0x10)):
             order = self.get(0x607A) if mode == 8 else self.get(0x60C1, 1)
             wanted = (order - self.sag - self.counts) / 0.02
+        elif self.state == 0x27 and mode == 1 and self._goal is not None and not self.get(0x6040) & 0x100:
+            gap, ramp = self._goal - self.counts, self.get(0x6083) or 1e6
+            fastest = min(float(self.get(0x6081)), (1.6 * ramp * abs(gap)) ** 0.5, abs(gap) / (2.0 * dt))
+            wanted = fastest if gap > 0 else -fastest
         else:
             wanted = 0.0
         self.speed += (
             float(np.clip(wanted - self.speed, -ramp * dt, ramp * dt))
-            if mode in (3, 9)
+            if mode in (1, 3, 9)
             else wanted - self.speed
         )
         if self.blocked:

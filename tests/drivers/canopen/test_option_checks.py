@@ -157,7 +157,7 @@ def test_outputs_belong_to_a_joints_drive_once_each() -> None:
     light = {"name": "light", "node_id": 1, "bit": 16}
     check_options(options(output=[light, light | {"name": "valve", "bit": 17}]))
     assert "that of a joint: 1, 2" in refused(output=[light | {"node_id": 9}])
-    assert "no other output has" in refused(output=[light, light | {"bit": 17}])
+    assert "no other output or gripper has" in refused(output=[light, light | {"bit": 17}])
     assert "no other output of this drive" in refused(output=[light, light | {"name": "valve"}])
     assert "CiA 402 drive's" in refused(protocol="odrive", output=[light])
     assert "ODrive's" in refused(endpoints=["flat_endpoints.json"])

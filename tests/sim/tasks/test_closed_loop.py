@@ -241,6 +241,9 @@ def test_command_prints_one_object(tmp_path, capsys, public_kind):
     ("arguments", "words"),
     [
         (["none.csv"], "cannot be read"),
+        ([], "a task file or --draw"),
+        (["{hard}", "--draw", "3"], "a task file or --draw"),
+        (["{hard}", "--arm", "twist", "--mechanics", "serial_servo"], "take --arm rx90"),
         (["{hard}", "--drop-camera", "3"], "START:SECONDS"),
         (["{hard}", "--ids", "1,x"], "ids by commas"),
         (["{hard}", "--ids", "1"], "no task 1"),

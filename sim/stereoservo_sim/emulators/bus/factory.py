@@ -15,10 +15,11 @@ from msgspec import Meta
 import stereoservo_drivers.canopen
 from stereoservo.messages.cell_file import CellFile, Mount
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_drivers.canopen.options import CanJoint, CanOptions
-from stereoservo_drivers.options import decode_options, invalid
+from stereoservo_drivers.canopen.cia402_configuration import eds_path
+from stereoservo_drivers.canopen.options import CanJoint, CanOptions, can_options
+from stereoservo_drivers.options import invalid
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
-from stereoservo_sim.emulators.bus.plant import STEP_NS, AxisPlant, PlantSettings
+from stereoservo_sim.emulators.bus.plant import STEP_NS, AxisPlant, PlantBeside, PlantSettings
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.emulators.nodes.node import EmulatedAxis, EmulatedNode
 from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, place_of
@@ -59,8 +60,8 @@ class DrivesSettings(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=
     mechanics: MechanicsOption = "none"
 
 
-def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
-    """The CAN options and the emulation's settings of a cell. Raises EmulationError, DriverError."""
+def drives_of_cell(cell: CellFile, cell_dir: Path = Path()) -> tuple[CanOptions, DrivesSettings]:
+    """The CAN options and the emulation's settings of a cell in ``cell_dir``. Raises EmulationError, DriverError."""
     if cell.joints.driver != "canopen":
         raise EmulationError(
             f"cell {cell.cell.name!r}: joints.driver is {cell.joints.driver!r}; drives are emulated for 'canopen' "
@@ -71,7 +72,7 @@ def drives_of_cell(cell: CellFile) -> tuple[CanOptions, DrivesSettings]:
         raise EmulationError(
             f"cell {cell.cell.name!r}: emulate.{unknown[0]} is unknown; valid: emulate.drives, emulate.cameras"
         )
-    options = decode_options(CanOptions, cell.joints.options, "canopen")
+    options = can_options(cell.joints.options, cell_dir)
     try:
         settings = msgspec.convert(cell.emulate.get("drives", {}), DrivesSettings)
     except msgspec.ValidationError as error:
@@ -106,12 +107,22 @@ def make_bus_emulator(
     start = _start(options, settings, arm)
     positions = newest[1] if newest is not None else start
     plant, rated = _plant(options, settings, positions, arm)
-    axes = [
-        EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(options.joint, plant.motors, strict=True)
+    grippers = tuple(gripper.joint() for gripper in options.gripper)
+    if grippers:  # each begins open
+        plant = PlantBeside(plant, IdealPlant(np.array([joint.position_max for joint in grippers])))
+        rated = None if rated is None else [*rated, *([1.0] * len(grippers))]
+    drives = (*options.joint, *grippers)
+    axes = [EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(drives, plant.motors, strict=True)]
+    files = [
+        *([_eds(options, settings, cell_dir)] * len(names)),
+        *(
+            eds_path(msgspec.structs.replace(options, eds=gripper.eds), cell_dir)
+            for gripper in options.gripper
+        ),
     ]
-    eds = _eds(options, settings, cell_dir)
     nodes = [
-        _node(options, joint, axis, settings, eds) for joint, axis in zip(options.joint, axes, strict=True)
+        _node(options, joint, axis, settings, eds)
+        for joint, axis, eds in zip(drives, axes, files, strict=True)
     ]
     moved = AxisPlant(axes, plant, settings.machine, t_ns=t_ns, history=history, rated=rated)
     return BusEmulator(nodes, moved, bitrate=options.bitrate if settings.bit_time else None, t_ns=t_ns)

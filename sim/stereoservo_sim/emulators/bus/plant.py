@@ -11,9 +11,10 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.emulators.nodes.node import EmulatedAxis
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.velocity_drives import Plant
+from stereoservo_sim.world.velocity_drives import IdealPlant, Plant
 
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -156,6 +157,53 @@ class _Body:
         return s.inertia * self.acceleration + s.friction * moving + s.gravity * math.cos(self.position)
 
 
+class PlantBeside:
+    """A plant and ideal joints beside it, as one: those of ``plant`` first."""
+
+    def __init__(self, plant: Plant, beside: IdealPlant) -> None:
+        self._parts: tuple[Plant, Plant] = plant, beside
+        self._count = len(plant.positions)
+        self._take()
+
+    def _take(self) -> None:
+        first, second = self._parts
+        self.positions = np.concatenate([first.positions, second.positions])
+        self.velocities = np.concatenate([first.velocities, second.velocities])
+        self.efforts = np.concatenate([first.efforts, second.efforts])
+
+    @property
+    def motors(self) -> FloatArray:
+        """Of both."""
+        return np.concatenate([part.motors for part in self._parts])
+
+    @property
+    def readings(self) -> FloatArray:
+        """Of both."""
+        return np.concatenate([part.readings for part in self._parts])
+
+    @property
+    def reading_rates(self) -> FloatArray:
+        """Of both."""
+        return np.concatenate([part.reading_rates for part in self._parts])
+
+    def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
+        """Advance both by ``h`` [s]."""
+        n = self._count
+        self._parts[0].follow(set_positions[:n], set_velocities[:n], h)
+        self._parts[1].follow(set_positions[n:], set_velocities[n:], h)
+        self._take()
+
+    def rest(self, h: float) -> bool:
+        """Let ``h`` [s] pass where neither moves."""
+        first, second = (part.rest(h) for part in self._parts)  # both pass the time
+        return first and second
+
+    def close(self) -> None:
+        """Release both."""
+        for part in self._parts:
+            part.close()
+
+
 class AxisPlant:
     """Axes and plant, step by step. A command acts from the first grid point after it came: never too early.
 
@@ -294,4 +342,5 @@ class AxisPlant:
 
     def _record(self) -> None:
         if self._history is not None and (self.t_ns // self.step_ns) % RECORD_STEPS == 0:
-            self._history.append(self.t_ns, self.plant.positions, self.plant.velocities)
+            n = self._history.joints  # a gripper is no part of the truth that cameras see
+            self._history.append(self.t_ns, self.plant.positions[:n], self.plant.velocities[:n])

@@ -13,7 +13,9 @@ from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSet
 from stereoservo_sim.emulators.nodes.state_machine import HALT_OPTION, STATUS, Cia402State, PowerMachine, Ramp
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 
-PROFILE_VELOCITY, CYCLIC_VELOCITY = 3, 9
+PROFILE_POSITION, PROFILE_VELOCITY, CYCLIC_VELOCITY = 1, 3, 9
+NEW_SET_POINT = 0x0010
+"""Of the control word in profile position."""
 FOLLOWING_ERROR = 0x8611
 REACHED_SHARE = 0.01
 """Velocity window of "target reached" as a share of the largest velocity; the EDS has no 0x606D."""
@@ -82,6 +84,8 @@ class DriveMotion:
         self._mirror: float | None = None
         self._limited = False
         self._following = False
+        self._goal: float | None = None
+        self._acknowledged = False
         self._beyond_since_ns = NEVER_NS
         for index in PARAMETERS:
             dictionary.changed(index, lambda sub, value: self.load_parameters())
@@ -152,8 +156,8 @@ class DriveMotion:
         return (side < 0) | (side > 0) << 1
 
     def status(self) -> int:
-        """Status word 0x6041. Bit 12 in mode 9: the drive follows the command; in mode 3: speed is zero, bit 10
-        target reached.
+        """Status word 0x6041. Bit 12 in mode 9: the drive follows the command; in mode 3: speed is zero; in mode 1: the
+        set-point is taken. Bit 10 in modes 1 and 3: target reached.
         """
         machine = self.machine
         word = STATUS[machine.state] | 0x10 | 0x200
@@ -167,6 +171,8 @@ class DriveMotion:
             word |= 0x1000
         if mode == PROFILE_VELOCITY:
             word |= 0x1000 * standing | 0x400 * self._reached(standing)
+        if mode == PROFILE_POSITION:
+            word |= 0x1000 * self._acknowledged | 0x400 * (standing and self._goal is None)
         return word
 
     def _reached(self, standing: bool) -> bool:
@@ -182,13 +188,15 @@ class DriveMotion:
     def power_lost(self, t_ns: int) -> None:
         """Reset after loss of the supply or a reboot of the firmware."""
         self.load_parameters()
-        self._limited = self._following = False
+        self._limited = self._following = self._acknowledged = False
+        self._goal = None
         self._beyond_since_ns = NEVER_NS
         self._brake.move(True, t_ns)  # it closes without power
         self._rest()
 
     def _rest(self) -> None:
         axis = self.axis
+        self._goal = None
         axis.powered = False
         axis.target = 0.0
         axis.brake_closed = self._brake.closed
@@ -244,6 +252,9 @@ class DriveMotion:
         """
         axis, get = self.axis, self._dictionary.get
         mode = get(0x6061)
+        if mode == PROFILE_POSITION:
+            self._go()
+            return
         wanted = get(0x60FF) if mode in (PROFILE_VELOCITY, CYCLIC_VELOCITY) else 0
         allowed = max(-self._largest, min(self._largest, wanted))
         target = allowed / self._units
@@ -256,6 +267,29 @@ class DriveMotion:
             axis.target, axis.acceleration = target, acceleration
         self._limited = stopped or allowed != wanted
         self._following = mode == CYCLIC_VELOCITY and not stopped
+
+    def take_set_point(self) -> None:
+        """Profile position: the rising edge of the control word's bit 4 takes 0x607A, at once; its fall ends bit 12."""
+        asked = bool(self.machine.word & NEW_SET_POINT) and self.machine.state is Cia402State.ENABLED
+        if asked and not self._acknowledged:
+            self._goal = self._dictionary.get(0x607A) / self._counts - self._offset
+        self._acknowledged = asked
+
+    def _go(self) -> None:
+        """Profile position: towards the set-point, no faster than the ramp lets it stop there."""
+        axis = self.axis
+        axis.acceleration = self._speeding_up
+        axis.target = 0.0
+        if self._goal is None:
+            return
+        gap = self._goal - axis.set_position
+        tick_s = self._settings.tick_ns * 1e-9
+        if abs(gap) * abs(self._counts) < 1.0 and abs(axis.set_velocity) <= self._speeding_up * tick_s:
+            self._goal = None
+            return
+        fastest = min(self._dictionary.get(0x6081), self._largest) / abs(self._units)
+        braking = math.sqrt(2.0 * 0.8 * self._speeding_up * abs(gap))
+        axis.target = math.copysign(min(fastest, braking, abs(gap) / (2.0 * tick_s)), gap)
 
     def _barred(self, side: float) -> bool:
         """Whether a limit switch or a software limit (0x607D) prevents motion to ``side`` of the joint.

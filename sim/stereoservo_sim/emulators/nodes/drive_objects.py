@@ -7,11 +7,17 @@ from __future__ import annotations
 from functools import partial
 
 from stereoservo_sim.emulators.nodes.dictionary import Abort, Dictionary, SdoError, Value
-from stereoservo_sim.emulators.nodes.drive_motion import CYCLIC_VELOCITY, PROFILE_VELOCITY, DriveMotion
+from stereoservo_sim.emulators.nodes.drive_motion import (
+    CYCLIC_VELOCITY,
+    PROFILE_POSITION,
+    PROFILE_VELOCITY,
+    DriveMotion,
+)
 from stereoservo_sim.emulators.nodes.node import NodeSettings
 from stereoservo_sim.emulators.nodes.state_machine import PowerMachine
 
-SUPPORTED_MODES = 1 << (PROFILE_VELOCITY - 1) | 1 << (CYCLIC_VELOCITY - 1)
+MODES = (PROFILE_POSITION, PROFILE_VELOCITY, CYCLIC_VELOCITY)
+SUPPORTED_MODES = sum(1 << mode - 1 for mode in MODES)
 SAVE, LOAD = 0x65766173, 0x64616F6C
 """Signatures of 0x1010 and 0x1011: "save", "load"."""
 OPTION_CODES = {
@@ -46,7 +52,7 @@ class DriveObjects:
             (0x60FD, motion.digital_inputs),
         ):
             dictionary.live(index, 0, value)
-        dictionary.changed(0x6040, lambda sub, value: machine.control(value))
+        dictionary.changed(0x6040, lambda sub, value: (machine.control(value), motion.take_set_point()))
         dictionary.guard(0x6060, self._check_mode)
         dictionary.changed(0x6060, lambda sub, value: dictionary.set(0x6061, 0, value))
         for index in OPTION_CODES:
@@ -59,7 +65,7 @@ class DriveObjects:
 
     @staticmethod
     def _check_mode(sub: int, value: int) -> None:
-        if value not in (0, PROFILE_VELOCITY, CYCLIC_VELOCITY):
+        if value not in (0, *MODES):
             raise SdoError(Abort.INVALID_VALUE)
 
     @staticmethod

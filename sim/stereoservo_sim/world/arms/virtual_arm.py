@@ -14,17 +14,27 @@ from stereoservo_sim.world.camera_rig import inverse_pose
 from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
+TO_NEXT = np.eye(4)[:, [1, 2, 0, 3]]
+"""(4, 4): z along what was x, so that x, y, z come in turn. From the base to the first virtual joint's frame."""
+
+
+def virtual_links(attitude: FloatArray) -> FloatArray:
+    """Links (6, 4, 4) after the virtual joints of ``T = Tx Ty Tz A Rx Ry Rz``, the last one to the tool itself;
+    ``attitude`` (3, 3): A.
+    """
+    turned = np.eye(4)
+    turned[:3, :3] = attitude
+    return np.array([TO_NEXT, TO_NEXT, turned @ TO_NEXT, TO_NEXT, TO_NEXT, np.eye(4)])
+
 
 def virtual_robot(
     robot: Robot, tool: FloatArray, attitude: FloatArray, joints: tuple[JointSpec, ...]
 ) -> Robot:
-    """``T = Tx Ty Tz A Rx Ry Rz`` of ``tool`` (4, 4) on the flange of ``robot``, as an arm; ``attitude`` (3, 3): A."""
-    to_next = np.eye(4)[:, [1, 2, 0, 3]]  # z along what was x: x, y, z in turn
-    turned = np.eye(4)
-    turned[:3, :3] = attitude
-    links = np.array([to_next, to_next, turned @ to_next, to_next, to_next, inverse_pose(tool)])
+    """The virtual joints of ``tool`` (4, 4) on the flange of ``robot``, as an arm; ``attitude`` (3, 3): A."""
+    links = virtual_links(attitude)
+    links[-1] = inverse_pose(tool)
     return Robot(
-        f"{robot.name} by twists", robot.mounted @ to_next, links, joints, np.zeros(6), np.zeros((6, 3)), ()
+        f"{robot.name} by twists", robot.mounted @ TO_NEXT, links, joints, np.zeros(6), np.zeros((6, 3)), ()
     )
 
 

@@ -186,10 +186,10 @@ def test_reads_of_the_drive_through_the_client(make_bench, eds):
     assert node.sdo[0x1008].raw == "drive402"
     assert node.sdo[0x1000].raw & 0xFFFF == 402
     assert node.sdo[0x1018][4].raw == bench.id
-    assert node.sdo[0x6502].raw == 0b1_0000_0100
+    assert node.sdo[0x6502].raw == 0b1_0000_0101
     node.sdo[0x6060].raw = 9
     assert node.sdo[0x6061].raw == 9
-    for mode in (1, 4, 8, 10, -1):
+    for mode in (2, 4, 8, 10, -1):
         with pytest.raises(SdoAbortedError) as refused:
             node.sdo[0x6060].raw = mode
         assert refused.value.code == 0x06090030
