@@ -8,11 +8,11 @@ Requests are answered here, after the stop and before all other monitors: hold, 
 what is monitored in this very step, and a goal that is accepted in a step in which something is found ends in that step
 with an event of its own.
 
-The detection that runs in every step is in this module: contact, joints that do not follow, and whether innovations,
-unfiltered, still look like noise. A round is one frame of every camera that delivers. Its chi-square, with the
-covariances of detector, timing and model, is cheap; only where it is improbable does `monitors.fault_isolation` ask
-which single change explains it: a moved camera, cameras moved as one, a slipped marker, a drifted joint zero. A
-diagnosis needs two rounds of the last three.
+The detection that runs in every step is in this module: contact, and joints that do not follow. Whether innovations,
+unfiltered, still look like noise is asked of rounds of frames (`monitors.frame_rounds`): the chi-square of a frame,
+with the covariances of detector, timing and model, is cheap; only where it is improbable does
+`monitors.fault_isolation` ask which single change explains it: a moved camera, cameras moved as one, a slipped marker,
+a drifted joint zero.
 """
 
 from __future__ import annotations
@@ -28,14 +28,8 @@ from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import (
-    LATE_S,
     MOVED,
-    STALE_PERIODS,
-    CameraMonitor,
-    ModelDiagnosis,
-    ModelMonitor,
 )
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
@@ -43,22 +37,13 @@ from stereoservo.core.monitors.diagnosis import (
     camera_moved_findings,
     emit_diagnosis,
     mask_marker,
-    unmask_returned,
-)
-from stereoservo.core.monitors.fault_isolation import (
-    bench_now,
-    diagnosed_beside_joint_errors,
 )
 from stereoservo.core.monitors.following import LAG_S, MEMORY_S, SILENCE_S, not_following, silent
+from stereoservo.core.monitors.frame_rounds import finish_round
 from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
 from stereoservo.core.prediction import (
-    MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
     TRUSTED_FRAMES,
-    camera_chi2,
-    gate_threshold,
-    improbable,
-    used_rows,
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
@@ -450,107 +435,6 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
     if verdict.kind == "marker_slipped" and mask_marker(verdict, context):
         subject = ", ".join(verdict.subjects)
         context.emit("warning", message=f"marker {subject} is not used any more", name=subject)
-
-
-AGREE, OF = 2, 3
-"""Rounds of the last ones that must say the same."""
-LATEST_S = 0.15
-"""By which at most, where nothing but noise is left then."""
-LATEST_MODEL_PX = 0.1
-"""What the model may be off by besides, at the latest."""
-
-
-def finish_round(context: StepContext) -> ModelDiagnosis | None:
-    """Finish a round where one is complete; the new verdict where it has changed."""
-    watching, arrays = context.state.watching, context.arrays
-    if arrays is None:
-        return None
-    if not watching.due:
-        for sighting in watching.sightings:
-            if sighting.looked:
-                return None
-    if context.state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
-        return None  # joints that a faulty drive tells are no measure of cameras
-    watching.due = False
-    known = []
-    for c, (camera, sighting) in enumerate(zip(context.settings.cameras, watching.sightings, strict=True)):
-        age_s = (context.now_ns - sighting.t_ns) * 1e-9
-        recent = not sighting.looked or age_s * camera.rate_hz <= STALE_PERIODS
-        mobile = context.state.mobile[c]
-        if recent and sighting.t_ns > 0 and not (mobile is not None and mobile.moving):
-            known.append(c)
-        sighting.looked = True
-    if not known:
-        return None
-    watching.rounds += 1
-    proven = context.state.reanchoring is not None
-    watching.last = [
-        *watching.last[1 - OF :],
-        _judged(watching, known, arrays, context.settings, proven=proven),
-    ]
-    if watching.masked.any():
-        unmask_returned(watching, known, context)
-    return _changed(watching)
-
-
-def _judged(
-    watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings, *, proven: bool
-) -> ModelDiagnosis:
-    """What one round says, of the cameras ``known``. ``proven``: that a camera has moved."""
-    suspicious = False
-    for c in known:
-        sighting = watching.sightings[c]
-        used = used_rows(watching, sighting)
-        likely = _likely(sighting.innovation, sighting.spread, used, settings)
-        suspicious |= not (likely or _late(sighting, used, settings))
-    if not suspicious:
-        return ModelDiagnosis()
-    return diagnosed_beside_joint_errors(bench_now(watching, known, arrays, settings), proven=proven)
-
-
-def _likely(
-    innovation: FloatArray, spread: FloatArray, used: FloatArray, settings: CoreSettings,
-    model_px: float = MODEL_SIGMA_PX,
-) -> bool:  # fmt: skip
-    """Whether innovations (k, 2) look like noise, all together and each of them."""
-    chi2, _, _, largest, count = camera_chi2(innovation, spread, used, model_px)
-    return chi2 <= improbable(2.0 * count) and largest <= gate_threshold(settings.gate_sigma)
-
-
-def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
-    """Whether a frame that was taken a little earlier or later than stated explains its innovations.
-
-    Pictures are late where a computer is busy; a camera that was moved shows it at rest, too.
-    """
-    moved = sighting.velocity * used[:, None]
-    square = float((moved * moved).sum())
-    if square <= 0.0:
-        return False
-    late_s = float((moved * sighting.innovation).sum()) / square
-    if abs(late_s) > LATEST_S:
-        return False
-    rest = sighting.innovation - late_s * sighting.velocity
-    model_px = MODEL_SIGMA_PX if abs(late_s) <= LATE_S else LATEST_MODEL_PX
-    return _likely(rest, sighting.spread, used, settings, model_px)
-
-
-def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:
-    """What two rounds must agree in."""
-    return (verdict.kind, *verdict.subjects)
-
-
-def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
-    """The verdict that two of the last three rounds agree in, where it is another than before."""
-    keys = [_key(verdict) for verdict in watching.last]
-    for verdict in reversed(watching.last):
-        if keys.count(_key(verdict)) < (OF if verdict.kind == "ok" else AGREE):
-            continue
-        if _key(verdict) == _key(watching.verdict):
-            watching.verdict = verdict
-            return None
-        watching.verdict = verdict
-        return verdict
-    return None
 
 
 def _monitor_model(context: StepContext) -> Iterator[Finding]:
