@@ -8,11 +8,11 @@ Requests are answered here, after the stop and before all other monitors: hold, 
 what is monitored in this very step, and a goal that is accepted in a step in which something is found ends in that step
 with an event of its own.
 
-The detection that runs in every step is in this module: contact, and joints that do not follow. Whether innovations,
-unfiltered, still look like noise is asked of rounds of frames (`monitors.frame_rounds`): the chi-square of a frame,
-with the covariances of detector, timing and model, is cheap; only where it is improbable does
-`monitors.fault_isolation` ask which single change explains it: a moved camera, cameras moved as one, a slipped marker,
-a drifted joint zero.
+The detection that runs in every step is in this module: contact, joints that do not follow, and whether innovations,
+unfiltered, still look like noise. A round is one frame of every camera that delivers. Its chi-square, with the
+covariances of detector, timing and model, is cheap; only where it is improbable does `monitors.fault_isolation` ask
+which single change explains it: a moved camera, cameras moved as one, a slipped marker, a drifted joint zero. A
+diagnosis needs two rounds of the last three.
 """
 
 from __future__ import annotations
@@ -24,26 +24,40 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.core.block import DELAY_SAMPLES
+from stereoservo.core.camera_state import CameraMonitor
 from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.monitor_state import (
-    MOVED,
-)
+from stereoservo.core.monitor_state import LATE_S, MOVED, STALE_PERIODS, ModelDiagnosis, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
 from stereoservo.core.monitors.diagnosis import (
     camera_moved_findings,
     emit_diagnosis,
     mask_marker,
+    unmask_returned,
 )
-from stereoservo.core.monitors.following import LAG_S, MEMORY_S, SILENCE_S, not_following, silent
-from stereoservo.core.monitors.frame_rounds import finish_round
+from stereoservo.core.monitors.fault_isolation import bench_now, diagnosed_beside_joint_errors
+from stereoservo.core.monitors.following import (
+    LAG_S,
+    MEMORY_S,
+    SILENCE_S,
+    account_silence,
+    not_following,
+    silent,
+    worst_follower,
+)
 from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
 from stereoservo.core.prediction import (
+    MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
     TRUSTED_FRAMES,
+    camera_chi2,
+    gate_threshold,
+    improbable,
+    rows_in_use,
+    used_rows,
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
@@ -349,40 +363,6 @@ def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -
     return FOLLOWS
 
 
-@kernel
-def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tuple[int, float]:
-    """The joint that lacks most of its travel, over what is ``allowed`` (n,), and how much, with its sign; -1: none.
-
-    What it was sent as of ``now`` and as of its delay (``late``, (n,) each) bounds where it should be.
-    """
-    worst, most = -1, 1.0
-    missing = 0.0
-    for j in range(allowed.shape[0]):
-        beyond = min(abs(now[j]), abs(late[j])) if now[j] * late[j] > 0.0 else 0.0
-        if beyond > most * allowed[j]:
-            worst, most, missing = j, beyond / allowed[j], math.copysign(beyond, now[j])
-    return worst, missing
-
-
-@kernel
-def account_silence(
-    q: FloatArray, velocity: FloatArray, answers: FloatArray, friction: FloatArray, dt_s: float,
-    silent_from: FloatArray, silent_travel: FloatArray, silent_s: FloatArray,
-) -> None:  # fmt: skip
-    """Add up what each joint was sent (``velocity`` (n,), as it arrives), and for how long, since its reading changed.
-
-    ``friction`` (n,) may hold the rest back.
-    """
-    for j in range(q.shape[0]):
-        if abs(q[j] - silent_from[j]) > answers[j]:
-            silent_from[j], silent_travel[j], silent_s[j] = q[j], 0.0, 0.0
-            continue
-        felt = velocity[j] - min(max(velocity[j], -friction[j]), friction[j])
-        silent_travel[j] += felt * dt_s
-        if felt != 0.0:
-            silent_s[j] += dt_s
-
-
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
     """The arm has met something: it stops with its drives on, as if a person had stopped it."""
     reason = detect_collision(context.state, context.settings, context.derived.room, context.ingested.joints)
@@ -435,6 +415,130 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
     if verdict.kind == "marker_slipped" and mask_marker(verdict, context):
         subject = ", ".join(verdict.subjects)
         context.emit("warning", message=f"marker {subject} is not used any more", name=subject)
+
+
+AGREE, OF = 2, 3
+"""Rounds of the last ones that must say the same."""
+LATEST_S = 0.15
+"""By which at most, where nothing but noise is left then."""
+LATEST_MODEL_PX = 0.1
+"""What the model may be off by besides, at the latest."""
+
+
+NOISE = ModelDiagnosis()
+"""Of a round that needs no explanation."""
+
+
+def finish_round(context: StepContext) -> ModelDiagnosis | None:
+    """Finish a round where one is complete; the new verdict where it has changed."""
+    state, arrays = context.state, context.arrays
+    watching = state.watching
+    if arrays is None:
+        return None
+    if not watching.due:
+        for sighting in watching.sightings:
+            if sighting.looked:
+                return None
+    if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+        return None  # joints that a faulty drive tells are no measure of cameras
+    watching.due = False
+    moving = sum([1 << c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving])
+    looked_at, odd, masked = judge_round(
+        state.block.record, context.derived.room.record, context.now_ns, watching.masked, moving
+    )
+    if not looked_at:
+        return None
+    watching.rounds += 1
+    verdict = NOISE
+    if odd and not _all_late(_cameras(odd), watching, context.settings):
+        bench = bench_now(watching, _cameras(looked_at), arrays, context.settings)
+        verdict = diagnosed_beside_joint_errors(bench, proven=state.reanchoring is not None)
+    watching.last = [*watching.last[1 - OF :], verdict]
+    if masked:
+        unmask_returned(watching, _cameras(looked_at), context)
+    return _changed(watching)
+
+
+def _cameras(bits: int) -> list[int]:
+    """Numbers of the cameras that ``bits`` stands for."""
+    return [c for c in range(bits.bit_length()) if bits >> c & 1]
+
+
+@kernel
+def judge_round(
+    block: Record, room: Record, now_ns: int, masked: FloatArray, moving: int
+) -> tuple[int, int, bool]:
+    """Look at the newest frame of each camera: those that are recent, and of them those whose innovations do not look
+    like noise, all together and each of them; and whether any marker is ``masked`` (m,) > 0.
+
+    Cameras are bits of a number, as are those that are ``moving``, which are left out.
+    """
+    memory, work = block[0], room[0]
+    rows = memory.rows
+    known = odd = 0
+    for c in range(memory.cameras):
+        frame, bit = memory.sightings[c], 1 << c
+        age_s = (now_ns - frame.t_ns) * 1e-9
+        recent = not frame.looked or age_s * work.camera_rates[c] <= STALE_PERIODS
+        frame.looked = True
+        if not recent or frame.t_ns <= 0 or moving & bit:
+            continue
+        known |= bit
+        at, end = rows * c, rows * (c + 1)
+        chi2, _, _, largest, count = camera_chi2(
+            memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2)),
+            memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2)),
+            rows_in_use(memory.frame_seen[at:end], masked), MODEL_SIGMA_PX,
+        )  # fmt: skip
+        if not (chi2 <= work.noise_chi2[count] and largest <= work.gate):
+            odd |= bit
+    return known, odd, bool((masked > 0.0).any())
+
+
+def _all_late(cameras: list[int], watching: ModelMonitor, settings: CoreSettings) -> bool:
+    """Whether the newest frame of each of these ``cameras`` is `_late`."""
+    frames = [watching.sightings[c] for c in cameras]
+    return all(_late(frame, used_rows(watching, frame), settings) for frame in frames)
+
+
+def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
+    """Whether a frame that was taken a little earlier or later than stated explains its innovations.
+
+    Pictures are late where a computer is busy; a camera that was moved shows it at rest, too.
+    """
+    moved = sighting.velocity * used[:, None]
+    square = float((moved * moved).sum())
+    if square <= 0.0:
+        return False
+    late_s = float((moved * sighting.innovation).sum()) / square
+    if abs(late_s) > LATEST_S:
+        return False
+    rest = sighting.innovation - late_s * sighting.velocity
+    model_px = MODEL_SIGMA_PX if abs(late_s) <= LATE_S else LATEST_MODEL_PX
+    chi2, _, _, largest, count = camera_chi2(rest, sighting.spread, used, model_px)
+    return bool(chi2 <= improbable(2.0 * count) and largest <= gate_threshold(settings.gate_sigma))
+
+
+def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:
+    """What two rounds must agree in."""
+    return (verdict.kind, *verdict.subjects)
+
+
+def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
+    """The verdict that two of the last three rounds agree in, where it is another than before."""
+    if {verdict.kind for verdict in (watching.verdict, *watching.last)} == {"ok"}:
+        watching.verdict = watching.last[-1] if len(watching.last) == OF else watching.verdict
+        return None
+    keys = [_key(verdict) for verdict in watching.last]
+    for verdict in reversed(watching.last):
+        if keys.count(_key(verdict)) < (OF if verdict.kind == "ok" else AGREE):
+            continue
+        if _key(verdict) == _key(watching.verdict):
+            watching.verdict = verdict
+            return None
+        watching.verdict = verdict
+        return verdict
+    return None
 
 
 def _monitor_model(context: StepContext) -> Iterator[Finding]:
