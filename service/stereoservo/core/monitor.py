@@ -427,6 +427,8 @@ LATEST_MODEL_PX = 0.1
 
 NOISE = ModelDiagnosis()
 """Of a round that needs no explanation."""
+QUIET = [NOISE] * OF
+"""Verdicts of the last rounds, where none needed one."""
 
 
 def finish_round(context: StepContext) -> ModelDiagnosis | None:
@@ -439,16 +441,18 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
         for sighting in watching.sightings:
             if sighting.looked:
                 return None
-    if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+    if state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED:
         return None  # joints that a faulty drive tells are no measure of cameras
     watching.due = False
-    moving = sum([1 << c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving])
+    moving = moving_camera.moving_bits(state) if any(state.mobile) else 0
     looked_at, odd, masked = judge_round(
         state.block.record, context.derived.room.record, context.now_ns, watching.masked, moving
     )
     if not looked_at:
         return None
     watching.rounds += 1
+    if not odd and not masked and watching.last == QUIET and watching.verdict == NOISE:
+        return None
     verdict = NOISE
     if odd and not _all_late(_cameras(odd), watching, context.settings):
         bench = bench_now(watching, _cameras(looked_at), arrays, context.settings)
@@ -526,9 +530,6 @@ def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:
 
 def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
     """The verdict that two of the last three rounds agree in, where it is another than before."""
-    if {verdict.kind for verdict in (watching.verdict, *watching.last)} == {"ok"}:
-        watching.verdict = watching.last[-1] if len(watching.last) == OF else watching.verdict
-        return None
     keys = [_key(verdict) for verdict in watching.last]
     for verdict in reversed(watching.last):
         if keys.count(_key(verdict)) < (OF if verdict.kind == "ok" else AGREE):

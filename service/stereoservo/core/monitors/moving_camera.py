@@ -385,6 +385,11 @@ def to_look_from(arrays: ModelArrays, context: StepContext) -> tuple[Prediction,
     return msgspec.structs.replace(context.prediction, pixels=pixels, jacobian=jacobian), moving, unknown
 
 
+def moving_bits(state: CoreState) -> int:
+    """The cameras that move now, as bits of a number."""
+    return sum(1 << c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving)
+
+
 def moving_cameras(state: CoreState, settings: CoreSettings) -> tuple[str, ...]:
     """Names of the cameras that move now."""
     return tuple(
