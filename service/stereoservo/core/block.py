@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.core.camera_state import CameraEstimate, CameraMonitor
+from stereoservo.core.camera_state import NOTHING_KNOWN, NOTHING_SEEN, CameraEstimate, CameraMonitor
 from stereoservo.core.monitor_state import DriveDelays
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -94,21 +94,21 @@ ARRAYS: Shapes = {
 }  # fmt: skip
 OTHER_TYPES: dict[str, Any] = {"history_ns": np.int64, "seen_ns": np.int64}
 """Of arrays that are not of float64."""
-CAMERAS: dict[str, type[CameraEstimate] | type[CameraMonitor]] = {
-    "estimates": CameraEstimate,
-    "sightings": CameraMonitor,
+CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, ...]]] = {
+    "estimates": (CameraEstimate, ("innovation", "sigma", "seen_ns")),
+    "sightings": (
+        CameraMonitor,
+        ("frame_innovation", "frame_spread", "frame_seen", "frame_velocity", "frame_q"),
+    ),
 }
-"""Of each camera, numbers by name of their field."""
-SIGHTS = {
-    "innovation": "estimates", "sigma": "estimates", "seen_ns": "estimates", "frame_innovation": "sightings",
-    "frame_spread": "sightings", "frame_seen": "sightings", "frame_velocity": "sightings", "frame_q": "sightings",
-}  # fmt: skip
-"""Arrays that are written out with the cameras whose rows they are, and not with the block."""
+"""Of each camera, by name of their field: what has numbers there, and the arrays of which it has a row."""
+SIGHTS = tuple(name for _, names in CAMERAS.values() for name in names)
+"""These arrays are written out with the cameras, and not with the block."""
 
 
 def packed_type(
     numbers: type[ctypes.Structure], arrays: Shapes, others: Mapping[str, Any],
-    parts: Mapping[str, Any],
+    parts: Mapping[str, type[ctypes.Structure]],
 ) -> np.dtype[Any]:  # fmt: skip
     """The type of a record of ``numbers`` and room for the ``arrays`` of the largest cell, of float64 or ``others``,
     and for the ``parts`` of each camera.
@@ -136,7 +136,7 @@ def views(record: np.ndarray[Any, Any], arrays: Shapes, counts: Mapping[str, int
     return found
 
 
-BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, CAMERAS)
+BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, {part: kind for part, (kind, _) in CAMERAS.items()})
 
 
 class Block:
@@ -228,17 +228,16 @@ class Block:
             self.delay_s, self.delay_samples, self.delay_onset, self.delay_sent, self.delay_past, self.delay_velocity,
             self.delay_under_way, self.delay_accounted, self.delay_missing,
         )  # fmt: skip
-        for part, kind in CAMERAS.items():
-            self.__dict__[part] = [self._of_camera(c, part, kind) for c in range(counts["cameras"])]
+        for part in CAMERAS:
+            self.__dict__[part] = [self._of_camera(c, part) for c in range(counts["cameras"])]
 
-    def _of_camera(self, c: int, part: str, kind: type[CameraEstimate] | type[CameraMonitor]) -> Any:
+    def _of_camera(self, c: int, part: str) -> Any:
         """What lies in the record of one camera, with its rows of the arrays."""
         assert BLOCK.fields is not None
+        kind, arrays = CAMERAS[part]
         at = BLOCK.fields[part][1] + c * ctypes.sizeof(kind)
         found = kind.from_buffer(self.record.view(np.uint8).data, at)
-        for name, of in SIGHTS.items():
-            if of == part:
-                setattr(found, name.removeprefix("frame_"), getattr(self, name)[c])
+        vars(found).update({name.removeprefix("frame_"): getattr(self, name)[c] for name in arrays})
         return found
 
     def counts(self) -> dict[str, int]:
@@ -251,10 +250,9 @@ class Block:
         for name in SIGHTS:
             getattr(self, name)[:] = 0
         self.sigma[:] = 1.0
-        for camera in self.estimates:
-            camera.take(CameraEstimate(0).numbers())
-        for frame in self.sightings:
-            frame.take(CameraMonitor(0, 0).numbers())
+        for camera, frame in zip(self.estimates, self.sightings, strict=True):
+            camera.count_as(NOTHING_KNOWN)
+            frame.count_as(NOTHING_SEEN)
 
     def remember_steps(self, past: int) -> None:
         """Room for so many steps of the past, of which nothing is known."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,23 +22,15 @@ class _Kept(ctypes.Structure):
         """All of it by name."""
         return {name: getattr(self, name) for name in type(self).__annotations__}
 
-    def numbers(self) -> dict[str, Any]:
-        """What of it is no array."""
-        return {name: value for name, value in self.kept().items() if not isinstance(value, np.ndarray)}
+    def count_as(self, other: Self) -> None:
+        """Have the numbers of another one."""
+        ctypes.memmove(ctypes.byref(self), ctypes.byref(other), ctypes.sizeof(self))
 
-    def take(self, kept: Mapping[str, Any]) -> Self:
-        """Become what ``kept`` names; the rest stays. Raises TypeError where a number is none."""
-        for name in type(self).__annotations__:
-            if name not in kept:
-                continue
-            value, here = kept[name], getattr(self, name, None)
-            if isinstance(here, CameraTiming):
-                here.take(value.kept() if isinstance(value, CameraTiming) else value)
-            elif isinstance(here, np.ndarray):
-                here[:] = value
-            else:
-                setattr(self, name, value)
-        return self
+    def become(self, other: Self) -> None:
+        """Have numbers and arrays of another one, of the same size. Raises ValueError."""
+        self.count_as(other)
+        for name, array in vars(self).items():
+            array[:] = getattr(other, name)
 
 
 class CameraEstimate(_Kept):
@@ -115,6 +107,10 @@ class CameraMonitor(_Kept):
         self.velocity, self.q = np.zeros((rows, 2)), np.zeros(joints)
 
 
+NOTHING_KNOWN, NOTHING_SEEN = CameraEstimate(0), CameraMonitor(0, 0)
+"""Not to be written to."""
+
+
 def camera_read(kind: type, kept: Mapping[str, Any]) -> CameraEstimate | CameraMonitor:
     """The estimate or the frame of which `kept` wrote ``kept``; numbers that it does not name are as in the beginning.
     Raises ValueError, TypeError where it is none.
@@ -122,8 +118,15 @@ def camera_read(kind: type, kept: Mapping[str, Any]) -> CameraEstimate | CameraM
     sizes = ("sigma",) if kind is CameraEstimate else ("seen", "q")
     if not all(isinstance(kept.get(name), np.ndarray) for name in sizes):
         raise ValueError(f"a camera without {' and '.join(sizes)}")
-    found = kind(*(len(kept[name]) for name in sizes))
-    for name, array in found.kept().items():
-        if isinstance(array, np.ndarray) and getattr(kept.get(name), "shape", None) != array.shape:
+    found: CameraEstimate | CameraMonitor = kind(*(len(kept[name]) for name in sizes))
+    for name, array in vars(found).items():
+        if getattr(kept.get(name), "shape", None) != array.shape:
             raise ValueError(f"a camera without {name} of shape {array.shape}")
-    return cast("CameraEstimate | CameraMonitor", found.take(kept))
+        array[:] = kept[name]
+    for name, value in kept.items():
+        if name == "timing":
+            for number, told in value.items():
+                setattr(found.timing, number, told)
+        elif name in type(found).__annotations__ and name not in vars(found):
+            setattr(found, name, value)
+    return found

@@ -463,7 +463,7 @@ def share_sights(state: CoreState) -> None:
     markers, rows = (state.cameras[0].sigma.size, frames[0].seen.size) if frames else (0, 0)
     block.begin_sights(markers, rows)
     for here, camera in zip(block.estimates, state.cameras, strict=True):
-        here.take(camera.kept())
+        here.become(camera)
     for seen, frame in zip(block.sightings, frames, strict=True):
-        seen.take(frame.kept())
+        seen.become(frame)
     state.cameras, state.watching.sightings = block.estimates, block.sightings
