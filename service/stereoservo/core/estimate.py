@@ -179,8 +179,8 @@ def _fold_frame(camera: int, observation: CameraObservation, context: StepContex
     alone = state.mobile[camera] is None and arrays.joint_accuracy is None
     found = take_frame(
         state.block.record, room.record, camera, t_ns, observation.ids.astype(np.int64),
-        np.array(observation.pixels, np.float64), np.array(observation.covariances, np.float64), watching.masked,
-        alone, alone and not _unknown(camera, state, context.settings),
+        np.array(observation.pixels, np.float64, order="C"), np.array(observation.covariances, np.float64, order="C"),
+        watching.masked, alone, alone and not _unknown(camera, state, context.settings),
     )  # fmt: skip
     if found & TOLD and not alone:  # where the arm was is known, and not only expected
         _look_for_motion(camera, t_ns, context)
