@@ -12,7 +12,7 @@ from stereoservo.core.estimate import estimate
 from stereoservo.core.goals.marker_body import place_now
 from stereoservo.core.ingest import ingest
 
-CELL = {"joints": 3, "cameras": 2, "markers": 5, "window": 4, "past": 65}
+CELL = {"joints": 3, "cameras": 2, "markers": 5, "rows": 7, "window": 4, "past": 65}
 
 
 def filled(counts: dict[str, int]) -> Block:

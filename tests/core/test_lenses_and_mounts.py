@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.estimate import seen_frame
+from stereoservo.core.estimate import see_frame, workspace
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import initial_state
@@ -129,16 +129,19 @@ def test_sights_beyond_the_fold_are_dropped_and_pinholes_pass_untouched(benches:
     for bench in (straight, bent):
         arrays = model_arrays(bench.truth.model, bench.settings)
         rest = np.zeros_like(arrays.zero)
-        block = initial_state(bench.settings).block
+        block, room = initial_state(bench.settings).block, workspace(bench.settings, None)
         block.history_ns[1], block.history_positions[:2], block.numbers.history_count = 1, rest, 2
-        frame = seen_frame(arrays, 0, observation, block, 1)
-        assert frame is not None
-        seen.append(frame.sights.seen[:3].tolist())
-        pixels.append((frame.prediction.pixels[0] + frame.sights.innovation[: len(arrays.ids)])[:3])
+        block.begin_sights(len(arrays.ids), len(arrays.row_ids))
+        room.use(arrays)
+        given = observation.ids, observation.pixels, observation.covariances
+        assert see_frame(block.record, room.record, 0, 1, *given)[0]
+        found = room.residuals(1)
+        seen.append(found.seen[:3].tolist())
+        pixels.append((room.of_frame.pixels[0] + found.innovation[: len(arrays.ids)])[:3])
     assert seen == [[True, True, True], [True, False, True]]
     np.testing.assert_allclose(pixels[0], observation.pixels, atol=1e-9)
     np.testing.assert_allclose(pixels[1][0], (320, 240), atol=1e-9)
-    assert np.linalg.det(frame.sights.spread[2]) > 1e-4  # a barrel compressed it
+    assert np.linalg.det(found.spread[2]) > 1e-4  # a barrel compressed it
 
 
 def test_set_point_where_the_lens_images_nothing_is_refused_with_its_value(benches: Any) -> None:

@@ -264,6 +264,29 @@ def test_a_state_of_before_goals_were_resolved_in_parts_is_read(bench: Any) -> N
         decode_state(msgspec.msgpack.encode(state))
 
 
+def test_a_state_of_before_frames_were_in_the_block_is_read(bench: Any) -> None:
+    """It has them in the same places, but does not say how many rows they have; of cameras, damage is told."""
+    bench.ready()
+    bench.run(0.1)
+    state = msgspec.msgpack.decode(encode_state(bench.core.state))
+    assert state["block"].pop("rows") == len(bench.core.state.watching.sightings[0].seen) > 0
+    of_then = msgspec.msgpack.encode(state)
+    assert is_recorded(bench.core.state, of_then)
+    assert encode_state(decode_state(of_then)) == encode_state(bench.core.state)
+    for held, name in (
+        (state["cameras"][0], "sigma"),
+        (state["cameras"][1], "innovation"),
+        (state["watching"]["sightings"][0], "q"),
+    ):
+        value = held.pop(name)
+        with pytest.raises(msgspec.ValidationError, match=name):
+            decode_state(msgspec.msgpack.encode(state))
+        held[name] = value
+    state["cameras"][0]["frames"] = "many"
+    with pytest.raises(msgspec.ValidationError):
+        decode_state(msgspec.msgpack.encode(state))
+
+
 def of_version(version: int) -> bytes:
     """A state of another version, which holds other fields, too."""
     return msgspec.msgpack.encode({"version": version, "step": 3, "something_else": [1, 2]})

@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from stereoservo.core.block import HISTORY
+from stereoservo.core.camera_state import CameraTiming
 from stereoservo.core.estimate import fold_timing
 from stereoservo.core.ingest import remember_joints
-from stereoservo.core.monitor_state import CameraTiming
-from stereoservo.core.prediction import MODEL_SIGMA_PX, FrameResiduals, joints_at, velocities_at
+from stereoservo.core.prediction import MODEL_SIGMA_PX, joints_at, velocities_at
 from stereoservo.core.report import advice, offset_s
 from stereoservo.core.state import JointHistory
 from stereoservo.numerics.arrays import FloatArray
 
 
-def frame(innovation: FloatArray, velocity: FloatArray, t_ns: int) -> FrameResiduals:
-    """Markers of a detector of 0.05 px."""
-    k = len(innovation)
-    spread = np.tile(0.05**2 * np.eye(2), (k, 1, 1))
-    return FrameResiduals(t_ns, innovation, spread, np.full(k, 0.05**2), np.ones(k, dtype=bool), velocity)
+def fold(timing: CameraTiming, innovation: FloatArray, velocity: FloatArray, t_ns: int) -> None:
+    """Take in a frame of markers of a detector of 0.05 px."""
+    noise, used = np.full(len(innovation), 0.05**2), np.ones(len(innovation))
+    timing.product, timing.square, timing.seen_ns = fold_timing(
+        timing.product, timing.square, timing.seen_ns, t_ns, innovation, velocity, noise, used
+    )
 
 
 def seen(
@@ -37,7 +38,7 @@ def seen(
         velocity = amplitude * w * np.cos(w * t) * directions
         moved = amplitude * (np.sin(w * (t + late_s)) - np.sin(w * t)) * directions
         innovation = moved + offsets + rng.normal(0.0, 0.05, (6, 2))
-        fold_timing(timing, frame(innovation, velocity, round(t * 1e9) + 1), np.ones(6))
+        fold(timing, innovation, velocity, round(t * 1e9) + 1)
     return timing
 
 
@@ -75,7 +76,7 @@ def test_old_frames_are_forgotten() -> None:
     for k in range(6000):
         t_ns = timing.seen_ns + 33_333_333
         velocity = np.array([[100.0, 0.0]])
-        fold_timing(timing, frame(rng.normal(0, 0.05, (1, 2)), velocity, t_ns), np.ones(1))
+        fold(timing, rng.normal(0, 0.05, (1, 2)), velocity, t_ns)
         late.append(offset_s(timing)[0])
         assert timing.seen_ns == t_ns, k
     assert abs(late[-1]) < 0.001

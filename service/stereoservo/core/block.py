@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from stereoservo.core.camera_state import NOTHING_KNOWN, NOTHING_SEEN, CameraEstimate, CameraMonitor
 from stereoservo.core.monitor_state import DriveDelays
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -39,10 +40,13 @@ MOST = {
     "joints": MAX_JOINTS,
     "cameras": MAX_CAMERAS,
     "markers": MAX_MARKERS,
+    "rows": MAX_MARKERS,
     "window": MAX_WINDOW,
     "past": steps_of_delay(MAX_RATE_HZ),
 }
-"""Counts of the largest cell: ``window`` samples of the watch on contact, and steps of the ``past``."""
+"""Counts of the largest cell: ``rows`` of a frame, markers of the model and static points; ``window`` samples of
+the watch on contact; steps of the ``past``.
+"""
 
 
 class Numbers(ctypes.Structure):
@@ -65,6 +69,7 @@ class Numbers(ctypes.Structure):
     leave_s: float
     tells_efforts: int
     tells_following: int
+    rows: int
     _fields_ = [
         (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
         for name, kind in __annotations__.items()
@@ -84,16 +89,32 @@ ARRAYS: Shapes = {
     "mean_efforts": JOINTS, "effort_excess": ("window", "joints"), "following_excess": ("window", "joints"),
     "contact_low": (2, "joints"), "contact_high": (2, "joints"), "efforts": JOINTS, "following_errors": JOINTS,
     "innovation": ("cameras", "markers", 2), "sigma": ("cameras", "markers"), "seen_ns": ("cameras", "markers"),
+    "frame_innovation": ("cameras", "rows", 2), "frame_spread": ("cameras", "rows", 2, 2),
+    "frame_seen": ("cameras", "rows"), "frame_velocity": ("cameras", "rows", 2), "frame_q": ("cameras", "joints"),
 }  # fmt: skip
 OTHER_TYPES: dict[str, Any] = {"history_ns": np.int64, "seen_ns": np.int64}
 """Of arrays that are not of float64."""
-SIGHTS = ("innovation", "sigma", "seen_ns")
-"""Arrays that are written out with the cameras whose rows they are."""
+CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, ...]]] = {
+    "estimates": (CameraEstimate, ("innovation", "sigma", "seen_ns")),
+    "sightings": (
+        CameraMonitor,
+        ("frame_innovation", "frame_spread", "frame_seen", "frame_velocity", "frame_q"),
+    ),
+}
+"""Of each camera, by name of their field: what has numbers there, and the arrays of which it has a row."""
+SIGHTS = tuple(name for _, names in CAMERAS.values() for name in names)
+"""These arrays are written out with the cameras, and not with the block."""
 
 
-def packed_type(numbers: type[ctypes.Structure], arrays: Shapes, others: Mapping[str, Any]) -> np.dtype[Any]:
-    """The type of a record of ``numbers`` and room for the ``arrays`` of the largest cell, of float64 or ``others``."""
+def packed_type(
+    numbers: type[ctypes.Structure], arrays: Shapes, others: Mapping[str, Any],
+    parts: Mapping[str, type[ctypes.Structure]],
+) -> np.dtype[Any]:  # fmt: skip
+    """The type of a record of ``numbers`` and room for the ``arrays`` of the largest cell, of float64 or ``others``,
+    and for the ``parts`` of each camera.
+    """
     fields: list[Any] = [(name, np.dtype(kind)) for name, kind, *_ in numbers._fields_]
+    fields += [(name, np.dtype(kind), (MAX_CAMERAS,)) for name, kind in parts.items()]
     fields += [
         (name, others.get(name, np.float64), (math.prod(shape_of(shape, MOST)),))
         for name, shape in arrays.items()
@@ -115,7 +136,7 @@ def views(record: np.ndarray[Any, Any], arrays: Shapes, counts: Mapping[str, int
     return found
 
 
-BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES)
+BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, {part: kind for part, (kind, _) in CAMERAS.items()})
 
 
 class Block:
@@ -138,7 +159,8 @@ class Block:
     ``leave_s`` of motion. ``efforts``, ``following_errors`` (n,) of the sample at ``loads_ns``, where it tells
     them.
 
-    Sights (c, m, 2), (c, m), (c, m): of each camera's `state.CameraEstimate`, which has its row.
+    Cameras: ``estimates`` and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns``
+    (c, m), and ``frame_…`` (c, k, …) for the newest frames, have the arrays, a row a camera.
     """
 
     record: np.ndarray[Any, Any]
@@ -174,6 +196,13 @@ class Block:
     innovation: FloatArray
     sigma: FloatArray
     seen_ns: IntArray
+    frame_innovation: FloatArray
+    frame_spread: FloatArray
+    frame_seen: FloatArray
+    frame_velocity: FloatArray
+    frame_q: FloatArray
+    estimates: list[CameraEstimate]
+    sightings: list[CameraMonitor]
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         """Nothing known, in a cell with these ``counts``. Raises ValueError."""
@@ -186,7 +215,7 @@ class Block:
         self._count(counts)
         self.numbers.last_joints_seq = -1
         self.delay_samples[:] = np.nan
-        self.sigma[:] = 1.0
+        self.begin_sights(counts["markers"], counts["rows"])
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{name} of the block is a view of its record: write into it")
@@ -199,15 +228,31 @@ class Block:
             self.delay_s, self.delay_samples, self.delay_onset, self.delay_sent, self.delay_past, self.delay_velocity,
             self.delay_under_way, self.delay_accounted, self.delay_missing,
         )  # fmt: skip
+        for part in CAMERAS:
+            self.__dict__[part] = [self._of_camera(c, part) for c in range(counts["cameras"])]
+
+    def _of_camera(self, c: int, part: str) -> Any:
+        """What lies in the record of one camera, with its rows of the arrays."""
+        assert BLOCK.fields is not None
+        kind, arrays = CAMERAS[part]
+        at = BLOCK.fields[part][1] + c * ctypes.sizeof(kind)
+        found = kind.from_buffer(self.record.view(np.uint8).data, at)
+        vars(found).update({name.removeprefix("frame_"): getattr(self, name)[c] for name in arrays})
+        return found
 
     def counts(self) -> dict[str, int]:
         """Of each of `MOST`, how many the cell has."""
         return {name: getattr(self.numbers, name) for name in MOST}
 
-    def begin_sights(self, markers: int) -> None:
-        """Sights of so many markers, none of which is seen yet."""
-        self._count({**self.counts(), "markers": markers})
-        self.innovation[:], self.sigma[:], self.seen_ns[:] = 0.0, 1.0, 0
+    def begin_sights(self, markers: int, rows: int) -> None:
+        """Cameras that have seen nothing yet of so many markers, ``rows`` with the static points."""
+        self._count({**self.counts(), "markers": markers, "rows": rows})
+        for name in SIGHTS:
+            getattr(self, name)[:] = 0
+        self.sigma[:] = 1.0
+        for camera, frame in zip(self.estimates, self.sightings, strict=True):
+            camera.count_as(NOTHING_KNOWN)
+            frame.count_as(NOTHING_SEEN)
 
     def remember_steps(self, past: int) -> None:
         """Room for so many steps of the past, of which nothing is known."""
@@ -226,7 +271,7 @@ def restored(kept: Mapping[str, Any]) -> Block:
     """The block of which `Block.kept` wrote ``kept``; what it does not name is as in the beginning. Raises ValueError,
     TypeError where it is none.
     """
-    counts = {name: kept.get(name) for name in MOST}
+    counts = {"rows": 0, **{name: kept.get(name) for name in MOST if name != "rows" or name in kept}}
     if not all(isinstance(count, int) for count in counts.values()):
         raise ValueError(f"a block with counts {counts}")
     block = Block(counts)  # type: ignore[arg-type]

@@ -9,15 +9,15 @@ kinematics (`core.prediction`), so that control goes on between frames and throu
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.core.block import Block
+from stereoservo.core.block import HISTORY
+from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays, model_arrays, require_fitting
-from stereoservo.core.monitor_state import MOVED, CameraTiming, ModelMonitor
+from stereoservo.core.monitor_state import MOVED
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
 from stereoservo.core.monitors.diagnosis import start_model_monitor
@@ -27,26 +27,23 @@ from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
     TIMING_SIGMA_S,
     FrameResiduals,
-    Prediction,
     camera_chi2,
     distance2,
-    gate_threshold,
     joint_step,
     positions_at,
     predict_into,
     present,
-    room,
+    rows_in_use,
     rows_of,
     undistort_sights,
-    used_rows,
     velocities_at,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState, camera_estimate, share_sights
-from stereoservo.core.workspace import Workspace
+from stereoservo.core.state import CoreState, share_sights
+from stereoservo.core.workspace import LENS_SIZE, Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation
 
@@ -144,7 +141,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     state.readiness = fitted_readiness(model)
     offsets = stated_offsets(model)
     state.cameras = [
-        camera_estimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
+        CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
     ]
     share_sights(state)
 
@@ -172,28 +169,41 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 
 def _fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
     """Compare a frame with the prediction at its shutter, and fold it into its camera's estimate."""
-    state, settings, arrays = context.state, context.settings, context.derived.arrays
-    estimate = state.cameras[camera]
+    state, arrays, room = context.state, context.derived.arrays, context.derived.room
+    estimate, watching, t_ns = state.cameras[camera], state.watching, observation.t_shutter_ns
     estimate.last_seq = observation.seq
-    estimate.last_visible = int(observation.ids.size)
-    shutter_ns = observation.t_shutter_ns + estimate.offset_ns
+    estimate.last_visible = observation.ids.size
     if arrays is None:
         return
-    frame = seen_frame(arrays, camera, observation, state.block, shutter_ns)
-    if frame is None:
-        return
-    sights = frame.sights
-    if frame.told:  # where the arm was is known, and not only expected
-        if state.mobile[camera] is not None:
-            sights = moving_camera.see(
-                state, settings, arrays, camera, sights, frame.prediction, frame.q, context.emit
-            )
-        fold_residuals(state.watching, camera, sights, frame.q)
+    # Of a camera that moves, and with joints that may be elsewhere than they tell, more is asked in between.
+    alone = state.mobile[camera] is None and arrays.joint_accuracy is None
+    found = take_frame(
+        state.block.record, room.record, camera, t_ns, observation.ids.astype(np.int64),
+        np.array(observation.pixels, np.float64, order="C"), np.array(observation.covariances, np.float64, order="C"),
+        watching.masked, alone, alone and not _unknown(camera, state, context.settings),
+    )  # fmt: skip
+    if found & TOLD and not alone:  # where the arm was is known, and not only expected
+        _look_for_motion(camera, t_ns, context)
+        found |= fold_residuals(state.block.record, room.record, camera, t_ns, watching.masked)
+    if found & WAITED:
+        watching.due = True
+    if found & TOLD and state.model is not None and state.model.shutter_offsets:
         _follow_offset(camera, observation, context)
-    if not _unknown(camera, state, settings):
-        used = state.watching.masked == 0.0
-        common = common_change(estimate, sights, used, frame.prediction.jacobian[0], arrays)
-        accept_sights(estimate, sights, used, settings, common)
+    if found and not alone and not _unknown(camera, state, context.settings):
+        used, jacobian = watching.masked == 0.0, room.of_frame.jacobian[0]
+        common = common_change(estimate, room.residuals(t_ns), used, jacobian, arrays)
+        accept_sights(state.block.record, room.record, camera, t_ns, watching.masked, common)
+
+
+def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
+    """Of a mobile camera: whether it moves; while it does, its newest frame is compared with nothing."""
+    state, room, arrays = context.state, context.derived.room, context.derived.arrays
+    if state.mobile[camera] is None or arrays is None:
+        return
+    sights = room.residuals(t_ns)
+    sights.seen[:] = moving_camera.see(
+        state, context.settings, arrays, camera, sights, room.of_frame, room.frame_q, context.emit
+    ).seen
 
 
 FOLLOWED_S = 0.02
@@ -265,42 +275,64 @@ def masked_ids(state: CoreState) -> tuple[int, ...]:
 AGREEING_PX = 1.5
 
 
-class SeenFrame(NamedTuple):
-    """A frame at its shutter: joints ``q`` (n,) then, whether they are ``told`` by samples on both sides, the
-    ``prediction`` of its camera alone, and the residuals ``sights``.
+KNOWN, TOLD, WAITED = 1, 2, 4
+"""What `take_frame` has found, added up: the joints are known at the shutter, and by samples on both sides of it; the
+camera's frame before has not been looked at yet.
+"""
+
+
+@kernel
+def take_frame(
+    block: Record, room: Record, camera: int, t_ns: int, ids: IntArray, pixels: FloatArray, covariances: FloatArray,
+    masked: FloatArray, watched: bool, used: bool,
+) -> int:  # fmt: skip
+    """Take a frame of ``camera``, stamped ``t_ns``: ``ids`` (k,) at raw ``pixels`` (k, 2) with ``covariances``
+    (k, 2, 2). What was found; nothing else happens where the joints then are not known.
+
+    Where it is ``watched`` and the joints are told it goes to the monitors, where it is ``used`` into the estimate;
+    both without the markers that are ``masked`` (m,) > 0.
     """
+    memory = block[0]
+    shutter_ns = t_ns + memory.estimates[camera].offset_ns
+    known, told = see_frame(block, room, camera, shutter_ns, ids, pixels, covariances)
+    if not known:
+        return 0
+    found = KNOWN
+    if told:
+        found |= TOLD
+    if told and watched:
+        found |= fold_residuals(block, room, camera, t_ns, masked)
+    if used:
+        accept_sights(block, room, camera, t_ns, masked, np.zeros((masked.size, 2)))
+    return found
 
-    q: FloatArray
-    told: bool
-    prediction: Prediction
-    sights: FrameResiduals
 
-
-def seen_frame(
-    arrays: ModelArrays, camera: int, observation: CameraObservation, block: Block, shutter_ns: int
-) -> SeenFrame | None:
-    """An observation of ``camera``, in raw pixels, taken at ``shutter_ns``; None where the joints then are not known.
+@kernel
+def see_frame(
+    block: Record, room: Record, camera: int, shutter_ns: int, ids: IntArray, pixels: FloatArray,
+    covariances: FloatArray,
+) -> tuple[bool, bool]:  # fmt: skip
+    """Compare a frame of ``camera``, taken at ``shutter_ns``, with the prediction; into the ``room``, what it holds of
+    the frame that was looked at last. Whether the joints are known then, and told by samples on both sides.
 
     The velocities of the joints at present are those of a frame that is newer than their last sample. Sights that the
     camera's lens cannot have made are left out.
     """
-    n, markers = arrays.zero.size, len(arrays.marker_points)
-    rows = markers + len(arrays.scene_points)
-    q, prediction = np.empty(n), room(n, 1, markers)
-    sights = FrameResiduals(
-        observation.t_shutter_ns, np.empty((rows, 2)), np.empty((rows, 2, 2)), np.empty(rows), np.empty(rows, np.bool_),
-        np.empty((rows, 2)),
+    memory, work = block[0], room[0]
+    n, m, rows, lens = memory.joints, memory.markers, memory.rows, work.lens_size
+    standing = 2 * rows * camera
+    return _seen_frame(
+        memory.history_ns, memory.history_positions[: HISTORY * n].reshape((HISTORY, n)), memory.history_count,
+        shutter_ns, memory.velocities[:n], work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n],
+        work.tip_first != 0, work.marker_points[: 4 * m].reshape((m, 4)),
+        work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
+        work.lenses[LENS_SIZE * camera : LENS_SIZE * camera + lens], ids, pixels, covariances, work.row_ids[:rows],
+        work.row_of[:rows], work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)),
+        work.frame_q[:n], work.operators[: 16 * n].reshape((n, 4, 4)), work.points[: 4 * m].reshape((m, 4)),
+        work.predicted[: 2 * m].reshape((1, m, 2)), work.jacobian[: 2 * m * n].reshape((1, m, 2, n)),
+        work.frame_innovation[: 2 * rows].reshape((rows, 2)), work.frame_spread[: 4 * rows].reshape((rows, 2, 2)),
+        work.frame_noise[:rows], work.frame_seen[:rows], work.frame_velocity[: 2 * rows].reshape((rows, 2)),
     )  # fmt: skip
-    known, told = _seen_frame(
-        block.history_ns, block.history_positions, block.numbers.history_count, shutter_ns, block.velocities,
-        arrays.generators, arrays.kinds,
-        arrays.zero, arrays.tip_first, arrays.marker_points, arrays.matrices[camera : camera + 1],
-        arrays.lenses[camera], observation.ids.astype(np.int64), np.array(observation.pixels, np.float64),
-        np.array(observation.covariances, np.float64), arrays.row_ids, arrays.row_of, arrays.scene_pixels[camera],
-        q, prediction.operators, prediction.points, prediction.pixels, prediction.jacobian, sights.innovation,
-        sights.spread, sights.noise, sights.seen, sights.velocity,
-    )  # fmt: skip
-    return SeenFrame(q, told, prediction, sights) if known else None
 
 
 @kernel
@@ -309,11 +341,11 @@ def _seen_frame(
     kinds: KindArray, zero: FloatArray, tip_first: bool, marker_points: FloatArray, matrix: FloatArray,
     lens: FloatArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, row_ids: IntArray, row_of: IntArray,
     standing: FloatArray, q: FloatArray, operators: FloatArray, points: FloatArray, predicted: FloatArray,
-    jacobian: FloatArray, innovation: FloatArray, spread: FloatArray, noise: FloatArray, seen: BoolArray,
+    jacobian: FloatArray, innovation: FloatArray, spread: FloatArray, noise: FloatArray, seen: KindArray,
     velocity: FloatArray,
 ) -> tuple[bool, bool]:  # fmt: skip
-    """Whether the joints are known then, and told by samples on both sides; into the last arguments, the arrays of
-    `SeenFrame`.
+    """Whether the joints are known then, and told by samples on both sides; into the last nine arguments: ``q`` (n,),
+    the fields of a `Prediction` of one camera, and those of `FrameResiduals`.
     """
     known, then = positions_at(stamps, positions, count, t_ns)
     q[:] = then
@@ -336,25 +368,37 @@ def _seen_frame(
     return known, told
 
 
-def fold_residuals(watching: ModelMonitor, camera: int, sights: FrameResiduals, q: FloatArray) -> None:
-    """A new frame of one camera, with the arm at ``q`` (n,) then."""
-    sighting = watching.sightings[camera]
-    watching.due = watching.due or not sighting.looked
-    sighting.innovation = sights.innovation
-    sighting.spread = sights.spread
-    sighting.seen = sights.seen.astype(np.float64)
-    sighting.velocity = sights.velocity
-    sighting.q = q
-    sighting.t_ns = sights.t_shutter_ns
-    sighting.fresh, sighting.looked = True, False
-    used = used_rows(watching, sighting)
-    chi2, squares, worst, _, count = camera_chi2(sighting.innovation, sighting.spread, used, MODEL_SIGMA_PX)
-    sighting.chi2 = chi2 / max(2.0 * count, 1.0)
-    sighting.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
-    sighting.worst = worst
-    u, v = (0.0, 0.0) if worst < 0 else sighting.innovation[worst].tolist()
-    sighting.worst_px = math.sqrt(u * u + v * v)
-    fold_timing(sighting.timing, sights, used)
+@kernel
+def fold_residuals(block: Record, room: Record, camera: int, t_ns: int, masked: FloatArray) -> int:
+    """What the ``room`` holds of a frame is the newest one of ``camera``; `WAITED` where no round has looked at the one
+    before.
+    """
+    memory, work = block[0], room[0]
+    n, rows = memory.joints, memory.rows
+    frame = memory.sightings[camera]
+    found = 0 if frame.looked else WAITED
+    frame.t_ns, frame.fresh, frame.looked = t_ns, True, False
+    at, end = rows * camera, rows * (camera + 1)
+    innovation = memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2))
+    spread = memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2))
+    velocity, seen = memory.frame_velocity[2 * at : 2 * end].reshape((rows, 2)), memory.frame_seen[at:end]
+    innovation[:] = work.frame_innovation[: 2 * rows].reshape((rows, 2))
+    spread[:] = work.frame_spread[: 4 * rows].reshape((rows, 2, 2))
+    velocity[:] = work.frame_velocity[: 2 * rows].reshape((rows, 2))
+    memory.frame_q[n * camera : n * (camera + 1)] = work.frame_q[:n]
+    for i in range(rows):
+        seen[i] = work.frame_seen[i]
+    used = rows_in_use(seen, masked)
+    chi2, squares, worst, _, count = camera_chi2(innovation, spread, used, MODEL_SIGMA_PX)
+    frame.chi2 = chi2 / max(2.0 * count, 1.0)
+    frame.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
+    u, v = (0.0, 0.0) if worst < 0 else (innovation[worst, 0], innovation[worst, 1])
+    frame.worst, frame.worst_px = worst, math.sqrt(u * u + v * v)
+    timing, noise = frame.timing, work.frame_noise[:rows]
+    timing.product, timing.square, timing.seen_ns = fold_timing(
+        timing.product, timing.square, timing.seen_ns, t_ns, innovation, velocity, noise, used
+    )
+    return found
 
 
 FORGETTING_S = 30.0
@@ -363,20 +407,21 @@ MOVING_PX_S = 20.0
 """Mean pixel speed below which a frame says nothing of time."""
 
 
-def fold_timing(timing: CameraTiming, sights: FrameResiduals, used: FloatArray) -> None:
-    """Take in the rows of a frame that are ``used`` (k,) > 0.
+@kernel
+def fold_timing(
+    product: float, square: float, seen_ns: int, t_ns: int, innovations: FloatArray, velocities: FloatArray,
+    noise: FloatArray, used: FloatArray,
+) -> tuple[float, float, int]:  # fmt: skip
+    """The sums of a `CameraTiming` with the rows of a frame that are ``used`` (k,) > 0.
 
     The markers of a frame share what the model is off by: they count as one sight, not as k.
     """
-    t_ns = sights.t_shutter_ns
-    k, speed, product, square = _timing_sums(sights.innovation, sights.velocity, sights.noise, used)
+    k, speed, along, squared = _timing_sums(innovations, velocities, noise, used)
     if k == 0 or speed < MOVING_PX_S * k:
-        return
-    elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns else 0.0
+        return product, square, seen_ns
+    elapsed_s = min((t_ns - seen_ns) * 1e-9, 0.2) if seen_ns != 0 else 0.0
     keep = math.exp(-elapsed_s / FORGETTING_S)
-    timing.product = keep * timing.product + product / k
-    timing.square = keep * timing.square + square / k
-    timing.seen_ns = t_ns
+    return keep * product + along / k, keep * square + squared / k, t_ns
 
 
 @kernel
@@ -399,31 +444,37 @@ def _timing_sums(
     return count, speed, product, square
 
 
+@kernel
 def accept_sights(
-    estimate: CameraEstimate, sights: FrameResiduals, used: BoolArray, settings: CoreSettings,
-    common: FloatArray,
-) -> None:  # fmt: skip
-    """Gate one frame and fold it into the camera's estimate; markers that are not ``used`` (m,) are left out.
+    block: Record, room: Record, camera: int, t_ns: int, masked: FloatArray, common: FloatArray
+) -> None:
+    """Gate the frame that the ``room`` holds and fold it into the camera's estimate; markers that are ``masked``
+    (m,) > 0 are left out.
 
     The gate is chi-square with two freedoms on the deviation from the filtered innovation and its ``common`` change
     (m, 2) [px], with the covariances of detector, timing and model. Near the gate a sight counts less: in the filter,
     and in triangulation by its sigma.
     """
-    m = used.size
+    memory, work = block[0], room[0]
+    m = memory.markers
+    at, end = m * camera, m * (camera + 1)
+    seen = np.empty(m, np.bool_)
+    for i in range(m):
+        seen[i] = work.frame_seen[i] != 0 and masked[i] == 0.0
     accepted, rejected, squares = fold_in(
-        sights.innovation[:m], sights.spread[:m], sights.seen[:m] & used, sights.noise[:m], common,
-        sights.t_shutter_ns, estimate.innovation, estimate.sigma, estimate.seen_ns,
-        settings.limits.coast_s + 1.0, settings.filter_s, gate_threshold(settings.gate_sigma), MODEL_SIGMA_PX,
-        FIRST_SIGHT_SIGMA_PX,
+        work.frame_innovation[: 2 * m].reshape((m, 2)), work.frame_spread[: 4 * m].reshape((m, 2, 2)), seen,
+        work.frame_noise[:m], common, t_ns, memory.innovation[2 * at : 2 * end].reshape((m, 2)), memory.sigma[at:end],
+        memory.seen_ns[at:end], work.known_s, work.filter_s, work.gate, MODEL_SIGMA_PX, FIRST_SIGHT_SIGMA_PX,
     )  # fmt: skip
+    estimate = memory.estimates[camera]
     estimate.last_visible = accepted
     estimate.frames += 1
-    estimate.rms_px = math.sqrt(squares / (2 * accepted)) if accepted else 0.0
+    estimate.rms_px = math.sqrt(squares / (2 * accepted)) if accepted > 0 else 0.0
     agrees = accepted >= 3 and rejected == 0 and estimate.rms_px < AGREEING_PX
     estimate.agreeing_frames = estimate.agreeing_frames + 1 if agrees else 0
     estimate.rejected_frames = estimate.rejected_frames + 1 if rejected > accepted else 0
     if accepted >= 3:
-        estimate.accepted_ns = sights.t_shutter_ns
+        estimate.accepted_ns = t_ns
 
 
 COMMON_ROUNDS = 8
@@ -469,7 +520,7 @@ def common_change(
 def _innovations_into(
     rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, standing: FloatArray,
     jacobian: FloatArray, speed: FloatArray, timing_s: float, innovation: FloatArray, spread: FloatArray,
-    noise: FloatArray, seen: BoolArray, velocity: FloatArray,
+    noise: FloatArray, seen: KindArray, velocity: FloatArray,
 ) -> None:  # fmt: skip
     """Into the last five, the fields of `FrameResiduals`, k rows: observed less ``predicted`` (m, 2) or ``standing``
     (s, 2) [px].
@@ -479,12 +530,12 @@ def _innovations_into(
     """
     markers, n = jacobian.shape[0], jacobian.shape[2]
     innovation[:], spread[:], velocity[:] = 0.0, 0.0, 0.0
-    seen[:], noise[:] = False, 1.0
+    seen[:], noise[:] = 0, 1.0
     for k in range(rows.size):
         i = rows[k]
         if i < 0:
             continue
-        seen[i] = True
+        seen[i] = 1
         noise[i] = 0.5 * (covariances[k, 0, 0] + covariances[k, 1, 1])
         for a in range(2):
             innovation[i, a] = pixels[k, a] - (predicted[i, a] if i < markers else standing[i - markers, a])

@@ -358,15 +358,19 @@ def _observations(
     """
     inputs = context.inputs
     cameras = context.derived.cameras
-    newest = [(estimate.last_seq, estimate.accepted_ns) for estimate in context.state.cameras]
+    newest: dict[int, tuple[int, int]] = {}  # of cameras with more than one frame
     timeout_s = context.derived.frame_timeout_s
     passed: list[tuple[int, CameraObservation]] = []
     refused: list[tuple[int, Reason]] = []
     for observation in inputs.observations:
         camera = cameras.get(observation.camera)
-        if camera is None or observation.seq == newest[camera][0]:
+        if camera is None:
             continue
-        if observation.seq < newest[camera][0] and observation.t_shutter_ns <= newest[camera][1]:
+        estimate = context.state.cameras[camera]
+        last_seq, accepted_ns = newest.get(camera) or (estimate.last_seq, estimate.accepted_ns)
+        if observation.seq == last_seq:
+            continue
+        if observation.seq < last_seq and observation.t_shutter_ns <= accepted_ns:
             continue
         age_s = (inputs.now_ns - observation.t_shutter_ns) * 1e-9
         if not 0.0 <= age_s <= timeout_s:
@@ -376,7 +380,7 @@ def _observations(
         if wrong:
             refused.append((camera, _impossible_frame(observation, wrong)))
             continue
-        newest[camera] = observation.seq, max(newest[camera][1], observation.t_shutter_ns)
+        newest[camera] = observation.seq, max(accepted_ns, observation.t_shutter_ns)
         passed.append((camera, observation))
     return tuple(passed), tuple(refused)
 

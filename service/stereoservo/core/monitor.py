@@ -24,19 +24,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.core.block import DELAY_SAMPLES
+from stereoservo.core.camera_state import CameraMonitor
 from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.monitor_state import (
-    LATE_S,
-    MOVED,
-    STALE_PERIODS,
-    CameraMonitor,
-    ModelDiagnosis,
-    ModelMonitor,
-)
+from stereoservo.core.monitor_state import LATE_S, MOVED, STALE_PERIODS, ModelDiagnosis, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
 from stereoservo.core.monitors.diagnosis import (
@@ -45,11 +38,16 @@ from stereoservo.core.monitors.diagnosis import (
     mask_marker,
     unmask_returned,
 )
-from stereoservo.core.monitors.fault_isolation import (
-    bench_now,
-    diagnosed_beside_joint_errors,
+from stereoservo.core.monitors.fault_isolation import bench_now, diagnosed_beside_joint_errors
+from stereoservo.core.monitors.following import (
+    LAG_S,
+    MEMORY_S,
+    SILENCE_S,
+    account_silence,
+    not_following,
+    silent,
+    worst_follower,
 )
-from stereoservo.core.monitors.following import LAG_S, MEMORY_S, SILENCE_S, not_following, silent
 from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
@@ -58,6 +56,7 @@ from stereoservo.core.prediction import (
     camera_chi2,
     gate_threshold,
     improbable,
+    rows_in_use,
     used_rows,
 )
 from stereoservo.core.settings import CoreSettings
@@ -364,40 +363,6 @@ def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -
     return FOLLOWS
 
 
-@kernel
-def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tuple[int, float]:
-    """The joint that lacks most of its travel, over what is ``allowed`` (n,), and how much, with its sign; -1: none.
-
-    What it was sent as of ``now`` and as of its delay (``late``, (n,) each) bounds where it should be.
-    """
-    worst, most = -1, 1.0
-    missing = 0.0
-    for j in range(allowed.shape[0]):
-        beyond = min(abs(now[j]), abs(late[j])) if now[j] * late[j] > 0.0 else 0.0
-        if beyond > most * allowed[j]:
-            worst, most, missing = j, beyond / allowed[j], math.copysign(beyond, now[j])
-    return worst, missing
-
-
-@kernel
-def account_silence(
-    q: FloatArray, velocity: FloatArray, answers: FloatArray, friction: FloatArray, dt_s: float,
-    silent_from: FloatArray, silent_travel: FloatArray, silent_s: FloatArray,
-) -> None:  # fmt: skip
-    """Add up what each joint was sent (``velocity`` (n,), as it arrives), and for how long, since its reading changed.
-
-    ``friction`` (n,) may hold the rest back.
-    """
-    for j in range(q.shape[0]):
-        if abs(q[j] - silent_from[j]) > answers[j]:
-            silent_from[j], silent_travel[j], silent_s[j] = q[j], 0.0, 0.0
-            continue
-        felt = velocity[j] - min(max(velocity[j], -friction[j]), friction[j])
-        silent_travel[j] += felt * dt_s
-        if felt != 0.0:
-            silent_s[j] += dt_s
-
-
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
     """The arm has met something: it stops with its drives on, as if a person had stopped it."""
     reason = detect_collision(context.state, context.settings, context.derived.room, context.ingested.joints)
@@ -460,61 +425,84 @@ LATEST_MODEL_PX = 0.1
 """What the model may be off by besides, at the latest."""
 
 
+NOISE = ModelDiagnosis()
+"""Of a round that needs no explanation."""
+QUIET = [NOISE] * OF
+"""Verdicts of the last rounds, where none needed one."""
+
+
 def finish_round(context: StepContext) -> ModelDiagnosis | None:
     """Finish a round where one is complete; the new verdict where it has changed."""
-    watching, arrays = context.state.watching, context.arrays
+    state, arrays = context.state, context.arrays
+    watching = state.watching
     if arrays is None:
         return None
     if not watching.due:
         for sighting in watching.sightings:
             if sighting.looked:
                 return None
-    if context.state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
+    if state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED:
         return None  # joints that a faulty drive tells are no measure of cameras
     watching.due = False
-    known = []
-    for c, (camera, sighting) in enumerate(zip(context.settings.cameras, watching.sightings, strict=True)):
-        age_s = (context.now_ns - sighting.t_ns) * 1e-9
-        recent = not sighting.looked or age_s * camera.rate_hz <= STALE_PERIODS
-        mobile = context.state.mobile[c]
-        if recent and sighting.t_ns > 0 and not (mobile is not None and mobile.moving):
-            known.append(c)
-        sighting.looked = True
-    if not known:
+    moving = moving_camera.moving_bits(state) if any(state.mobile) else 0
+    looked_at, odd, masked = judge_round(
+        state.block.record, context.derived.room.record, context.now_ns, watching.masked, moving
+    )
+    if not looked_at:
         return None
     watching.rounds += 1
-    proven = context.state.reanchoring is not None
-    watching.last = [
-        *watching.last[1 - OF :],
-        _judged(watching, known, arrays, context.settings, proven=proven),
-    ]
-    if watching.masked.any():
-        unmask_returned(watching, known, context)
+    if not odd and not masked and watching.last == QUIET and watching.verdict == NOISE:
+        return None
+    verdict = NOISE
+    if odd and not _all_late(_cameras(odd), watching, context.settings):
+        bench = bench_now(watching, _cameras(looked_at), arrays, context.settings)
+        verdict = diagnosed_beside_joint_errors(bench, proven=state.reanchoring is not None)
+    watching.last = [*watching.last[1 - OF :], verdict]
+    if masked:
+        unmask_returned(watching, _cameras(looked_at), context)
     return _changed(watching)
 
 
-def _judged(
-    watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings, *, proven: bool
-) -> ModelDiagnosis:
-    """What one round says, of the cameras ``known``. ``proven``: that a camera has moved."""
-    suspicious = False
-    for c in known:
-        sighting = watching.sightings[c]
-        used = used_rows(watching, sighting)
-        likely = _likely(sighting.innovation, sighting.spread, used, settings)
-        suspicious |= not (likely or _late(sighting, used, settings))
-    if not suspicious:
-        return ModelDiagnosis()
-    return diagnosed_beside_joint_errors(bench_now(watching, known, arrays, settings), proven=proven)
+def _cameras(bits: int) -> list[int]:
+    """Numbers of the cameras that ``bits`` stands for."""
+    return [c for c in range(bits.bit_length()) if bits >> c & 1]
 
 
-def _likely(
-    innovation: FloatArray, spread: FloatArray, used: FloatArray, settings: CoreSettings,
-    model_px: float = MODEL_SIGMA_PX,
-) -> bool:  # fmt: skip
-    """Whether innovations (k, 2) look like noise, all together and each of them."""
-    chi2, _, _, largest, count = camera_chi2(innovation, spread, used, model_px)
-    return chi2 <= improbable(2.0 * count) and largest <= gate_threshold(settings.gate_sigma)
+@kernel
+def judge_round(
+    block: Record, room: Record, now_ns: int, masked: FloatArray, moving: int
+) -> tuple[int, int, bool]:
+    """Look at the newest frame of each camera: those that are recent, and of them those whose innovations do not look
+    like noise, all together and each of them; and whether any marker is ``masked`` (m,) > 0.
+
+    Cameras are bits of a number, as are those that are ``moving``, which are left out.
+    """
+    memory, work = block[0], room[0]
+    rows = memory.rows
+    known = odd = 0
+    for c in range(memory.cameras):
+        frame, bit = memory.sightings[c], 1 << c
+        age_s = (now_ns - frame.t_ns) * 1e-9
+        recent = not frame.looked or age_s * work.camera_rates[c] <= STALE_PERIODS
+        frame.looked = True
+        if not recent or frame.t_ns <= 0 or moving & bit:
+            continue
+        known |= bit
+        at, end = rows * c, rows * (c + 1)
+        chi2, _, _, largest, count = camera_chi2(
+            memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2)),
+            memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2)),
+            rows_in_use(memory.frame_seen[at:end], masked), MODEL_SIGMA_PX,
+        )  # fmt: skip
+        if not (chi2 <= work.noise_chi2[count] and largest <= work.gate):
+            odd |= bit
+    return known, odd, bool((masked > 0.0).any())
+
+
+def _all_late(cameras: list[int], watching: ModelMonitor, settings: CoreSettings) -> bool:
+    """Whether the newest frame of each of these ``cameras`` is `_late`."""
+    frames = [watching.sightings[c] for c in cameras]
+    return all(_late(frame, used_rows(watching, frame), settings) for frame in frames)
 
 
 def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
@@ -531,7 +519,8 @@ def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> 
         return False
     rest = sighting.innovation - late_s * sighting.velocity
     model_px = MODEL_SIGMA_PX if abs(late_s) <= LATE_S else LATEST_MODEL_PX
-    return _likely(rest, sighting.spread, used, settings, model_px)
+    chi2, _, _, largest, count = camera_chi2(rest, sighting.spread, used, model_px)
+    return bool(chi2 <= improbable(2.0 * count) and largest <= gate_threshold(settings.gate_sigma))
 
 
 def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:

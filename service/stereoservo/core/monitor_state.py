@@ -1,5 +1,5 @@
-"""State of the monitors between steps: fault diagnosis of the model, innovations and timing of each camera, moving
-cameras, relocalization of cameras, averages of pixels at rest.
+"""State of the monitors between steps: fault diagnosis of the model, moving cameras, relocalization of cameras,
+averages of pixels at rest.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from stereoservo.core.camera_state import CameraMonitor
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
@@ -47,38 +48,6 @@ class ModelDiagnosis(msgspec.Struct, frozen=True):
     unit: str = ""
     moved_px: float = 0.0
     text: str = ""
-
-
-class CameraTiming(msgspec.Struct, eq=False):
-    """Sums over frames of one camera: ``product`` of velocities and innovations, ``square`` of velocities, weighted."""
-
-    product: float = 0.0
-    square: float = 0.0
-    seen_ns: int = 0
-
-
-class CameraMonitor(msgspec.Struct, eq=False):
-    """The newest frame of one camera against the prediction at its shutter: markers of the model, then static points.
-
-    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0, ``velocity`` (k, 2)
-    [px/s]; joints ``q`` (n,); ``timing``: what moving markers have said of the stamps.
-    ``fresh``: it came in this step; ``looked``: a round has looked at it. ``chi2`` a freedom, ``rms_px`` and the
-    ``worst`` row are its own.
-    """
-
-    innovation: FloatArray
-    spread: FloatArray
-    seen: FloatArray
-    velocity: FloatArray
-    q: FloatArray
-    timing: CameraTiming = msgspec.field(default_factory=CameraTiming)
-    t_ns: int = 0
-    fresh: bool = False
-    looked: bool = True
-    chi2: float = 0.0
-    rms_px: float = 0.0
-    worst: int = -1
-    worst_px: float = 0.0
 
 
 class ModelMonitor(msgspec.Struct, eq=False):
@@ -169,18 +138,7 @@ class Relocalization(msgspec.Struct, eq=False, kw_only=True):
 def nothing_sighted(cameras: int, rows: int, joints: int, markers: int) -> ModelMonitor:
     """A watch that has seen nothing: ``rows`` markers and static points, of them ``markers`` of the model."""
     return ModelMonitor(
-        [
-            CameraMonitor(
-                np.zeros((rows, 2)),
-                np.zeros((rows, 2, 2)),
-                np.zeros(rows),
-                np.zeros((rows, 2)),
-                np.zeros(joints),
-            )
-            for _ in range(cameras)
-        ],
-        np.zeros(markers),
-        np.zeros(markers, np.int64),
+        [CameraMonitor(rows, joints) for _ in range(cameras)], np.zeros(markers), np.zeros(markers, np.int64)
     )
 
 

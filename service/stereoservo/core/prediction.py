@@ -14,9 +14,10 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law import Scene
+from stereoservo.core.camera_state import CameraEstimate, CameraMonitor
 from stereoservo.core.model_arrays import ModelArrays, with_unit_height
-from stereoservo.core.monitor_state import CameraMonitor, ModelMonitor
-from stereoservo.core.state import CameraEstimate, JointHistory, ServoGoal
+from stereoservo.core.monitor_state import ModelMonitor
+from stereoservo.core.state import JointHistory, ServoGoal
 from stereoservo.kinematics.kernels import (
     chain_forward,
     distortion_jacobian,
@@ -102,16 +103,6 @@ def predict_into(
     """`predict_markers` into the last four. To Python, an array that is returned costs more than one passed."""
     found = predict_markers(generators, kinds, zero, q, tip_first, marker_points, matrices)
     operators[:], points[:], pixels[:], jacobian[:] = found
-
-
-def room(joints: int, cameras: int, markers: int) -> Prediction:
-    """Arrays for a prediction, to be filled."""
-    return Prediction(
-        np.empty((joints, 4, 4)),
-        np.empty((markers, 4)),
-        np.empty((cameras, markers, 2)),
-        np.empty((cameras, markers, 2, joints)),
-    )
 
 
 @kernel
@@ -206,12 +197,13 @@ def rows_of(ids: IntArray, known: IntArray, rows: IntArray) -> IntArray:
 
 def used_rows(watching: ModelMonitor, sighting: CameraMonitor) -> FloatArray:
     """(k,) 1 for what is seen and has not slipped."""
-    used: FloatArray = _used_rows(sighting.seen, watching.masked)
+    used: FloatArray = rows_in_use(sighting.seen, watching.masked)
     return used
 
 
 @kernel
-def _used_rows(seen: FloatArray, masked: FloatArray) -> FloatArray:
+def rows_in_use(seen: FloatArray, masked: FloatArray) -> FloatArray:
+    """(k,) 1 for what is ``seen`` (k,) and, of the markers, not ``masked`` (m,)."""
     used = seen.copy()
     for i in range(masked.size):
         used[i] *= 1.0 - masked[i]

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from stereoservo.core.camera_state import CameraTiming
 from stereoservo.core.context import COMPILING, SourceOutput, StepContext
 from stereoservo.core.cycle import Event, Status, StepOutputs
 from stereoservo.core.estimate import masked_ids
@@ -15,17 +16,17 @@ from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
 from stereoservo.core.limit import SafetyResult
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays
-from stereoservo.core.monitor_state import CameraTiming, ModelDiagnosis
+from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import TIMING_SIGMA_S, Prediction, propagate_covariance
-from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState
+from stereoservo.core.state import CoreState
+from stereoservo.core.workspace import LENS_SIZE
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
 from stereoservo.messages.reasons import Level, Reason
 from stereoservo.messages.status import CameraHealth, Health, Lifecycle, ModelReadiness
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import Prior
 
@@ -141,13 +142,11 @@ def _priors(context: StepContext) -> tuple[Prior, ...]:
     state, arrays, prediction = context.state, context.derived.arrays, context.prediction
     if prediction is None or arrays is None or state.step % context.derived.prior_every:
         return ()
-    cameras = state.cameras
+    moving: list[int] = []
     unknown: tuple[str, ...] = ()
     if state.reanchoring is not None or any(state.mobile):
-        arrays, prediction, cameras, unknown = moving_camera.to_look_from(arrays, context)
-    return priors(
-        arrays, context.settings, prediction, cameras, state.block.velocities, context.now_ns, unknown
-    )
+        prediction, moving, unknown = moving_camera.to_look_from(arrays, context)
+    return priors(arrays, context, prediction, moving, unknown)
 
 
 def _level(reasons: tuple[Reason, ...]) -> str:
@@ -248,53 +247,66 @@ def advice(timing: CameraTiming) -> str:
 
 
 def priors(
-    arrays: ModelArrays, settings: CoreSettings, prediction: Prediction, cameras: list[CameraEstimate],
-    velocities: FloatArray, now_ns: int, unknown: tuple[str, ...] = (),
+    arrays: ModelArrays, context: StepContext, prediction: Prediction, moving: list[int], unknown: tuple[str, ...]
 ) -> tuple[Prior, ...]:  # fmt: skip
     """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back.
 
-    None for cameras of whose place nothing is known: their detectors look in the whole image.
+    What cameras that are ``moving`` saw before is no matter. None for cameras of whose place nothing is known: their
+    detectors look in the whole image.
     """
+    state, room, now_ns = context.state, context.derived.room, context.now_ns
+    shape = prediction.pixels.shape
+    pixels, speed, covariance = np.empty(shape), np.empty(shape), np.empty((*shape, 2))
+    if arrays.joint_accuracy is not None:
+        room.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
+    beyond = expect_sights(
+        state.block.record, room.record, now_ns, prediction.pixels, prediction.jacobian,
+        sum([1 << c for c in moving]), pixels, speed, covariance,
+    )  # fmt: skip
     found = []
-    for camera, estimate in enumerate(cameras):
-        if settings.cameras[camera].name in unknown:
+    for c, (camera, estimate) in enumerate(zip(context.settings.cameras, state.cameras, strict=True)):
+        if camera.name in unknown:
             continue
-        jacobian = prediction.jacobian[camera]
-        ids, markers = arrays.ids, arrays.ids.size
-        pixels, speed, covariance, seen = (
-            np.empty((markers, 2)),
-            np.empty((markers, 2)),
-            np.empty((markers, 2, 2)),
-            np.empty(markers, np.bool_),
-        )
-        all_seen = _expected(
-            prediction.pixels[camera], jacobian, velocities, estimate.innovation, now_ns, estimate.seen_ns,
-            _unseen_sigma(jacobian, arrays), arrays.lenses[camera], pixels, speed, covariance, seen,
-        )  # fmt: skip
-        if not all_seen:  # markers beyond the fold of the camera's lens are left out
-            ids, pixels, speed, covariance = ids[seen], pixels[seen], speed[seen], covariance[seen]
         # The vision process asks for the stamps that the camera tells.
-        stamp_ns = now_ns - estimate.offset_ns
-        found.append(Prior(settings.cameras[camera].name, stamp_ns, ids, pixels, speed, covariance))
+        shown = arrays.ids, pixels[c], speed[c], covariance[c]
+        if beyond >> c & 1:
+            within = np.isfinite(pixels[c]).all(axis=-1)
+            shown = arrays.ids[within], pixels[c][within], speed[c][within], covariance[c][within]
+        found.append(Prior(camera.name, now_ns - estimate.offset_ns, *shown))
     return tuple(found)
 
 
 @kernel
-def _expected(
-    predicted: FloatArray, jacobian: FloatArray, velocities: FloatArray, innovation: FloatArray, now_ns: int,
-    seen_ns: IntArray, unseen_px: FloatArray, lens: FloatArray, pixels: FloatArray, speed: FloatArray,
-    covariance: FloatArray, seen: BoolArray,
-) -> bool:  # fmt: skip
-    """Into the last four: `expected_sights_into` as the camera's lens shows them, and which of them (m,) lie within its
-    fold; whether all do.
+def expect_sights(
+    block: Record, room: Record, now_ns: int, predicted: FloatArray, jacobian: FloatArray, moving: int,
+    pixels: FloatArray, speed: FloatArray, covariance: FloatArray,
+) -> int:  # fmt: skip
+    """Into the last three, (c, m, …): `expected_sights_into` of all cameras, as their lenses show them. As bits of a
+    number, the cameras with markers beyond the folds of their lenses; pixels of these are no numbers.
+
+    ``predicted`` (c, m, 2) with its ``jacobian`` (c, m, 2, n). Cameras whose bits are set in ``moving`` have seen
+    nothing of late.
     """
-    expected_sights_into(
-        predicted, jacobian, velocities, innovation, now_ns, seen_ns, unseen_px, pixels, speed, covariance
-    )
-    if lens.size == 4 and lens[0] == 0.0:
-        return True
-    pixels[:], speed[:], covariance[:], seen[:] = distort_expected(lens, pixels, speed, covariance)
-    return bool(seen.all())
+    memory, work = block[0], room[0]
+    m, lens_size = memory.markers, work.lens_size
+    beyond = 0
+    for c in range(memory.cameras):
+        at, end = m * c, m * (c + 1)
+        seen_ns = memory.seen_ns[at:end]
+        if moving & (1 << c):
+            seen_ns = np.zeros(m, np.int64)
+        expected_sights_into(
+            predicted[c], jacobian[c], memory.velocities[: memory.joints],
+            memory.innovation[2 * at : 2 * end].reshape((m, 2)), now_ns, seen_ns, work.unseen_px[at:end], pixels[c],
+            speed[c], covariance[c],
+        )  # fmt: skip
+        lens = work.lenses[LENS_SIZE * c : LENS_SIZE * c + lens_size]
+        if lens_size == 4 and lens[0] == 0.0:
+            continue
+        pixels[c], speed[c], covariance[c], seen = distort_expected(lens, pixels[c], speed[c], covariance[c])
+        if not seen.all():
+            beyond |= 1 << c
+    return beyond
 
 
 @kernel
@@ -329,9 +341,7 @@ LARGEST_WINDOW_PX = 20.0
 
 
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
-    """Deviations (m,) [px] of markers that were not seen of late, by their ``jacobian`` (m, 2, n)."""
-    if arrays.joint_accuracy is None:
-        return arrays.unseen_px
+    """Deviations (c, m) [px] of markers that were not seen of late, by their ``jacobian`` (c, m, 2, n)."""
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
     return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
 

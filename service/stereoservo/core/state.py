@@ -7,12 +7,12 @@ from __future__ import annotations
 from typing import Literal
 
 import msgspec
-import numpy as np
 
 from stereoservo.control.face_choice import FaceChoice
 from stereoservo.control.faces import Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
-from stereoservo.core.block import SIGHTS, Block, steps_of_delay
+from stereoservo.core.block import Block, steps_of_delay
+from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.cycle import WayFrame
 from stereoservo.core.monitor_state import (
     MobileCamera,
@@ -40,30 +40,6 @@ class JointHistory(msgspec.Struct, eq=False):
     t_ns: IntArray
     positions: FloatArray
     count: int = 0
-
-
-class CameraEstimate(msgspec.Struct, eq=False):
-    """What one camera said, per marker of the model.
-
-    ``innovation`` (m, 2) [px]: filtered difference observed - predicted; ``sigma`` (m,) [px] of one observation;
-    ``seen_ns`` (m,): shutter time of the last accepted sight, 0 = never.
-    """
-
-    innovation: FloatArray
-    sigma: FloatArray
-    seen_ns: IntArray
-    last_seq: int = -1
-    last_visible: int = 0
-    accepted_ns: int = 0
-    """Shutter time of the last frame with three or more accepted markers."""
-    frames: int = 0
-    rejected_frames: int = 0
-    """Consecutive frames of which the gate refused more than half of the markers."""
-    agreeing_frames: int = 0
-    """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
-    rms_px: float = 0.0
-    offset_ns: int = 0
-    """By which its shutter opens later than its stamps tell, as far as known."""
 
 
 class Refused(msgspec.Struct, eq=False):
@@ -436,13 +412,14 @@ class CoreState(msgspec.Struct, eq=False):
 def initial_state(settings: CoreSettings) -> CoreState:
     """The state before the first step: nothing known, nothing allowed."""
     n = len(settings.joint_names)
-    return CoreState(
+    state = CoreState(
         version=STATE_VERSION,
         block=Block(
             {
                 "joints": n,
                 "cameras": len(settings.cameras),
                 "markers": 0,
+                "rows": 0,
                 "window": 1 if settings.contact is None else settings.contact.samples,
                 "past": steps_of_delay(settings.rate_hz),
             }
@@ -455,7 +432,7 @@ def initial_state(settings: CoreSettings) -> CoreState:
         pending_model=None,
         refused_joints=Refused(),
         refused_frames=[Refused() for _ in settings.cameras],
-        cameras=[camera_estimate(0) for _ in settings.cameras],
+        cameras=[CameraEstimate(0) for _ in settings.cameras],
         source=Holding(),
         queue=[],
         queued_until_ns={},
@@ -476,23 +453,17 @@ def initial_state(settings: CoreSettings) -> CoreState:
         mobile=[None for _ in settings.cameras],
         adjusted=(),
     )
-
-
-def camera_estimate(markers: int, offset_ns: int = 0) -> CameraEstimate:
-    """An estimate that has seen nothing, for ``markers`` markers; ``offset_ns``: of the shutter stamps."""
-    return CameraEstimate(
-        innovation=np.zeros((markers, 2)), sigma=np.ones(markers), seen_ns=np.zeros(markers, np.int64),
-        offset_ns=offset_ns,
-    )  # fmt: skip
+    share_sights(state)
+    return state
 
 
 def share_sights(state: CoreState) -> None:
-    """The sights of the cameras lie in the block from here on, of which each camera has its row."""
-    block = state.block
-    markers = state.cameras[0].sigma.size if state.cameras else 0
-    block.begin_sights(markers)
-    for c, camera in enumerate(state.cameras):
-        for name in SIGHTS:
-            row = getattr(block, name)[c]
-            row[:] = getattr(camera, name)
-            setattr(camera, name, row)
+    """What is known of the cameras, and their newest frames, lie in the block from here on."""
+    block, frames = state.block, state.watching.sightings
+    markers, rows = (state.cameras[0].sigma.size, frames[0].seen.size) if frames else (0, 0)
+    block.begin_sights(markers, rows)
+    for here, camera in zip(block.estimates, state.cameras, strict=True):
+        here.become(camera)
+    for seen, frame in zip(block.sightings, frames, strict=True):
+        seen.become(frame)
+    state.cameras, state.watching.sightings = block.estimates, block.sightings

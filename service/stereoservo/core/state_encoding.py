@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 
 from stereoservo.core.block import Block, restored
+from stereoservo.core.camera_state import CameraEstimate, CameraMonitor, CameraTiming, camera_read
 from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_sights
 
@@ -31,14 +32,21 @@ class _Versioned(msgspec.Struct):
     version: int
 
 
+KEPT = (Block, CameraEstimate, CameraMonitor, CameraTiming)
+"""What is written out by its ``kept``."""
+
+
 def _encode_hook(value: object) -> object:
-    return value.kept() if isinstance(value, Block) else encode_array(value)
+    return value.kept() if isinstance(value, KEPT) else encode_array(value)
 
 
 def _decode_hook(kind: type, value: Any) -> object:
-    if kind is not Block:
+    if kind not in KEPT:
         return decode_array(kind, value)
-    return restored({name: decode_array(kind, v) if isinstance(v, list) else v for name, v in value.items()})
+    if not isinstance(value, dict):
+        raise TypeError(f"a {kind.__name__} that is a {type(value).__name__}")
+    kept = {name: decode_array(kind, v) if isinstance(v, list) else v for name, v in value.items()}
+    return restored(kept) if kind is Block else camera_read(kind, kept)
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_encode_hook)

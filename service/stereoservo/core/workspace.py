@@ -12,9 +12,19 @@ import numpy as np
 from stereoservo.core.block import JOINTS, Shapes, packed_type, views
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitors.following import LAG_S, of_kinds
-from stereoservo.core.prediction import SEEN_SLACK_NS, Prediction
+from stereoservo.core.prediction import (
+    SEEN_SLACK_NS,
+    FrameResiduals,
+    Prediction,
+    gate_threshold,
+    improbable,
+)
 from stereoservo.core.settings import CoreSettings
+from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.numerics.arrays import FloatArray
+
+LENS_SIZE = 7
+"""Numbers of a lens, at most."""
 
 
 class Numbers(ctypes.Structure):
@@ -25,6 +35,10 @@ class Numbers(ctypes.Structure):
     tip_first: int
     worst: int
     missing: float
+    lens_size: int
+    known_s: float
+    filter_s: float
+    gate: float
     _fields_ = [
         (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
         for name, kind in __annotations__.items()
@@ -36,11 +50,18 @@ ARRAYS: Shapes = {
     "effort_limits": JOINTS, "following_limits": JOINTS, "stated_effort_limits": JOINTS,
     "stated_following_limits": JOINTS, "generators": ("joints", 4, 4), "kinds": JOINTS, "zero": JOINTS,
     "marker_points": ("markers", 4), "matrices": ("cameras", 3, 4),
+    "lenses": ("cameras", LENS_SIZE), "scene_pixels": ("cameras", "rows", 2), "row_ids": ("rows",), "row_of": ("rows",),
+    "camera_rates": ("cameras",), "noise_chi2": (MAX_MARKERS + 1,),
     "sample": (4, "joints"), "operators": ("joints", 4, 4), "points": ("markers", 4),
     "predicted": ("cameras", "markers", 2), "jacobian": ("cameras", "markers", 2, "joints"),
     "weights": ("cameras", "markers"), "pixels": ("cameras", "markers", 2),
+    "frame_q": JOINTS, "frame_innovation": ("rows", 2), "frame_spread": ("rows", 2, 2), "frame_noise": ("rows",),
+    "frame_seen": ("rows",), "frame_velocity": ("rows", 2), "unseen_px": ("cameras", "markers"),
 }  # fmt: skip
-WORKSPACE = packed_type(Numbers, ARRAYS, {"kinds": np.uint8})
+OTHER_TYPES = {"kinds": np.uint8, "row_ids": np.int64, "row_of": np.int64, "frame_seen": np.uint8}
+WORKSPACE = packed_type(Numbers, ARRAYS, OTHER_TYPES, {})
+NOISE_CHI2 = np.array([improbable(2.0 * count) for count in range(MAX_MARKERS + 1)])
+"""Of so many markers: what `improbable` says of a frame that is nothing but noise."""
 Limits = tuple[FloatArray, FloatArray]
 
 
@@ -49,23 +70,35 @@ class Workspace:
 
     Of the settings: ``period_s`` of the loop; ``velocity_max`` (n,); the ``lag`` [rad or m] of a healthy joint's drive
     and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for how long a sight has a weight,
-    ``lasting_ns``. Limits (n,) of efforts and following errors: of the model, and those that the cell file states. Of
-    the model: as in `ModelArrays`.
+    ``lasting_ns``; of a frame's gate: the squared distance ``gate``, for how long an innovation is known, ``known_s``,
+    and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,). Limits (n,) of efforts and following
+    errors: of the model, and those that the cell file states. Of the model: as in `ModelArrays`, its lenses of
+    ``lens_size`` numbers.
 
     Of a step: the ``sample`` (4, n) of the joints (positions, velocities, efforts, following errors), the fields of its
     ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2), and the joint that follows ``worst``, with what it is
-    ``missing``.
+    ``missing``. Of the frame that was looked at last: joints ``frame_q`` (n,), what `residuals` gives, and until the
+    present is there the prediction of its camera alone, ``of_frame``.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
         self.record: np.ndarray[Any, Any] = np.zeros(1, WORKSPACE)
-        self._counts = {"joints": len(settings.joint_names), "cameras": len(settings.cameras), "markers": 0}
+        self._counts = {
+            "joints": len(settings.joint_names),
+            "cameras": len(settings.cameras),
+            "markers": 0,
+            "rows": 0,
+        }
         self._arrays: dict[str, Any] = {}
         self._view()
         self.numbers = Numbers.from_buffer(self.record.view(np.uint8).data)
         self.numbers.period_s = 1.0 / settings.rate_hz
         self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
+        self.numbers.known_s, self.numbers.filter_s = settings.limits.coast_s + 1.0, settings.filter_s
+        self.numbers.gate = gate_threshold(settings.gate_sigma)
         given = self._arrays
+        given["noise_chi2"][:] = NOISE_CHI2
+        given["camera_rates"][:] = [camera.rate_hz for camera in settings.cameras]
         given["velocity_max"][:] = settings.limits.velocity_max
         given["lag"][:] = LAG_S * settings.limits.velocity_max
         given["play"][:], given["answers"][:], given["friction"][:] = of_kinds(
@@ -83,11 +116,14 @@ class Workspace:
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""
-        self._counts["markers"] = len(arrays.marker_points)
+        self._counts["markers"], self._counts["rows"] = len(arrays.marker_points), len(arrays.row_ids)
         self._view()
-        self.numbers.tip_first = arrays.tip_first
-        for name in ("generators", "kinds", "zero", "marker_points", "matrices"):
+        self.numbers.tip_first, self.numbers.lens_size = arrays.tip_first, arrays.lenses.shape[1]
+        for name in ("generators", "kinds", "zero", "marker_points", "matrices", "row_ids", "row_of"):
             self._arrays[name][:] = getattr(arrays, name)
+        self._arrays["lenses"][:, : arrays.lenses.shape[1]] = arrays.lenses
+        self._arrays["scene_pixels"][:, : len(arrays.scene_points)] = arrays.scene_pixels
+        self.unseen_px[:] = arrays.unseen_px
 
     def _view(self) -> None:
         given = self._arrays = views(self.record, ARRAYS, self._counts)
@@ -99,3 +135,16 @@ class Workspace:
         self.prediction = Prediction(
             given["operators"], given["points"], given["predicted"], given["jacobian"]
         )
+        self.of_frame = Prediction(
+            given["operators"], given["points"], given["predicted"][:1], given["jacobian"][:1]
+        )
+        self.frame_q: FloatArray = given["frame_q"]
+        self.unseen_px: FloatArray = given["unseen_px"]
+
+    def residuals(self, t_shutter_ns: int) -> FrameResiduals:
+        """The frame that was looked at last."""
+        given = self._arrays
+        return FrameResiduals(
+            t_shutter_ns, given["frame_innovation"], given["frame_spread"], given["frame_noise"],
+            given["frame_seen"].view(np.bool_), given["frame_velocity"],
+        )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Joints that do not follow: bounds and reasons of the watch in `core.monitor`.
+"""Joints that do not follow: bounds, sums and reasons of the watch in `core.monitor`.
 
 What a joint was sent is compared with its reading as of now and as of its drive's delay (`core.move.measure_delays`),
 and what lies between the two is not missing.
@@ -6,6 +6,7 @@ and what lies between the two is not missing.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from stereoservo.core.settings import CoreSettings
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import kernel
 
 MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
 LAG_S = 0.15  # a healthy drive lags by less than this at full speed
@@ -63,3 +65,37 @@ def silent(joint: int, sent: float, since_s: float, settings: CoreSettings) -> R
         f"the reading of joint {name} stood still for {since_s:.2f} s while it was sent {sent:+.3f} {unit} of travel "
         f"(up to {limit:g} may be play): check its encoder, brake and drive; then reset and enable",
     )  # fmt: skip
+
+
+@kernel
+def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tuple[int, float]:
+    """The joint that lacks most of its travel, over what is ``allowed`` (n,), and how much, with its sign; -1: none.
+
+    What it was sent as of ``now`` and as of its delay (``late``, (n,) each) bounds where it should be.
+    """
+    worst, most = -1, 1.0
+    missing = 0.0
+    for j in range(allowed.shape[0]):
+        beyond = min(abs(now[j]), abs(late[j])) if now[j] * late[j] > 0.0 else 0.0
+        if beyond > most * allowed[j]:
+            worst, most, missing = j, beyond / allowed[j], math.copysign(beyond, now[j])
+    return worst, missing
+
+
+@kernel
+def account_silence(
+    q: FloatArray, velocity: FloatArray, answers: FloatArray, friction: FloatArray, dt_s: float,
+    silent_from: FloatArray, silent_travel: FloatArray, silent_s: FloatArray,
+) -> None:  # fmt: skip
+    """Add up what each joint was sent (``velocity`` (n,), as it arrives), and for how long, since its reading changed.
+
+    ``friction`` (n,) may hold the rest back.
+    """
+    for j in range(q.shape[0]):
+        if abs(q[j] - silent_from[j]) > answers[j]:
+            silent_from[j], silent_travel[j], silent_s[j] = q[j], 0.0, 0.0
+            continue
+        felt = velocity[j] - min(max(velocity[j], -friction[j]), friction[j])
+        silent_travel[j] += felt * dt_s
+        if felt != 0.0:
+            silent_s[j] += dt_s

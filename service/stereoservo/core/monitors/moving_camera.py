@@ -50,7 +50,7 @@ from stereoservo.core.prediction import (
     predict,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState, Holding, camera_estimate
+from stereoservo.core.state import CoreState, Holding
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.kinematics.kernels import (
     exp_twist,
@@ -362,36 +362,32 @@ def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
 # -- what others ask ------------------------------------------------------------------------------------------
 
 
-def to_look_from(
-    arrays: ModelArrays, context: StepContext
-) -> tuple[ModelArrays, Prediction, list[CameraEstimate], tuple[str, ...]]:
-    """For the priors: the model and its prediction with moving cameras where they are now, what cameras said, and
-    those of whose place nothing is known.
+def to_look_from(arrays: ModelArrays, context: StepContext) -> tuple[Prediction, list[int], tuple[str, ...]]:
+    """For the priors: the prediction with moving cameras where they are now, which these are, and the names of those
+    of whose place nothing is known.
     """
     state, settings = context.state, context.settings
     assert context.prediction is not None
     unknown = unknown_cameras(state)
     moving = [c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving]
     if not moving:
-        return arrays, context.prediction, state.cameras, unknown
-    matrices, cameras = arrays.matrices.copy(), list(state.cameras)
+        return context.prediction, moving, unknown
+    matrices = arrays.matrices.copy()
     for c in moving:
         mobile = state.mobile[c]
         assert mobile is not None
         matrices[c] = moved_matrix(arrays.matrices[c], mobile.way)
-        cameras[c] = camera_estimate(len(arrays.marker_ids), cameras[c].offset_ns)
         if mobile.place == "lost":
             unknown = (*unknown, settings.cameras[c].name)
-    here = _arrays_with(arrays, matrices)
-    corrected = predict(here, context.q + state.block.correction)
+    corrected = predict(_arrays_with(arrays, matrices), context.q + state.block.correction)
     pixels, jacobian = context.prediction.pixels.copy(), context.prediction.jacobian.copy()
     pixels[moving], jacobian[moving] = corrected.pixels[moving], corrected.jacobian[moving]
-    return (
-        here,
-        msgspec.structs.replace(context.prediction, pixels=pixels, jacobian=jacobian),
-        cameras,
-        unknown,
-    )
+    return msgspec.structs.replace(context.prediction, pixels=pixels, jacobian=jacobian), moving, unknown
+
+
+def moving_bits(state: CoreState) -> int:
+    """The cameras that move now, as bits of a number."""
+    return sum(1 << c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving)
 
 
 def moving_cameras(state: CoreState, settings: CoreSettings) -> tuple[str, ...]:

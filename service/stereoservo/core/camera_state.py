@@ -1,0 +1,132 @@
+"""What is known of each camera from step to step: its estimate and its newest frame. Both are numbers and arrays that
+lie in the block (`core.block`), where kernels have them by the number of the camera.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+_KINDS: Mapping[str, Any] = {"int": ctypes.c_int64, "float": ctypes.c_double, "bool": ctypes.c_bool}
+
+
+class _Kept(ctypes.Structure):
+    """Numbers with their arrays, all of which are written out by name, in the order of the class."""
+
+    def kept(self) -> dict[str, Any]:
+        """All of it by name."""
+        return {name: getattr(self, name) for name in type(self).__annotations__}
+
+    def count_as(self, other: Self) -> None:
+        """Have the numbers of another one."""
+        ctypes.memmove(ctypes.byref(self), ctypes.byref(other), ctypes.sizeof(self))
+
+    def become(self, other: Self) -> None:
+        """Have numbers and arrays of another one, of the same size. Raises ValueError."""
+        self.count_as(other)
+        for name, array in vars(self).items():
+            array[:] = getattr(other, name)
+
+
+class CameraEstimate(_Kept):
+    """What one camera said, per marker of the model.
+
+    ``innovation`` (m, 2) [px]: filtered difference observed - predicted; ``sigma`` (m,) [px] of one observation;
+    ``seen_ns`` (m,): shutter time of the last accepted sight, 0 = never.
+    """
+
+    innovation: FloatArray
+    sigma: FloatArray
+    seen_ns: IntArray
+    last_seq: int
+    last_visible: int
+    accepted_ns: int
+    """Shutter time of the last frame with three or more accepted markers."""
+    frames: int
+    rejected_frames: int
+    """Consecutive frames of which the gate refused more than half of the markers."""
+    agreeing_frames: int
+    """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
+    rms_px: float
+    offset_ns: int
+    """By which its shutter opens later than its stamps tell, as far as known."""
+    _fields_ = [(name, _KINDS[kind]) for name, kind in __annotations__.items() if kind in _KINDS]
+
+    def __init__(self, markers: int, offset_ns: int = 0) -> None:
+        """Nothing seen, with ``markers`` markers; ``offset_ns``: of the shutter stamps."""
+        super().__init__(last_seq=-1, offset_ns=offset_ns)
+        self.innovation, self.sigma = np.zeros((markers, 2)), np.ones(markers)
+        self.seen_ns = np.zeros(markers, np.int64)
+
+
+class CameraTiming(_Kept):
+    """Sums over frames of one camera: ``product`` of velocities and innovations, ``square`` of velocities, weighted."""
+
+    product: float
+    square: float
+    seen_ns: int
+    _fields_ = [(name, _KINDS[kind]) for name, kind in __annotations__.items()]
+
+
+class CameraMonitor(_Kept):
+    """The newest frame of one camera against the prediction at its shutter: markers of the model, then static points.
+
+    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0, ``velocity`` (k, 2)
+    [px/s]; joints ``q`` (n,); ``timing``: what moving markers have said of the stamps.
+    ``fresh``: it came in this step; ``looked``: a round has looked at it. ``chi2`` a freedom, ``rms_px`` and the
+    ``worst`` row are its own.
+    """
+
+    innovation: FloatArray
+    spread: FloatArray
+    seen: FloatArray
+    velocity: FloatArray
+    q: FloatArray
+    timing: CameraTiming
+    t_ns: int
+    fresh: bool
+    looked: bool
+    chi2: float
+    rms_px: float
+    worst: int
+    worst_px: float
+    _fields_ = [
+        *((name, _KINDS[kind]) for name, kind in __annotations__.items() if kind in _KINDS),
+        ("timing", CameraTiming),
+    ]
+
+    def __init__(self, rows: int, joints: int) -> None:
+        """Nothing seen of ``rows`` markers and static points."""
+        super().__init__(looked=True, worst=-1)
+        self.innovation, self.spread, self.seen = np.zeros((rows, 2)), np.zeros((rows, 2, 2)), np.zeros(rows)
+        self.velocity, self.q = np.zeros((rows, 2)), np.zeros(joints)
+
+
+NOTHING_KNOWN, NOTHING_SEEN = CameraEstimate(0), CameraMonitor(0, 0)
+"""Not to be written to."""
+
+
+def camera_read(kind: type, kept: Mapping[str, Any]) -> CameraEstimate | CameraMonitor:
+    """The estimate or the frame of which `kept` wrote ``kept``; numbers that it does not name are as in the beginning.
+    Raises ValueError, TypeError where it is none.
+    """
+    sizes = ("sigma",) if kind is CameraEstimate else ("seen", "q")
+    if not all(isinstance(kept.get(name), np.ndarray) for name in sizes):
+        raise ValueError(f"a camera without {' and '.join(sizes)}")
+    found: CameraEstimate | CameraMonitor = kind(*(len(kept[name]) for name in sizes))
+    for name, array in vars(found).items():
+        if getattr(kept.get(name), "shape", None) != array.shape:
+            raise ValueError(f"a camera without {name} of shape {array.shape}")
+        array[:] = kept[name]
+    for name, value in kept.items():
+        if name == "timing":
+            for number, told in value.items():
+                setattr(found.timing, number, told)
+        elif name in type(found).__annotations__ and name not in vars(found):
+            setattr(found, name, value)
+    return found
