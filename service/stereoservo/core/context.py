@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -15,10 +15,12 @@ import numpy as np
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitor_state import ModelMonitor
 from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.core.workspace import Workspace
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Health
@@ -51,8 +53,12 @@ class Derived:
     room: Workspace
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
-    health: tuple[object, Health] | None = None
+    health: tuple[tuple[Any, ...], Health] | None = None
     """What the status last said of the model's health, and of what."""
+    watched: ModelMonitor | None = None
+    """The watch over the model that this was, whose frames alone change it."""
+    masked: tuple[bytes, CellModel | None, tuple[int, ...]] | None = None
+    """Markers that are not used, as the status last named them: marks, model and ids."""
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""

@@ -41,53 +41,46 @@ def report(
         finish(motion, context)
     state.step += 1
     return StepOutputs(
-        command=state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
-        status=_status(context, motion, limited),
-        priors=_priors(context),
-        events=tuple(events),
-        driver_request=state.driver_request,  # type: ignore[arg-type]
+        state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
+        _status(context, motion, limited),
+        () if state.step % context.derived.prior_every else _priors(context),
+        tuple(events),
+        state.driver_request,  # type: ignore[arg-type]
     )
 
 
 def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
-    state, settings, block = context.state, context.settings, context.state.block
-    masked = masked_ids(state)
+    """The status, its fields in their order: an argument by name costs as much as an array."""
+    state, derived, block = context.state, context.derived, context.state.block
+    masked = _shown_masked(context)
     diagnosis = shown_diagnosis(state.watching.verdict, masked)
+    source, kind = state.source, MOTION_SOURCES[type(state.source)]
     reasons = _reasons(context, motion, limited, diagnosis)
-    effort_limits, following_limits = context.derived.load_limits or (None, None)
-    source = MOTION_SOURCES[type(state.source)]
-    done, left_s = (None, None) if source.progress is None else source.progress(state.source, context)
+    done, left_s = (None, None) if kind.progress is None else kind.progress(source, context)
     innovation_px, visible = {}, {}
-    for camera, estimate in zip(settings.cameras, state.cameras, strict=True):
+    for camera, estimate in zip(context.settings.cameras, state.cameras, strict=True):
         innovation_px[camera.name] = estimate.rms_px
         visible[camera.name] = estimate.last_visible
+    numbers, (effort_limits, following_limits) = block.numbers, derived.load_limits or (None, None)
+    model_epoch = 0 if state.model is None else state.model.epoch
+    efforts = block.efforts.copy() if numbers.tells_efforts else None
+    following_errors = block.following_errors.copy() if numbers.tells_following else None
     return Status(
-        t_ns=context.now_ns,
-        step=state.step,
-        lifecycle=str(state.lifecycle),
-        model=str(state.readiness),
-        model_epoch=0 if state.model is None else state.model.epoch,
-        source=source.name,
-        goal=source.subject(state.source),
-        law=source.law(state.source),
-        level=_level(reasons),
-        reasons=reasons,
-        positions=context.q,
-        velocities=state.block.velocities.copy(),
-        command_raw=motion.velocity,
-        command=state.block.command.copy(),
-        error_px=motion.error_px,
-        task_error=motion.task_error,
-        innovation_px=innovation_px,
-        visible=visible,
-        progress=done,
-        seconds_left=left_s,
-        efforts=block.efforts.copy() if block.numbers.tells_efforts else None,
-        following_errors=block.following_errors.copy() if block.numbers.tells_following else None,
-        effort_limits=effort_limits,
-        following_limits=following_limits,
-        health=_health(context, diagnosis, masked),
-    )
+        context.now_ns, state.step, str(state.lifecycle), str(state.readiness), model_epoch, kind.name,
+        kind.subject(source), kind.law(source), _level(reasons), reasons, context.q, block.velocities.copy(),
+        motion.velocity, block.command.copy(), motion.error_px, motion.task_error, innovation_px, visible, done, left_s,
+        efforts, following_errors, effort_limits, following_limits, _health(context, diagnosis, masked),
+    )  # fmt: skip
+
+
+def _shown_masked(context: StepContext) -> tuple[int, ...]:
+    """`masked_ids`, read anew where the marks or the model are others than in the step before."""
+    state, derived = context.state, context.derived
+    told = state.watching.masked.tobytes(), state.model
+    known = derived.masked
+    if known is None or known[0] != told[0] or known[1] is not told[1]:
+        known = derived.masked = (*told, masked_ids(state))
+    return known[2]
 
 
 def _reasons(
@@ -95,7 +88,10 @@ def _reasons(
 ) -> tuple[Reason, ...]:
     """Why the arm does not do what its source wants, or may not soon."""
     state = context.state
-    found = [*state.fault, *limited.reasons, *motion.reasons, *_refused_inputs(state)]
+    found = [*state.fault, *limited.reasons, *motion.reasons]
+    for refused in (state.refused_joints, *state.refused_frames):
+        if refused.reason is not None and not _latched(refused.reason, state):
+            found.append(refused.reason)
     if state.reanchoring is not None:
         found.extend(camera_relocalization.reasons(state))
     if any(state.mobile):
@@ -122,18 +118,10 @@ def _reasons(
     return tuple(found)
 
 
-def _refused_inputs(state: CoreState) -> list[Reason]:
-    """Why samples are refused, but for what already stands as the reason of a stop."""
+def _latched(reason: Reason, state: CoreState) -> bool:
+    """Whether that is refused which already stands as the reason of a stop."""
     latched = state.stop_reason if state.stopped else None
-    found = []
-    for refused in (state.refused_joints, *state.refused_frames):
-        reason = refused.reason
-        if reason is None or (
-            latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
-        ):
-            continue
-        found.append(reason)
-    return found
+    return latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
 
 
 def _priors(context: StepContext) -> tuple[Prior, ...]:
@@ -176,6 +164,17 @@ def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, 
     model = state.model
     if model is None or state.readiness == ModelReadiness.NONE:
         return NO_HEALTH
+    known = derived.health
+    if (
+        known is not None
+        and not context.observations
+        and state.reanchoring is None
+        and known[0][:4] == (model.epoch, diagnosis, masked, "")
+        and state.watching is derived.watched
+        and not any(state.mobile)
+    ):
+        return known[1]
+    derived.watched = state.watching
     reanchoring = "" if state.reanchoring is None else state.reanchoring.phase
     facts = [
         (s.chi2, s.rms_px, s.worst, s.worst_px, s.timing.product, s.timing.square)
