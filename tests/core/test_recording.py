@@ -109,7 +109,7 @@ def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
 
     bench = benches(3, noise_px=0.1)
     bench.ready()
-    raising = dataclasses.replace(LAWS[DEFAULT_LAW], step=step)
+    raising = dataclasses.replace(LAWS[DEFAULT_LAW], step=step, kernel=None)
     monkeypatch.setitem(LAWS.usable(), DEFAULT_LAW, raising)
     target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
     goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(target)))
@@ -132,7 +132,7 @@ def test_a_law_whose_numbers_are_of_another_type_compiles_nothing_in_the_loop(
         return found._replace(velocity=velocity)
 
     compiled = []
-    for number, used in enumerate((law, dataclasses.replace(law, step=step))):
+    for number, used in enumerate((law, dataclasses.replace(law, step=step, kernel=None))):
         monkeypatch.setitem(LAWS.usable(), DEFAULT_LAW, used)
         bench = benches(3, noise_px=0.1).ready()
         target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])

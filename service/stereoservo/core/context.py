@@ -18,7 +18,7 @@ from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelMonitor
 from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CoreState
+from stereoservo.core.state import CameraEstimate, CoreState
 from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
@@ -57,6 +57,10 @@ class Derived:
     """What the status last said of the model's health, and of what."""
     watched: ModelMonitor | None = None
     """The watch over the model that this was, whose frames alone change it."""
+    seen: tuple[list[CameraEstimate], dict[str, float], dict[str, int]] | None = None
+    """What the status last said of each camera, by name: of which estimates, their innovation, the markers visible."""
+    friction_bounds: tuple[CellModel | None, FloatArray, FloatArray] | None = None
+    """Largest compensation and least travel of the joints (n,), as of `core.move`, and the model by which they are."""
     masked: tuple[bytes, CellModel | None, tuple[int, ...]] | None = None
     """Markers that are not used, as the status last named them: marks, model and ids."""
 
@@ -89,6 +93,7 @@ class StepContext(msgspec.Struct, eq=False):
     `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
     ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) need a model. `move` sets ``paused``: the active source had
     to wait, and with late drives ``outermost`` (n,): where joints are, or will be, farthest towards where they go.
+    ``features_ns``: shutter time of the newest frame with accepted markers, 0 before the first.
     ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
     """
 
@@ -108,6 +113,7 @@ class StepContext(msgspec.Struct, eq=False):
     pixels: FloatArray | None = None
     paused: bool = False
     outermost: FloatArray | None = None
+    features_ns: int = 0
     goals_read: list[str] = []
 
 

@@ -75,6 +75,11 @@ class SafetyLimits:
         """The joints' limits as the kernel takes them (4, n): smallest and largest position, velocity, acceleration."""
         return np.array([self.position_min, self.position_max, self.velocity_max, self.acceleration_max])
 
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Likewise the margin of positions, and the longest ages of joints and features: fresh ones, and at all."""
+        return np.array([self.position_margin, self.joint_timeout_s, self.features_fresh_s, self.coast_s])
+
     def __post_init__(self) -> None:
         n = len(self.joint_names)
         for name in ("position_min", "position_max", "velocity_max", "acceleration_max"):
@@ -150,8 +155,8 @@ class SafetyResult(msgspec.Struct, frozen=True, eq=False):
 
     raw: FloatArray
     limited: FloatArray
-    reasons: tuple[Reason, ...]
-    braking: bool
+    reasons: tuple[Reason, ...] = ()
+    braking: bool = False
 
 
 def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
@@ -167,7 +172,7 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
     """
     raw, positions, previous = inputs.raw, inputs.positions, inputs.previous
     n = len(limits.joint_names)
-    if raw.shape != (n,) or positions.shape != (n,) or previous.shape != (n,):
+    if not raw.shape == positions.shape == previous.shape == (n,):
         raise SafetyConfigurationError(
             f"raw {raw.shape}, positions {positions.shape}, previous {previous.shape}; each must be ({n},)"
         )
@@ -175,29 +180,22 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
         raise SafetyConfigurationError(
             f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
         )
-    reasons: list[Reason] = []
-    brake, timeout_s, age_s = inputs.brake, limits.joint_timeout_s, inputs.joint_age_s
-    if not 0.0 <= age_s <= timeout_s:
-        age_s = timeout_s
-        brake = _stale(inputs, limits, reasons) or brake
-    elif inputs.needs_features and not 0.0 <= inputs.feature_age_s <= limits.features_fresh_s:
-        brake = _stale(inputs, limits, reasons) or brake
-    speed_scale = min(max(inputs.speed_scale, 0.0), 1.0) if math.isfinite(inputs.speed_scale) else 0.0
-    limited, found = np.empty(n), np.empty(n + 5)
-    if limit_velocity(
-        raw, positions, previous, brake, inputs.dt_s, age_s, speed_scale, limits.table, limits.position_margin,
-        limits.keep_outs, limited, found,
+    limited, found = np.empty(n), np.empty(n + 6)
+    if not limit_velocity(
+        raw, positions, previous, inputs.brake, inputs.dt_s, inputs.joint_age_s, inputs.feature_age_s,
+        inputs.needs_features, inputs.speed_scale, limits.table, limits.bounds, limits.keep_outs, limited, found,
     ):  # fmt: skip
-        brake = _tell(inputs, limits, speed_scale, limited, found.tolist(), brake, reasons)
-    return SafetyResult(raw, limited, tuple(reasons), brake)
+        return SafetyResult(raw, limited)
+    return _explained(inputs, limits, limited, found.tolist())
 
 
-def _tell(
-    inputs: SafetyInputs, limits: SafetyLimits, speed_scale: float, limited: FloatArray, found: list[float],
-    brake: bool, reasons: list[Reason],
-) -> bool:  # fmt: skip
-    """Append why a command was changed, by what `limit_velocity` ``found``; whether the stage brakes."""
-    finite, scale, scaled_by, share, shared_by, *acted = found
+def _explained(
+    inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: list[float]
+) -> SafetyResult:
+    """The result with its reasons, by what `limit_velocity` ``found``."""
+    reasons: list[Reason] = []
+    brake = _stale(inputs, limits, reasons) or inputs.brake
+    finite, speed_scale, scale, scaled_by, share, shared_by, *acted = found
     if not finite:
         brake = True
         _tell_non_finite(inputs.raw, inputs.positions, limits, reasons)
@@ -230,22 +228,19 @@ def _tell(
                 "passes by itself",
             )
         )
-    return brake
+    return SafetyResult(inputs.raw, limited, tuple(reasons), brake)
 
 
 def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> SafetyResult:
     """Stage 6: the source's velocity within all limits; it becomes the command, zero outside ACTIVE."""
     state, block, now_ns = context.state, context.state.block, context.now_ns
-    newest_ns = 0
-    for estimate in state.cameras:
-        newest_ns = max(newest_ns, estimate.accepted_ns)
     inputs = SafetyInputs(
         motion.velocity,
         context.q if context.outermost is None else context.outermost,
         block.command,
         context.dt_s,
         (now_ns - block.numbers.last_joints_ns) * 1e-9,
-        (now_ns - newest_ns) * 1e-9,
+        (now_ns - context.features_ns) * 1e-9,
         motion.needs_features,
         motion.speed_scale * context.settings.limits.speed_scale,
         context.paused,
@@ -506,21 +501,29 @@ def _velocity_scale(
 
 @kernel
 def limit_velocity(
-    raw: FloatArray, positions: FloatArray, previous: FloatArray, brake: bool, dt: float, sample_age: float,
-    speed_scale: float, table: FloatArray, margin: float, keep_outs: FloatArray, limited: FloatArray,
-    found: FloatArray,
+    raw: FloatArray, positions: FloatArray, previous: FloatArray, brake: bool, dt: float, joint_age: float,
+    feature_age: float, needs_features: bool, speed_scale: float, table: FloatArray, bounds: FloatArray,
+    keep_outs: FloatArray, limited: FloatArray, found: FloatArray,
 ) -> bool:  # fmt: skip
-    """Braking, velocity, positions and keep-outs, acceleration, in this order; whether there is anything to tell.
+    """Staleness, braking, velocity, positions and keep-outs, acceleration, in this order; whether there is anything to
+    tell.
 
-    ``table``, ``margin``, ``keep_outs``: see `SafetyLimits`. Where ``raw`` or ``positions`` are not finite it brakes,
-    too. Into the last two arguments the limited velocity (n,), and (5 + n,): whether all was finite; velocity scale, its
-    joint, acceleration share, its joint, -1 for none; and who has acted on each joint: 0 nobody, 1 position limit, 2 + k
-    keep-out k.
+    ``table``, ``bounds``, ``keep_outs``: see `SafetyLimits`. Where ``raw`` or ``positions`` are not finite it brakes,
+    too. Into the last two arguments the limited velocity (n,), and (6 + n,): whether all was finite; the speed scale
+    that holds; velocity scale, its joint, acceleration share, its joint, -1 for none; and who has acted on each joint:
+    0 nobody, 1 position limit, 2 + k keep-out k.
     """
+    margin, timeout, fresh, coast = bounds[0], bounds[1], bounds[2], bounds[3]
     limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)
+    told, sample_age = brake, joint_age
+    if not 0.0 <= joint_age <= timeout:
+        brake, sample_age = True, timeout
+    if needs_features and not 0.0 <= feature_age <= fresh:
+        told, brake = True, brake or not 0.0 <= feature_age <= coast
+    speed_scale = min(max(speed_scale, 0.0), 1.0) if math.isfinite(speed_scale) else 0.0
     velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
     n = raw.shape[0]
-    acted = found[5:]
+    acted = found[6:]
     finite = True
     for j in range(n):
         acted[j] = 0.0
@@ -568,8 +571,9 @@ def limit_velocity(
         elif limited[j] < low[j]:
             limited[j] = max(limited[j], min(low[j], before[j] + step))
             acted[j] = low_by[j] + 2
-    told = brake or scaled_by >= 0 or shared_by >= 0
+    told = told or brake or scaled_by >= 0 or shared_by >= 0
     for j in range(n):
         told = told or acted[j] != 0.0
-    found[0], found[1], found[2], found[3], found[4] = 1.0 if finite else 0.0, scale, scaled_by, share, shared_by
+    found[0], found[1] = 1.0 if finite else 0.0, speed_scale
+    found[2], found[3], found[4], found[5] = scale, scaled_by, share, shared_by
     return told

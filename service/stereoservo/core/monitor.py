@@ -553,11 +553,22 @@ def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
     return None
 
 
-def _monitor_model(context: StepContext) -> Iterator[Finding]:
+def _monitor_model(context: StepContext) -> Findings:
     """Images that contradict the model for many frames make it SUSPECT; ones that agree with it clear it."""
     state = context.state
     if state.reanchoring is not None:
-        return
+        return ()
+    if state.readiness != ModelReadiness.SUSPECT:
+        for estimate in state.cameras:
+            if estimate.rejected_frames >= SUSPECT_FRAMES:
+                break
+        else:
+            return ()
+    return _judge_model(context)
+
+
+def _judge_model(context: StepContext) -> Iterator[Finding]:
+    state = context.state
     if state.readiness == ModelReadiness.SUSPECT and state.model is not None:
         if min(estimate.agreeing_frames for estimate in state.cameras) >= TRUSTED_FRAMES:
             state.readiness = fitted_readiness(state.model)

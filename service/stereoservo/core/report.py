@@ -57,10 +57,10 @@ def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -
     source, kind = state.source, MOTION_SOURCES[type(state.source)]
     reasons = _reasons(context, motion, limited, diagnosis)
     done, left_s = (None, None) if kind.progress is None else kind.progress(source, context)
-    innovation_px, visible = {}, {}
-    for camera, estimate in zip(context.settings.cameras, state.cameras, strict=True):
-        innovation_px[camera.name] = estimate.rms_px
-        visible[camera.name] = estimate.last_visible
+    seen = derived.seen
+    if context.observations or seen is None or seen[0] is not state.cameras:
+        seen = derived.seen = _seen(context)
+    _, innovation_px, visible = seen
     numbers, (effort_limits, following_limits) = block.numbers, derived.load_limits or (None, None)
     model_epoch = 0 if state.model is None else state.model.epoch
     efforts = block.efforts.copy() if numbers.tells_efforts else None
@@ -71,6 +71,13 @@ def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -
         motion.velocity, block.command.copy(), motion.error_px, motion.task_error, innovation_px, visible, done, left_s,
         efforts, following_errors, effort_limits, following_limits, _health(context, diagnosis, masked),
     )  # fmt: skip
+
+
+def _seen(context: StepContext) -> tuple[list[CameraEstimate], dict[str, float], dict[str, int]]:
+    """The cameras' estimates, and of each camera, by name: the innovation [px], and the markers visible."""
+    estimates, names = context.state.cameras, context.derived.cameras
+    innovation_px = {name: estimates[c].rms_px for name, c in names.items()}
+    return estimates, innovation_px, {name: estimates[c].last_visible for name, c in names.items()}
 
 
 def _shown_masked(context: StepContext) -> tuple[int, ...]:
