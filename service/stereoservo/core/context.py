@@ -15,7 +15,7 @@ import numpy as np
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.monitor_state import ModelMonitor
+from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CameraEstimate, CoreState
@@ -55,14 +55,12 @@ class Derived:
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
     """What the status last said of the model's health, and of what."""
-    watched: ModelMonitor | None = None
-    """The watch over the model that this was, whose frames alone change it."""
     seen: tuple[list[CameraEstimate], dict[str, float], dict[str, int]] | None = None
     """What the status last said of each camera, by name: of which estimates, their innovation, the markers visible."""
     friction_bounds: tuple[CellModel | None, FloatArray, FloatArray] | None = None
     """Largest compensation and least travel of the joints (n,), as of `core.move`, and the model by which they are."""
-    masked: tuple[bytes, CellModel | None, tuple[int, ...]] | None = None
-    """Markers that are not used, as the status last named them: marks, model and ids."""
+    model_health: tuple[tuple[object, ...], bytes, tuple[ModelDiagnosis, Health]] | None = None
+    """The diagnosis and the health that the status last showed: of what, and with which markers left out."""
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""

@@ -76,6 +76,11 @@ class SafetyLimits:
         return np.array([self.position_min, self.position_max, self.velocity_max, self.acceleration_max])
 
     @cached_property
+    def found(self) -> FloatArray:
+        """Room for what `limit_velocity` finds in a step (6 + n,)."""
+        return np.empty(6 + len(self.joint_names))
+
+    @cached_property
     def bounds(self) -> FloatArray:
         """Likewise the margin of positions, and the longest ages of joints and features: fresh ones, and at all."""
         return np.array([self.position_margin, self.joint_timeout_s, self.features_fresh_s, self.coast_s])
@@ -180,7 +185,7 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
         raise SafetyConfigurationError(
             f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
         )
-    limited, found = np.empty(n), np.empty(n + 6)
+    limited, found = np.empty(n), limits.found
     if not limit_velocity(
         raw, positions, previous, inputs.brake, inputs.dt_s, inputs.joint_age_s, inputs.feature_age_s,
         inputs.needs_features, inputs.speed_scale, limits.table, limits.bounds, limits.keep_outs, limited, found,

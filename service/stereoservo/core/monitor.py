@@ -296,11 +296,13 @@ def detect_following_error(
     ``LAG_S`` at full speed, beside what its drive's delay explains. What is sent to a joint whose reading stands still
     is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new sample nothing is concluded.
     """
-    block, numbers, commanded = state.block, room.numbers, state.block.command
+    block, numbers = state.block, room.numbers
     if sent is not None and sent.shape == q.shape and np.isfinite(sent).all():
-        commanded, block.command[:] = commanded.copy(), sent
-    found = account_following(block.record, room.record, q, dt_s)
-    block.command[:] = commanded
+        commanded, block.command[:] = block.command.copy(), sent
+        found = account_following(block.record, room.record, q, dt_s)
+        block.command[:] = commanded
+    else:
+        found = account_following(block.record, room.record, q, dt_s)
     if found == FOLLOWS:
         return None
     joint = numbers.worst

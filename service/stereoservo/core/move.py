@@ -51,6 +51,7 @@ from stereoservo.core.state import (
     ServoGoal,
     Source,
 )
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
@@ -246,7 +247,10 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
         known = state.friction = FrictionCompensation(
             subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
         )
-    most, travel = _friction_bounds(context)
+    bounds = context.derived.friction_bounds
+    if bounds is None or bounds[0] is not state.model:
+        bounds = context.derived.friction_bounds = _friction_bounds(context)
+    _, most, travel = bounds
     looks = context.ingested.joints is not None and (
         not output.needs_features
         or (context.now_ns - context.features_ns) * 1e-9 <= context.derived.features_fresh_s
@@ -263,17 +267,11 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
     )  # fmt: skip
 
 
-def _friction_bounds(context: StepContext) -> tuple[FloatArray, FloatArray]:
-    """`_bounds` by the model in use."""
-    model, derived, settings = context.state.model, context.derived, context.settings
-    known = derived.friction_bounds
-    if known is None or known[0] is not model:
-        inexact = model is not None and model.joint_accuracy is not None
-        known = derived.friction_bounds = (
-            model,
-            *_bounds(settings.joint_kinds, settings.resolution, inexact),
-        )
-    return known[1], known[2]
+def _friction_bounds(context: StepContext) -> tuple[CellModel | None, FloatArray, FloatArray]:
+    """The model in use, and `_bounds` by it."""
+    model, settings = context.state.model, context.settings
+    inexact = model is not None and model.joint_accuracy is not None
+    return model, *_bounds(settings.joint_kinds, settings.resolution, inexact)
 
 
 @kernel

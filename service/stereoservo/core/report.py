@@ -5,6 +5,7 @@ model health and the estimated time offset of each camera.
 from __future__ import annotations
 
 import math
+from operator import is_
 
 import numpy as np
 
@@ -52,8 +53,7 @@ def report(
 def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
     """The status, its fields in their order: an argument by name costs as much as an array."""
     state, derived, block = context.state, context.derived, context.state.block
-    masked = _shown_masked(context)
-    diagnosis = shown_diagnosis(state.watching.verdict, masked)
+    diagnosis, health = _model_health(context)
     source, kind = state.source, MOTION_SOURCES[type(state.source)]
     reasons = _reasons(context, motion, limited, diagnosis)
     done, left_s = (None, None) if kind.progress is None else kind.progress(source, context)
@@ -69,7 +69,7 @@ def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -
         context.now_ns, state.step, str(state.lifecycle), str(state.readiness), model_epoch, kind.name,
         kind.subject(source), kind.law(source), _level(reasons), reasons, context.q, block.velocities.copy(),
         motion.velocity, block.command.copy(), motion.error_px, motion.task_error, innovation_px, visible, done, left_s,
-        efforts, following_errors, effort_limits, following_limits, _health(context, diagnosis, masked),
+        efforts, following_errors, effort_limits, following_limits, health,
     )  # fmt: skip
 
 
@@ -80,14 +80,27 @@ def _seen(context: StepContext) -> tuple[list[CameraEstimate], dict[str, float],
     return estimates, innovation_px, {name: estimates[c].last_visible for name, c in names.items()}
 
 
-def _shown_masked(context: StepContext) -> tuple[int, ...]:
-    """`masked_ids`, read anew where the marks or the model are others than in the step before."""
-    state, derived = context.state, context.derived
-    told = state.watching.masked.tobytes(), state.model
-    known = derived.masked
-    if known is None or known[0] != told[0] or known[1] is not told[1]:
-        known = derived.masked = (*told, masked_ids(state))
-    return known[2]
+def _model_health(context: StepContext) -> tuple[ModelDiagnosis, Health]:
+    """The diagnosis as it is shown, and what the status says of the model's health: those of the step before, where no
+    frame has come and nothing else that they follow from is another.
+    """
+    state, derived, watching = context.state, context.derived, context.state.watching
+    told = state.model, state.readiness, watching, watching.verdict
+    marks, known = watching.masked.tobytes(), derived.model_health
+    quiet = state.reanchoring is None and not any(state.mobile)
+    if (
+        known is not None
+        and quiet
+        and not context.observations
+        and all(map(is_, told, known[0]))
+        and marks == known[1]
+    ):
+        return known[2]
+    masked = masked_ids(state)
+    diagnosis = shown_diagnosis(watching.verdict, masked)
+    found = diagnosis, _health(context, diagnosis, masked)
+    derived.model_health = (told, marks, found) if quiet else None
+    return found
 
 
 def _reasons(
@@ -171,17 +184,6 @@ def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, 
     model = state.model
     if model is None or state.readiness == ModelReadiness.NONE:
         return NO_HEALTH
-    known = derived.health
-    if (
-        known is not None
-        and not context.observations
-        and state.reanchoring is None
-        and known[0][:4] == (model.epoch, diagnosis, masked, "")
-        and state.watching is derived.watched
-        and not any(state.mobile)
-    ):
-        return known[1]
-    derived.watched = state.watching
     reanchoring = "" if state.reanchoring is None else state.reanchoring.phase
     facts = [
         (s.chi2, s.rms_px, s.worst, s.worst_px, s.timing.product, s.timing.square)
