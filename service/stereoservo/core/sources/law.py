@@ -51,6 +51,8 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     if ended is not None:
         return ended
     scene, task = choose(source, context, *scene_and_task(source, context, arrays, found))
+    if not law.components:  # laws in the images work in all cameras, whatever a face shows them
+        scene = scene._replace(camera_centres=arrays.camera_centres)
     if law.planned:
         if source.plan is None and source.pose_known:
             hint = "the way is planned from where the arm comes to rest"
