@@ -296,13 +296,11 @@ def detect_following_error(
     ``LAG_S`` at full speed, beside what its drive's delay explains. What is sent to a joint whose reading stands still
     is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new sample nothing is concluded.
     """
-    block, numbers = state.block, room.numbers
+    block, numbers, commanded = state.block, room.numbers, state.block.command
     if sent is not None and sent.shape == q.shape and np.isfinite(sent).all():
-        commanded, block.command[:] = block.command.copy(), sent
-        found = account_following(block.record, room.record, q, dt_s)
-        block.command[:] = commanded
-    else:
-        found = account_following(block.record, room.record, q, dt_s)
+        commanded, block.command[:] = commanded.copy(), sent
+    found = account_following(block.record, room.record, q, dt_s)
+    block.command[:] = commanded
     if found == FOLLOWS:
         return None
     joint = numbers.worst
@@ -555,22 +553,11 @@ def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
     return None
 
 
-def _monitor_model(context: StepContext) -> Findings:
+def _monitor_model(context: StepContext) -> Iterator[Finding]:
     """Images that contradict the model for many frames make it SUSPECT; ones that agree with it clear it."""
     state = context.state
     if state.reanchoring is not None:
-        return ()
-    if state.readiness != ModelReadiness.SUSPECT:
-        for estimate in state.cameras:
-            if estimate.rejected_frames >= SUSPECT_FRAMES:
-                break
-        else:
-            return ()
-    return _judge_model(context)
-
-
-def _judge_model(context: StepContext) -> Iterator[Finding]:
-    state = context.state
+        return
     if state.readiness == ModelReadiness.SUSPECT and state.model is not None:
         if min(estimate.agreeing_frames for estimate in state.cameras) >= TRUSTED_FRAMES:
             state.readiness = fitted_readiness(state.model)

@@ -30,13 +30,15 @@ from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step
 from stereoservo.core.sources.incidence import incidence_motion, incidence_report
 from stereoservo.core.sources.joint_move import joint_move_progress, joint_move_step, joint_report
-from stereoservo.core.sources.law import activate_run, awaits_plan, servo_step
-from stereoservo.core.sources.progress import (
+from stereoservo.core.sources.law import (
     Progress,
+    activate_run,
+    awaits_plan,
     progress_reasons,
     run_progress,
     servo_progress,
     servo_progress_reasons,
+    servo_step,
 )
 from stereoservo.core.state import (
     AwaitingAcknowledgement,

@@ -128,7 +128,7 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
 
 
 class ProgressHistory(msgspec.Struct, eq=False):
-    """What of a law's run tells whether it gets on; see `core.sources.progress`.
+    """What of a law's run tells whether it gets on; see `core.sources.law`.
 
     ``first_px``: the largest error so far; ``mean_px`` of late; ``least_px``: the smallest such mean, improved for the
     last time after ``least_s`` of motion. ``reasons``: what was found when it was last looked at.

@@ -5,20 +5,18 @@ step, as one flat record of fixed size. Nothing of it is remembered: it follows 
 from __future__ import annotations
 
 import ctypes
-from operator import is_
 from typing import Any
 
 import numpy as np
 
-from stereoservo.control.face_choice import FaceChoice, law_scene
-from stereoservo.control.law import LawStep, Scene, Task
+from stereoservo.control.face_choice import FaceChoice
+from stereoservo.control.law import Scene, Task
 from stereoservo.core.block import JOINTS, Shapes, packed_type, views
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitors.following import LAG_S, of_kinds
 from stereoservo.core.prediction import SEEN_SLACK_NS, Prediction
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import ServoGoal
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray
 
 
 class Numbers(ctypes.Structure):
@@ -60,7 +58,6 @@ ARRAYS: Shapes = {
 }  # fmt: skip
 WORKSPACE = packed_type(Numbers, ARRAYS, {"kinds": np.uint8, "face": np.int64, "component_status": np.int64})
 Limits = tuple[FloatArray, FloatArray]
-NOTHING, NO_STATUS = np.zeros(0), np.zeros(0, dtype=np.int64)
 
 
 class Workspace:
@@ -78,19 +75,20 @@ class Workspace:
     Of the goal that a law works on, as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are ``wanted``
     (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres ``eyes`` of the
     ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and ``centre`` now,
-    and whether an ``error_px`` was ``measured``. What a law finds: see `control.law.Law`.
+    and whether an ``error_px`` was ``measured``. What a law finds: see `control.law.Law`. ``arrays``: all of these by
+    name; ``scene`` and ``task``: those that laws take; ``aim`` and ``faced``: of which goal and face they are.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
         self.record: np.ndarray[Any, Any] = np.zeros(1, WORKSPACE)
         self._counts = {"joints": len(settings.joint_names), "cameras": len(settings.cameras), "markers": 0}
-        self._arrays: dict[str, Any] = {}
+        self.arrays: dict[str, Any] = {}
         self._view()
         self.numbers = Numbers.from_buffer(self.record.view(np.uint8).data)
         self.numbers.joints, self.numbers.cameras = self._counts["joints"], self._counts["cameras"]
         self.numbers.period_s = 1.0 / settings.rate_hz
         self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
-        given = self._arrays
+        given = self.arrays
         given["velocity_max"][:] = settings.limits.velocity_max
         given["lag"][:] = LAG_S * settings.limits.velocity_max
         given["play"][:], given["answers"][:], given["friction"][:] = of_kinds(
@@ -104,13 +102,13 @@ class Workspace:
         """Collision thresholds (n,), (n,) from here on; None: nothing reaches them."""
         self.watches_loads = limits is not None
         efforts, following = limits or (np.inf, np.inf)
-        self._arrays["effort_limits"][:], self._arrays["following_limits"][:] = efforts, following
+        self.arrays["effort_limits"][:], self.arrays["following_limits"][:] = efforts, following
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""
         self._counts["markers"] = len(arrays.marker_points)
         self._view()
-        numbers, given = self.numbers, self._arrays
+        numbers, given = self.numbers, self.arrays
         numbers.markers, numbers.tip_first = len(arrays.marker_points), arrays.tip_first
         numbers.composition = arrays.composition
         for name in ("generators", "kinds", "zero", "marker_points", "matrices", "camera_centres"):
@@ -124,55 +122,11 @@ class Workspace:
             given["set_points"], given["wanted"], given["no_rates"], given["target_points"], given["target_known"],
             given["centre"], given["centre_target"], given["face"],
         )  # fmt: skip
-        self._aim: tuple[Any, ...] = ()
-        self._faced: FaceChoice | None = None
-
-    def aim(self, goal: ServoGoal) -> None:
-        """Work on a ``goal`` from here on. Its arrays are replaced where it moves, and not written into."""
-        aim = (
-            goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
-            goal.centre_target, goal.pose_known,
-        )  # fmt: skip
-        if len(self._aim) == len(aim) and all(map(is_, aim, self._aim)):
-            return
-        self._aim, self._faced, given = aim, None, self._arrays
-        for name in (
-            "used",
-            "wanted",
-            "set_points",
-            "target_points",
-            "centre_weights",
-            "centre_body",
-            "centre_target",
-        ):
-            given[name][:] = getattr(goal, name)
-        given["target_known"][:] = goal.pose_known
-
-    def keep_in_sight(self, choice: FaceChoice) -> None:
-        """The law works on the face that was chosen, in the cameras that keep sight of it."""
-        if self._faced is choice:
-            return
-        self.face(choice.triple, law_scene(self.scene, choice).camera_centres)
-        self._faced = choice
-
-    def face(self, triple: IntArray, eyes: FloatArray) -> None:
-        """The law works on a face of three markers (3,), before cameras with these centres (k, 4)."""
-        self._faced, given = None, self._arrays
-        given["face"][:], given["eyes"][: len(eyes)] = triple, eyes
-        self.numbers.eye_count = len(eyes)
-
-    def law_step(self, components: int) -> LawStep:
-        """What the law's kernel has found, of so many components."""
-        given, numbers = self._arrays, self.numbers
-        velocity = self.velocity.copy()
-        if components == 0:
-            return LawStep(velocity, NOTHING, NOTHING, NO_STATUS, numbers.conditioning)
-        found = given["components"].reshape(-1)[: 2 * components].reshape(2, -1).copy()
-        status = given["component_status"][:components].copy()
-        return LawStep(velocity, found[0], found[1], status, numbers.conditioning)
+        self.aim: tuple[Any, ...] = ()
+        self.faced: FaceChoice | None = None
 
     def _view(self) -> None:
-        given = self._arrays = views(self.record, ARRAYS, self._counts)
+        given = self.arrays = views(self.record, ARRAYS, self._counts)
         self.sample: FloatArray = given["sample"]
         self.limits: Limits = given["effort_limits"], given["following_limits"]
         self.stated_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]

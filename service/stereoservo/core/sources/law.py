@@ -6,25 +6,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from operator import is_
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereoservo.control.face_choice import choose_face, law_scene
+from stereoservo.control.face_choice import FaceChoice, choose_face, law_scene
 from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene, Task
+from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
+from stereoservo.core.sources.progress import Traits, examine_progress
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
+from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, KindArray, Record
+from stereoservo.numerics.arrays import FloatArray, IntArray, KindArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
+AIM = (
+    "used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target",
+)  # fmt: skip
+"""Arrays of a goal that a law's kernel has in the workspace."""
 SELF_MOTION_RATE = 0.5
 """[1/s], of a joint's half range: how fast self-motion takes it from a limit."""
 
@@ -37,9 +45,8 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
         and source.stream is None
         and source.points == "predicted"
         and context.weights is not None
-        and context.weights
-        is context.derived.room.weights  # others in a step in which a camera's place is found
-    ):
+        and context.weights is context.derived.room.weights
+    ):  # the present is another in a step in which a camera's place is found
         return _compiled_step(source, context, law, law.kernel)
     arrays, prediction, pixels = context.arrays, context.prediction, context.pixels
     if arrays is None or prediction is None or context.weights is None or pixels is None:
@@ -80,7 +87,7 @@ def _compiled_step(
 ) -> SourceOutput:
     """`servo_step` of a goal that stands, by the ``kernel`` of its law."""
     room = context.derived.room
-    room.aim(source)
+    _aim(room, source)
     seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
     error_px = numbers.error_px if numbers.measured else None
     ended = run_ended(source, context, error_px, seen, source.wanted)
@@ -88,20 +95,52 @@ def _compiled_step(
         return ended
     if source.pose_known and (context.observations or source.choice.cameras == 0):
         scene, task = choose(source, context, room.scene, room.task)
-        room.face(task.face, scene.camera_centres)
-    else:
-        room.keep_in_sight(source.choice)
+        _face(room, task.face, scene.camera_centres)
+    elif room.faced is not source.choice:
+        eyes = law_scene(room.scene, source.choice).camera_centres
+        _face(room, source.choice.triple, eyes, source.choice)
     try:
         kernel(room.record, gain_now(source, error_px), context.dt_s, source.jacobian)
     except Exception as error:  # as any law: it ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
-    step = room.law_step(len(law.components))
+    step = _found_step(room, len(law.components))
     velocity = step.velocity
     if len(velocity) > RIGID_FREEDOMS:
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
         velocity, True, source.goal.speed_scale, False, False, error_px, step.error, law.reasons(step)
     )
+
+
+def _aim(room: Workspace, goal: ServoGoal) -> None:
+    """The law works on a ``goal``, whose arrays are replaced where it moves, and not written into."""
+    aim = (
+        goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
+        goal.centre_target, goal.pose_known,
+    )  # fmt: skip
+    if len(room.aim) == len(aim) and all(map(is_, aim, room.aim)):
+        return
+    room.aim, room.faced, given = aim, None, room.arrays
+    for name in AIM:
+        given[name][:] = getattr(goal, name)
+    given["target_known"][:] = goal.pose_known
+
+
+def _face(room: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
+    """The law works on a face of three markers (3,), before cameras with these centres (k, 4): as in the ``choice``."""
+    room.faced, given = choice, room.arrays
+    given["face"][:], given["eyes"][: len(eyes)] = triple, eyes
+    room.numbers.eye_count = len(eyes)
+
+
+def _found_step(room: Workspace, components: int) -> LawStep:
+    """What the law's kernel has found, of so many components."""
+    given, velocity = room.arrays, room.velocity.copy()
+    if components == 0:
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, room.numbers.conditioning)
+    found = given["components"].reshape(-1)[: 2 * components].reshape(2, -1).copy()
+    status = given["component_status"][:components].copy()
+    return LawStep(velocity, found[0], found[1], status, room.numbers.conditioning)
 
 
 class GoalError(NamedTuple):
@@ -411,3 +450,83 @@ def _planned_set_points(source: ServoGoal, scene: Scene) -> tuple[FloatArray, fl
     goal_pixels, _ = project_points(scene.matrices, source.target_points)
     given = source.wanted[..., None] > 0.0
     return pixels + share * np.where(given, source.set_points - goal_pixels, 0.0), share
+
+
+AVERAGED_S = 0.5
+"""Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
+SMALLER = 0.95
+"""Of the least mean error so far, below which it counts as smaller."""
+LOOK_EVERY_S = 0.2
+Progress = tuple[float | None, float | None]
+
+
+def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
+    """Share [0, 1] of the goal's path that is done, and the seconds left; None where that is not known."""
+    if source.error_px is None:
+        return None, None
+    if context.derived.laws[source.law].planned:
+        if source.plan is None:
+            return None, None
+        length_s = float(source.plan.times[-1])
+        if source.plan_s < length_s:
+            return source.plan_s / length_s, length_s - source.plan_s
+    if source.stream is not None:
+        return None, None
+    return run_progress(source, context)
+
+
+def run_progress(source: LawRun, context: StepContext) -> Progress:
+    """The same of any law, by the exponential decay of its error."""
+    if source.error_px is None:
+        return None, None
+    left_s = _decay_s(source, source.error_px)
+    whole_s = _decay_s(source, max(source.watch.first_px, source.error_px))
+    return (1.0 if whole_s <= 0.0 else 1.0 - left_s / whole_s), left_s
+
+
+def _decay_s(source: LawRun, error_px: float) -> float:
+    """Time in which an error decays to the tolerance at the slower of the goal's gains."""
+    return math.log(max(error_px / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+
+
+def servo_progress_reasons(
+    source: ServoGoal, context: StepContext, reported: tuple[Reason, ...]
+) -> tuple[Reason, ...]:
+    """The progress reasons of a goal in set-points."""
+    return progress_reasons(source, context, reported, _servo_traits)
+
+
+def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
+    local = source.law if context.derived.laws[source.law].path == "free" else ""
+    return _plain_traits(source, context)._replace(
+        wanted=source.wanted, moves=source.stream is not None, local_law=local
+    )
+
+
+def _plain_traits(source: LawRun, context: StepContext) -> Traits:
+    error = source.error_px
+    return Traits(gain_now(source, error), 0.0 if error is None else _decay_s(source, error))
+
+
+def progress_reasons(
+    source: LawRun,
+    context: StepContext,
+    told: tuple[Reason, ...],
+    traits: Callable[[Any, StepContext], Traits] = _plain_traits,
+) -> tuple[Reason, ...]:
+    """What a law's run shows over time beside the reasons ``told`` in this step; kept between two examinations."""
+    seen = source.watch
+    error = source.error_px
+    if error is not None:
+        seen.first_px = max(seen.first_px, error)
+        share = context.dt_s / (context.dt_s + AVERAGED_S)
+        seen.mean_px = error if seen.mean_px == 0.0 else seen.mean_px + share * (error - seen.mean_px)
+        if seen.least_px == 0.0 or seen.mean_px < SMALLER * seen.least_px or error <= source.tolerance_px:
+            seen.least_px, seen.least_s = max(seen.mean_px, 1e-9), source.moved_s
+    every = max(1, round(LOOK_EVERY_S / context.dt_s))
+    if context.state.step % every == 0:
+        seen.reasons = examine_progress(source, context, told, traits(source, context))
+    if not seen.reasons:
+        return ()
+    codes = {reason.code for reason in told}
+    return tuple(reason for reason in seen.reasons if reason.code not in codes)

@@ -1,31 +1,21 @@
-"""What a law's run shows over time: share of its path that is done, seconds left, and why it is slow or stuck."""
+"""Why a law's run is slow or stuck: what is found when its progress is looked at, a few times a second."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.core.context import StepContext
-from stereoservo.core.sources.law import gain_now
-from stereoservo.core.state import LawRun, ServoGoal
+from stereoservo.core.state import LawRun
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
 
-Progress = tuple[float | None, float | None]
-
 STUCK_S = 3.0
 """Time of motion without a smaller error after which a law is said to be stuck."""
-AVERAGED_S = 0.5
-"""Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
-SMALLER = 0.95
-"""Of the least mean error so far, below which it counts as smaller."""
-LOOK_EVERY_S = 0.2
 NEAR_LIMIT = 0.087
 """Room to a limit less its margin [rad or m] below which it is told: five degrees."""
 NEAR_SINGULAR = 2.0 * ILL_CONDITIONED
@@ -44,88 +34,24 @@ CAUSES = (
 """What may hold a law up, the most probable first."""
 
 
-def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
-    """Share [0, 1] of the goal's path that is done, and the seconds left; None where that is not known."""
-    if source.error_px is None:
-        return None, None
-    if context.derived.laws[source.law].planned:
-        if source.plan is None:
-            return None, None
-        length_s = float(source.plan.times[-1])
-        if source.plan_s < length_s:
-            return source.plan_s / length_s, length_s - source.plan_s
-    if source.stream is not None:
-        return None, None
-    return run_progress(source, context)
+class Traits(NamedTuple):
+    """Of a run its ``gain`` now and the time ``left_s`` in which its error decays; of its goal the set-points that
+    count (c, m), whether they move, a law that may rest in a minimum.
+    """
 
-
-def run_progress(source: LawRun, context: StepContext) -> Progress:
-    """The same of any law, by the exponential decay of its error."""
-    if source.error_px is None:
-        return None, None
-    left_s = _decay_s(source, source.error_px)
-    whole_s = _decay_s(source, max(source.watch.first_px, source.error_px))
-    return (1.0 if whole_s <= 0.0 else 1.0 - left_s / whole_s), left_s
-
-
-def _decay_s(source: LawRun, error_px: float) -> float:
-    """Time in which an error decays to the tolerance at the slower of the goal's gains."""
-    return math.log(max(error_px / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
-
-
-def servo_progress_reasons(
-    source: ServoGoal, context: StepContext, reported: tuple[Reason, ...]
-) -> tuple[Reason, ...]:
-    """The progress reasons of a goal in set-points."""
-    return progress_reasons(source, context, reported, _servo_traits)
-
-
-class _ProgressTraits(NamedTuple):
-    """What differs by goal: set-points that count (c, m), whether they move, a law that may rest in a minimum."""
-
+    gain: float
+    left_s: float
     wanted: FloatArray | None = None
     moves: bool = False
     local_law: str = ""
 
 
-def _servo_traits(source: ServoGoal, context: StepContext) -> _ProgressTraits:
-    local = source.law if context.derived.laws[source.law].path == "free" else ""
-    return _ProgressTraits(source.wanted, source.stream is not None, local)
-
-
-def _plain_traits(source: LawRun, context: StepContext) -> _ProgressTraits:
-    return _ProgressTraits()
-
-
-def progress_reasons(
-    source: LawRun,
-    context: StepContext,
-    told: tuple[Reason, ...],
-    traits: Callable[[Any, StepContext], _ProgressTraits] = _plain_traits,
-) -> tuple[Reason, ...]:
-    """What a law's run shows over time beside the reasons ``told`` in this step; kept between two examinations."""
-    seen = source.watch
-    error = source.error_px
-    if error is not None:
-        seen.first_px = max(seen.first_px, error)
-        share = context.dt_s / (context.dt_s + AVERAGED_S)
-        seen.mean_px = error if seen.mean_px == 0.0 else seen.mean_px + share * (error - seen.mean_px)
-        if seen.least_px == 0.0 or seen.mean_px < SMALLER * seen.least_px or error <= source.tolerance_px:
-            seen.least_px, seen.least_s = max(seen.mean_px, 1e-9), source.moved_s
-    every = max(1, round(LOOK_EVERY_S / context.dt_s))
-    if context.state.step % every == 0:
-        seen.reasons = _examine_progress(source, context, told, traits(source, context))
-    if not seen.reasons:
-        return ()
-    codes = {reason.code for reason in told}
-    return tuple(reason for reason in seen.reasons if reason.code not in codes)
-
-
-def _examine_progress(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: _ProgressTraits
+def examine_progress(
+    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
 ) -> list[Reason]:
+    """The reasons beside those that are ``told`` in this step, the gravest first."""
     found = [*_near_limits(context), *_near_singular(source, context), *_few_markers(source, context, traits)]
-    tail = _tail(source)
+    tail = _tail(source, traits)
     if tail is not None:
         found.append(tail)
     if not traits.moves:
@@ -170,7 +96,7 @@ def image_conditioning(context: StepContext, source: LawRun) -> float:
     return float(conditioning)
 
 
-def _few_markers(source: LawRun, context: StepContext, traits: _ProgressTraits) -> list[Reason]:
+def _few_markers(source: LawRun, context: StepContext, traits: Traits) -> list[Reason]:
     if context.weights is None:
         return []
     usable = context.weights * source.used[:, None]
@@ -183,14 +109,13 @@ def _few_markers(source: LawRun, context: StepContext, traits: _ProgressTraits) 
     return [Reason("FEW_MARKERS", "info", "", float(seen), float(FEW_MARKERS), "markers", hint)]
 
 
-def _tail(source: LawRun) -> Reason | None:
+def _tail(source: LawRun, traits: Traits) -> Reason | None:
     error = source.error_px
     if error is None or not source.tolerance_px < error < TAIL * source.tolerance_px:
         return None
-    left_s = _decay_s(source, error)
+    gain, left_s = traits.gain, traits.left_s
     if left_s < TAIL_S:
         return None
-    gain = gain_now(source, error)
     hint = (
         f"near the goal the error falls to a third in {1.1 / gain:.1f} s: a higher gain (or one that rises near the "
         "goal), or a wider tolerance, is faster"
@@ -199,7 +124,7 @@ def _tail(source: LawRun) -> Reason | None:
 
 
 def _stall_reason(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: _ProgressTraits
+    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
 ) -> Reason | None:
     error, since_s = source.error_px, source.moved_s - source.watch.least_s
     if error is None or error <= source.tolerance_px or since_s < STUCK_S:
