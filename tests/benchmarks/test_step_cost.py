@@ -18,7 +18,7 @@ from stereoservo_sim.world.synthetic import rx90
 
 PACKAGE = str(Path(stereoservo.__file__).parent)
 LINES = {"stereo": 450, "cartesian3": 455, "trajectory": 560}
-"""Of Python that a step between frames may run, kernels apart (405, 410, 519 when this was written; 533, 551, 614 with
+"""Of Python that a step between frames may run, kernels apart (403, 408, 523 when this was written; 533, 551, 614 with
 a call from Python for each part of a stage), in a step that sends no priors.
 """
 
