@@ -421,8 +421,8 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
         )  # drives that are late: where they will be counts, and not where they are
         context = SimpleNamespace(
             outermost=step.positions if late else None,
+            features_ns=max((frame.accepted_ns for frame in accepted), default=0),
             state=SimpleNamespace(
-                cameras=accepted,
                 block=SimpleNamespace(
                     command=step.previous.copy(),
                     numbers=SimpleNamespace(last_joints_ns=now_ns - ages_ns[2] // 4),

@@ -109,7 +109,7 @@ def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
 
     bench = benches(3, noise_px=0.1)
     bench.ready()
-    raising = dataclasses.replace(LAWS[DEFAULT_LAW], step=step)
+    raising = dataclasses.replace(LAWS[DEFAULT_LAW], step=step, kernel=None)
     monkeypatch.setitem(LAWS.usable(), DEFAULT_LAW, raising)
     target = bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])
     goal = Goal(str(uuid.UUID(int=1)), FeatureTarget(bench.features(target)))
@@ -123,7 +123,7 @@ def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
 def test_a_law_whose_numbers_are_of_another_type_compiles_nothing_in_the_loop(
     benches: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    law = LAWS[DEFAULT_LAW]
+    law = dataclasses.replace(LAWS[DEFAULT_LAW], kernel=None)
 
     def step(scene: Scene, task: Task, options: Options) -> LawStep:
         found = law.step(scene, task, options)

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 
 
 class JacobianChoice(IntEnum):
@@ -76,6 +76,9 @@ class Task(NamedTuple):
     joint_weight: float = 0.0
 
 
+DAMPING = 1e-6
+
+
 class Options(NamedTuple):
     """How to go there.
 
@@ -87,7 +90,7 @@ class Options(NamedTuple):
     gain: float
     dt_s: float = 0.0
     jacobian: int = JacobianChoice.MEAN
-    damping: float = 1e-6
+    damping: float = DAMPING
     rotation_rate: float = inf
     translation_rate: float = inf
 
@@ -135,6 +138,12 @@ class Law:
     ``follows_streams``: the target may move while the law runs. ``options``: fields of a goal that belong to this
     law, of ``centre``, ``jacobian`` and ``profile``.
 
+    ``kernel``: the same step in one compiled call, bit for bit, at the gain, the time ``dt_s`` and the choice of the
+    Jacobian of `Options`, whose rest is as by default. It takes an array (1,) of a record, `core.workspace.WORKSPACE`,
+    which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as ``body``; of the cameras
+    that keep sight of the face the centres as ``eyes``), and fills in ``velocity``, ``components`` (errors, then what
+    is allowed), ``component_status`` and ``conditioning``. None: the step is called.
+
     ``summary``: one line for lists. ``colour``: in figures. ``rank``: where the law stands in lists.
     """
 
@@ -148,6 +157,7 @@ class Law:
     components: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     reasons: Callable[[LawStep], tuple[Reason, ...]] = lambda step: ()
+    kernel: Callable[[Record, float, float, int], None] | None = None
     properties: LawProperties | None = None
     colour: str = "#7f7f7f"
     rank: int = 1000

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -15,10 +15,12 @@ import numpy as np
 from stereoservo.control.law import Law
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CoreState
+from stereoservo.core.state import CameraEstimate, CoreState
 from stereoservo.core.workspace import Workspace
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Health
@@ -51,8 +53,14 @@ class Derived:
     room: Workspace
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
-    health: tuple[object, Health] | None = None
+    health: tuple[tuple[Any, ...], Health] | None = None
     """What the status last said of the model's health, and of what."""
+    seen: tuple[list[CameraEstimate], dict[str, float], dict[str, int]] | None = None
+    """What the status last said of each camera, by name: of which estimates, their innovation, the markers visible."""
+    friction_bounds: tuple[CellModel | None, FloatArray, FloatArray] | None = None
+    """Largest compensation and least travel of the joints (n,), as of `core.move`, and the model by which they are."""
+    model_health: tuple[tuple[object, ...], bytes, tuple[ModelDiagnosis, Health]] | None = None
+    """The diagnosis and the health that the status last showed: of what, and with which markers left out."""
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""
@@ -83,6 +91,7 @@ class StepContext(msgspec.Struct, eq=False):
     `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
     ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) need a model. `move` sets ``paused``: the active source had
     to wait, and with late drives ``outermost`` (n,): where joints are, or will be, farthest towards where they go.
+    ``features_ns``: shutter time of the newest frame with accepted markers, 0 before the first.
     ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
     """
 
@@ -102,6 +111,7 @@ class StepContext(msgspec.Struct, eq=False):
     pixels: FloatArray | None = None
     paused: bool = False
     outermost: FloatArray | None = None
+    features_ns: int = 0
     goals_read: list[str] = []
 
 

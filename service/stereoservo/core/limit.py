@@ -71,12 +71,19 @@ class SafetyLimits:
     features_fresh_s: float = 0.15
 
     @cached_property
-    def arrays(self) -> JointLimits:
-        """The limits as the kernel takes them."""
-        return JointLimits(
-            self.position_min, self.position_max, self.velocity_max, self.acceleration_max, self.position_margin,
-            self.keep_outs,
-        )  # fmt: skip
+    def table(self) -> FloatArray:
+        """The joints' limits as the kernel takes them (4, n): smallest and largest position, velocity, acceleration."""
+        return np.array([self.position_min, self.position_max, self.velocity_max, self.acceleration_max])
+
+    @cached_property
+    def found(self) -> FloatArray:
+        """Room for what `limit_velocity` finds in a step (6 + n,)."""
+        return np.empty(6 + len(self.joint_names))
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Likewise the margin of positions, and the longest ages of joints and features: fresh ones, and at all."""
+        return np.array([self.position_margin, self.joint_timeout_s, self.features_fresh_s, self.coast_s])
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
@@ -153,8 +160,8 @@ class SafetyResult(msgspec.Struct, frozen=True, eq=False):
 
     raw: FloatArray
     limited: FloatArray
-    reasons: tuple[Reason, ...]
-    braking: bool
+    reasons: tuple[Reason, ...] = ()
+    braking: bool = False
 
 
 def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
@@ -170,7 +177,7 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
     """
     raw, positions, previous = inputs.raw, inputs.positions, inputs.previous
     n = len(limits.joint_names)
-    if raw.shape != (n,) or positions.shape != (n,) or previous.shape != (n,):
+    if not raw.shape == positions.shape == previous.shape == (n,):
         raise SafetyConfigurationError(
             f"raw {raw.shape}, positions {positions.shape}, previous {previous.shape}; each must be ({n},)"
         )
@@ -178,38 +185,43 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
         raise SafetyConfigurationError(
             f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
         )
+    limited, found = np.empty(n), limits.found
+    if not limit_velocity(
+        raw, positions, previous, inputs.brake, inputs.dt_s, inputs.joint_age_s, inputs.feature_age_s,
+        inputs.needs_features, inputs.speed_scale, limits.table, limits.bounds, limits.keep_outs, limited, found,
+    ):  # fmt: skip
+        return SafetyResult(raw, limited)
+    return _explained(inputs, limits, limited, found.tolist())
+
+
+def _explained(
+    inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: list[float]
+) -> SafetyResult:
+    """The result with its reasons, by what `limit_velocity` ``found``."""
     reasons: list[Reason] = []
     brake = _stale(inputs, limits, reasons) or inputs.brake
-    age = (
-        inputs.joint_age_s if _within(inputs.joint_age_s, limits.joint_timeout_s) else limits.joint_timeout_s
-    )
-    speed_scale = min(max(inputs.speed_scale, 0.0), 1.0) if math.isfinite(inputs.speed_scale) else 0.0
-    limited, acted = np.empty(n), np.empty(n, np.int64)
-    by_position, finite, scale, scaled_by, share, shared_by = limit_velocity(
-        raw, positions, previous, brake, inputs.dt_s, age, speed_scale, limits.arrays, limited, acted
-    )
+    finite, speed_scale, scale, scaled_by, share, shared_by, *acted = found
     if not finite:
         brake = True
-        _tell_non_finite(raw, positions, limits, reasons)
+        _tell_non_finite(inputs.raw, inputs.positions, limits, reasons)
     if brake:
         reasons.append(_braking(limited, limits, inputs.brake))
-    if by_position:
-        _tell_positions(acted, inputs, limits, reasons)
+    _tell_positions(acted, inputs, limits, reasons)
     if scaled_by >= 0 and scale < 1.0 - TOUCHED:
-        j = scaled_by
+        j = int(scaled_by)
         reasons.append(
             Reason(
                 VELOCITY_SCALED,
                 "slow",
                 limits.joint_names[j],
-                float(abs(raw[j])),
+                float(abs(inputs.raw[j])),
                 float(limits.velocity_max[j] * speed_scale),
                 "1/s",
                 "slower, in the same direction; a lower gain or a higher speed scale avoids it",
             )
         )
     if not brake and shared_by >= 0 and share < 1.0 - TOUCHED:
-        j = shared_by
+        j = int(shared_by)
         reasons.append(
             Reason(
                 ACCELERATION_LIMITED,
@@ -221,29 +233,25 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
                 "passes by itself",
             )
         )
-    return SafetyResult(raw, limited, tuple(reasons), brake)
+    return SafetyResult(inputs.raw, limited, tuple(reasons), brake)
 
 
 def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> SafetyResult:
     """Stage 6: the source's velocity within all limits; it becomes the command, zero outside ACTIVE."""
-    state = context.state
-    newest_ns = max([estimate.accepted_ns for estimate in state.cameras], default=0)
-    result = safety_stage(
-        SafetyInputs(
-            raw=motion.velocity,
-            positions=context.q if context.outermost is None else context.outermost,
-            previous=state.block.command,
-            dt_s=context.dt_s,
-            joint_age_s=(context.now_ns - state.block.numbers.last_joints_ns) * 1e-9,
-            feature_age_s=(context.now_ns - newest_ns) * 1e-9,
-            needs_features=motion.needs_features,
-            speed_scale=motion.speed_scale * context.settings.limits.speed_scale,
-            brake=context.paused,
-        ),
-        limits,
+    state, block, now_ns = context.state, context.state.block, context.now_ns
+    inputs = SafetyInputs(
+        motion.velocity,
+        context.q if context.outermost is None else context.outermost,
+        block.command,
+        context.dt_s,
+        (now_ns - block.numbers.last_joints_ns) * 1e-9,
+        (now_ns - context.features_ns) * 1e-9,
+        motion.needs_features,
+        motion.speed_scale * context.settings.limits.speed_scale,
+        context.paused,
     )
-    active = state.lifecycle == Lifecycle.ACTIVE
-    state.block.command[:] = result.limited if active else 0.0
+    result = safety_stage(inputs, limits)
+    block.command[:] = result.limited if state.lifecycle == Lifecycle.ACTIVE else 0.0
     return result
 
 
@@ -335,10 +343,10 @@ def _tell_non_finite(
 
 
 def _tell_positions(
-    acted: IntArray, inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]
+    acted: list[float], inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]
 ) -> None:
     margin = limits.position_margin
-    for j, code in enumerate(acted.tolist()):
+    for j, code in enumerate(int(one) for one in acted):
         if not code:
             continue
         name, position = limits.joint_names[j], float(inputs.positions[j])
@@ -498,28 +506,32 @@ def _velocity_scale(
 
 @kernel
 def limit_velocity(
-    raw: FloatArray,
-    positions: FloatArray,
-    previous: FloatArray,
-    brake: bool,
-    dt: float,
-    sample_age: float,
-    speed_scale: float,
-    limits: JointLimits,
-    limited: FloatArray,
-    acted: IntArray,
-) -> tuple[bool, bool, float, int, float, int]:
-    """Braking, velocity, positions and keep-outs, acceleration, in this order.
+    raw: FloatArray, positions: FloatArray, previous: FloatArray, brake: bool, dt: float, joint_age: float,
+    feature_age: float, needs_features: bool, speed_scale: float, table: FloatArray, bounds: FloatArray,
+    keep_outs: FloatArray, limited: FloatArray, found: FloatArray,
+) -> bool:  # fmt: skip
+    """Staleness, braking, velocity, positions and keep-outs, acceleration, in this order; whether there is anything to
+    tell.
 
-    Where ``raw`` or ``positions`` are not finite it brakes, too. Into the last two arguments the limited velocity (n,)
-    and who has acted (n,): 0 nobody, 1 position limit, 2 + k keep-out k. Returns whether any has; whether all was
-    finite; velocity scale, its joint, acceleration share, its joint, -1 for none.
+    ``table``, ``bounds``, ``keep_outs``: see `SafetyLimits`. Where ``raw`` or ``positions`` are not finite it brakes,
+    too. Into the last two arguments the limited velocity (n,), and (6 + n,): whether all was finite; the speed scale
+    that holds; velocity scale, its joint, acceleration share, its joint, -1 for none; and who has acted on each joint:
+    0 nobody, 1 position limit, 2 + k keep-out k.
     """
+    margin, timeout, fresh, coast = bounds[0], bounds[1], bounds[2], bounds[3]
+    limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)
+    told, sample_age = brake, joint_age
+    if not 0.0 <= joint_age <= timeout:
+        brake, sample_age = True, timeout
+    if needs_features and not 0.0 <= feature_age <= fresh:
+        told, brake = True, brake or not 0.0 <= feature_age <= coast
+    speed_scale = min(max(speed_scale, 0.0), 1.0) if math.isfinite(speed_scale) else 0.0
     velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
     n = raw.shape[0]
+    acted = found[6:]
     finite = True
     for j in range(n):
-        acted[j] = 0
+        acted[j] = 0.0
         finite = finite and math.isfinite(raw[j]) and math.isfinite(positions[j])
     brake = brake or not finite
     before = _within_speed_limits(previous, velocity_max)
@@ -564,7 +576,9 @@ def limit_velocity(
         elif limited[j] < low[j]:
             limited[j] = max(limited[j], min(low[j], before[j] + step))
             acted[j] = low_by[j] + 2
-    by_position = False
+    told = told or brake or scaled_by >= 0 or shared_by >= 0
     for j in range(n):
-        by_position = by_position or acted[j] != 0
-    return by_position, finite, scale, scaled_by, share, shared_by
+        told = told or acted[j] != 0.0
+    found[0], found[1] = 1.0 if finite else 0.0, speed_scale
+    found[2], found[3], found[4], found[5] = scale, scaled_by, share, shared_by
+    return told

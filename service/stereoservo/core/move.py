@@ -18,11 +18,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from operator import attrgetter
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from stereoservo.core.block import LONGEST_DELAY_S
@@ -55,10 +53,11 @@ from stereoservo.core.state import (
     ServoGoal,
     Source,
 )
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 
 
@@ -177,8 +176,10 @@ def paused(state: CoreState) -> bool:
 
 def move(context: StepContext) -> SourceOutput:
     """The active source's output; no motion while it is paused, and outside ACTIVE, where `execute_goals` ends it."""
-    state = context.state
-    context.paused = paused(state)
+    state, newest_ns = context.state, 0
+    for estimate in state.cameras:
+        newest_ns = max(newest_ns, estimate.accepted_ns)
+    context.features_ns, context.paused = newest_ns, paused(state)
     if context.paused or state.lifecycle != Lifecycle.ACTIVE:
         state.friction = None
         return _foreseen(SourceOutput(np.zeros_like(context.q)), context)
@@ -215,7 +216,6 @@ LEAST_STEPS = 5.0
 """Steps of the encoder likewise."""
 
 
-@lru_cache(maxsize=8)
 def _bounds(
     kinds: tuple[str, ...], resolution: tuple[float, ...], inexact: bool
 ) -> tuple[FloatArray, FloatArray]:
@@ -249,16 +249,45 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
         known = state.friction = FrictionCompensation(
             subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
         )
-    inexact = state.model is not None and state.model.joint_accuracy is not None
-    most, travel = _bounds(settings.joint_kinds, settings.resolution, inexact)
-    looks = context.ingested.joints is not None and _fresh(output, context)
-    arrives = state.block.delays.velocity if settings.watch_following else state.block.command
+    bounds = context.derived.friction_bounds
+    if bounds is None or bounds[0] is not state.model:
+        bounds = context.derived.friction_bounds = _friction_bounds(context)
+    _, most, travel = bounds
+    looks = context.ingested.joints is not None and (
+        not output.needs_features
+        or (context.now_ns - context.features_ns) * 1e-9 <= context.derived.features_fresh_s
+    )
     velocity = np.empty(context.q.size)
-    changed = _compensated(
-        output.velocity, arrives, context.q, known.velocity, known.stood_at, known.sent, known.sent_s, most,
-        travel, context.dt_s, looks, velocity,
+    if not add_friction(
+        state.block.record, output.velocity, context.q, known.velocity, known.stood_at, known.sent, known.sent_s, most,
+        travel, context.dt_s, looks, settings.watch_following, velocity,
+    ):  # fmt: skip
+        return output
+    return SourceOutput(
+        velocity, output.needs_features, output.speed_scale, output.finished, output.reached, output.error_px,
+        output.task_error, output.reasons,
     )  # fmt: skip
-    return msgspec.structs.replace(output, velocity=velocity) if changed else output
+
+
+def _friction_bounds(context: StepContext) -> tuple[CellModel | None, FloatArray, FloatArray]:
+    """The model in use, and `_bounds` by it."""
+    model, settings = context.state.model, context.settings
+    inexact = model is not None and model.joint_accuracy is not None
+    return model, *_bounds(settings.joint_kinds, settings.resolution, inexact)
+
+
+@kernel
+def add_friction(
+    block: Record, wanted: FloatArray, q: FloatArray, friction: FloatArray, stood_at: FloatArray, sent: FloatArray,
+    sent_s: FloatArray, most: FloatArray, travel: FloatArray, dt_s: float, looks: bool, late: bool,
+    velocity: FloatArray,
+) -> bool:  # fmt: skip
+    """`_compensated` with what the drives obey now: the last command, or, where drives may be ``late``, another."""
+    memory = block[0]
+    arrives = memory.delay_velocity[: q.size] if late else memory.command[: q.size]
+    return _compensated(
+        wanted, arrives, q, friction, stood_at, sent, sent_s, most, travel, dt_s, looks, velocity
+    )
 
 
 @kernel
@@ -294,13 +323,6 @@ def _compensated(
         if wanted[j] != 0.0:
             velocity[j] = wanted[j] + friction[j]
     return changed
-
-
-def _fresh(output: SourceOutput, context: StepContext) -> bool:
-    if not output.needs_features:
-        return True
-    newest_ns = max([estimate.accepted_ns for estimate in context.state.cameras], default=0)
-    return (context.now_ns - newest_ns) * 1e-9 <= context.derived.features_fresh_s
 
 
 # -- late drives ------------------------------------------------------------------------------------------------

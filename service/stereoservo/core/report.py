@@ -5,6 +5,7 @@ model health and the estimated time offset of each camera.
 from __future__ import annotations
 
 import math
+from operator import is_
 
 import numpy as np
 
@@ -42,53 +43,65 @@ def report(
         finish(motion, context)
     state.step += 1
     return StepOutputs(
-        command=state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
-        status=_status(context, motion, limited),
-        priors=_priors(context),
-        events=tuple(events),
-        driver_request=state.driver_request,  # type: ignore[arg-type]
+        state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
+        _status(context, motion, limited),
+        () if state.step % context.derived.prior_every else _priors(context),
+        tuple(events),
+        state.driver_request,  # type: ignore[arg-type]
     )
 
 
 def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
-    state, settings, block = context.state, context.settings, context.state.block
-    masked = masked_ids(state)
-    diagnosis = shown_diagnosis(state.watching.verdict, masked)
+    """The status, its fields in their order: an argument by name costs as much as an array."""
+    state, derived, block = context.state, context.derived, context.state.block
+    diagnosis, health = _model_health(context)
+    source, kind = state.source, MOTION_SOURCES[type(state.source)]
     reasons = _reasons(context, motion, limited, diagnosis)
-    effort_limits, following_limits = context.derived.load_limits or (None, None)
-    source = MOTION_SOURCES[type(state.source)]
-    done, left_s = (None, None) if source.progress is None else source.progress(state.source, context)
-    innovation_px, visible = {}, {}
-    for camera, estimate in zip(settings.cameras, state.cameras, strict=True):
-        innovation_px[camera.name] = estimate.rms_px
-        visible[camera.name] = estimate.last_visible
+    done, left_s = (None, None) if kind.progress is None else kind.progress(source, context)
+    seen = derived.seen
+    if context.observations or seen is None or seen[0] is not state.cameras:
+        seen = derived.seen = _seen(context)
+    _, innovation_px, visible = seen
+    numbers, (effort_limits, following_limits) = block.numbers, derived.load_limits or (None, None)
+    model_epoch = 0 if state.model is None else state.model.epoch
+    efforts = block.efforts.copy() if numbers.tells_efforts else None
+    following_errors = block.following_errors.copy() if numbers.tells_following else None
     return Status(
-        t_ns=context.now_ns,
-        step=state.step,
-        lifecycle=str(state.lifecycle),
-        model=str(state.readiness),
-        model_epoch=0 if state.model is None else state.model.epoch,
-        source=source.name,
-        goal=source.subject(state.source),
-        law=source.law(state.source),
-        level=_level(reasons),
-        reasons=reasons,
-        positions=context.q,
-        velocities=state.block.velocities.copy(),
-        command_raw=motion.velocity,
-        command=state.block.command.copy(),
-        error_px=motion.error_px,
-        task_error=motion.task_error,
-        innovation_px=innovation_px,
-        visible=visible,
-        progress=done,
-        seconds_left=left_s,
-        efforts=block.efforts.copy() if block.numbers.tells_efforts else None,
-        following_errors=block.following_errors.copy() if block.numbers.tells_following else None,
-        effort_limits=effort_limits,
-        following_limits=following_limits,
-        health=_health(context, diagnosis, masked),
-    )
+        context.now_ns, state.step, str(state.lifecycle), str(state.readiness), model_epoch, kind.name,
+        kind.subject(source), kind.law(source), _level(reasons), reasons, context.q, block.velocities.copy(),
+        motion.velocity, block.command.copy(), motion.error_px, motion.task_error, innovation_px, visible, done, left_s,
+        efforts, following_errors, effort_limits, following_limits, health,
+    )  # fmt: skip
+
+
+def _seen(context: StepContext) -> tuple[list[CameraEstimate], dict[str, float], dict[str, int]]:
+    """The cameras' estimates, and of each camera, by name: the innovation [px], and the markers visible."""
+    estimates, names = context.state.cameras, context.derived.cameras
+    innovation_px = {name: estimates[c].rms_px for name, c in names.items()}
+    return estimates, innovation_px, {name: estimates[c].last_visible for name, c in names.items()}
+
+
+def _model_health(context: StepContext) -> tuple[ModelDiagnosis, Health]:
+    """The diagnosis as it is shown, and what the status says of the model's health: those of the step before, where no
+    frame has come and nothing else that they follow from is another.
+    """
+    state, derived, watching = context.state, context.derived, context.state.watching
+    told = state.model, state.readiness, watching, watching.verdict
+    marks, known = watching.masked.tobytes(), derived.model_health
+    quiet = state.reanchoring is None and not any(state.mobile)
+    if (
+        known is not None
+        and quiet
+        and not context.observations
+        and all(map(is_, told, known[0]))
+        and marks == known[1]
+    ):
+        return known[2]
+    masked = masked_ids(state)
+    diagnosis = shown_diagnosis(watching.verdict, masked)
+    found = diagnosis, _health(context, diagnosis, masked)
+    derived.model_health = (told, marks, found) if quiet else None
+    return found
 
 
 def _reasons(
@@ -96,7 +109,10 @@ def _reasons(
 ) -> tuple[Reason, ...]:
     """Why the arm does not do what its source wants, or may not soon."""
     state = context.state
-    found = [*state.fault, *limited.reasons, *motion.reasons, *_refused_inputs(state)]
+    found = [*state.fault, *limited.reasons, *motion.reasons]
+    for refused in (state.refused_joints, *state.refused_frames):
+        if refused.reason is not None and not _latched(refused.reason, state):
+            found.append(refused.reason)
     if state.reanchoring is not None:
         found.extend(camera_relocalization.reasons(state))
     if any(state.mobile):
@@ -123,18 +139,10 @@ def _reasons(
     return tuple(found)
 
 
-def _refused_inputs(state: CoreState) -> list[Reason]:
-    """Why samples are refused, but for what already stands as the reason of a stop."""
+def _latched(reason: Reason, state: CoreState) -> bool:
+    """Whether that is refused which already stands as the reason of a stop."""
     latched = state.stop_reason if state.stopped else None
-    found = []
-    for refused in (state.refused_joints, *state.refused_frames):
-        reason = refused.reason
-        if reason is None or (
-            latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
-        ):
-            continue
-        found.append(reason)
-    return found
+    return latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
 
 
 def _priors(context: StepContext) -> tuple[Prior, ...]:

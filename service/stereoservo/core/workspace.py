@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from stereoservo.control.face_choice import FaceChoice
+from stereoservo.control.law import Scene, Task
 from stereoservo.core.block import JOINTS, Shapes, packed_type, views
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitors.following import LAG_S, of_kinds
@@ -39,6 +41,14 @@ class Numbers(ctypes.Structure):
     known_s: float
     filter_s: float
     gate: float
+    joints: int
+    cameras: int
+    markers: int
+    composition: int
+    eye_count: int
+    measured: int
+    error_px: float
+    conditioning: float
     _fields_ = [
         (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
         for name, kind in __annotations__.items()
@@ -57,8 +67,15 @@ ARRAYS: Shapes = {
     "weights": ("cameras", "markers"), "pixels": ("cameras", "markers", 2),
     "frame_q": JOINTS, "frame_innovation": ("rows", 2), "frame_spread": ("rows", 2, 2), "frame_noise": ("rows",),
     "frame_seen": ("rows",), "frame_velocity": ("rows", 2), "unseen_px": ("cameras", "markers"),
+    "camera_centres": ("cameras", 4), "no_rates": ("cameras", "markers", 2),
+    "used": ("cameras",), "wanted": ("cameras", "markers"), "set_points": ("cameras", "markers", 2),
+    "target_points": ("markers", 4), "target_known": ("markers",), "centre_weights": ("markers",), "centre_body": (4,),
+    "centre_target": (4,), "face": (3,), "eyes": ("cameras", 4),
+    "usable": ("cameras", "markers"), "body": ("markers", 4), "centre": (4,),
+    "velocity": JOINTS, "components": (2, 3), "component_status": (3,),
 }  # fmt: skip
-OTHER_TYPES = {"kinds": np.uint8, "row_ids": np.int64, "row_of": np.int64, "frame_seen": np.uint8}
+OTHER_TYPES = {"kinds": np.uint8, "row_ids": np.int64, "row_of": np.int64, "frame_seen": np.uint8, "face": np.int64,
+    "component_status": np.int64}  # fmt: skip
 WORKSPACE = packed_type(Numbers, ARRAYS, OTHER_TYPES, {})
 NOISE_CHI2 = np.array([improbable(2.0 * count) for count in range(MAX_MARKERS + 1)])
 """Of so many markers: what `improbable` says of a frame that is nothing but noise."""
@@ -79,6 +96,12 @@ class Workspace:
     ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2), and the joint that follows ``worst``, with what it is
     ``missing``. Of the frame that was looked at last: joints ``frame_q`` (n,), what `residuals` gives, and until the
     present is there the prediction of its camera alone, ``of_frame``.
+
+    Of the goal that a law works on, as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are ``wanted``
+    (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres ``eyes`` of the
+    ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and ``centre`` now,
+    and whether an ``error_px`` was ``measured``. What a law finds: see `control.law.Law`. ``arrays``: all of these by
+    name; ``scene`` and ``task``: those that laws take; ``aim`` and ``faced``: of which goal and face they are.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
@@ -89,14 +112,15 @@ class Workspace:
             "markers": 0,
             "rows": 0,
         }
-        self._arrays: dict[str, Any] = {}
+        self.arrays: dict[str, Any] = {}
         self._view()
         self.numbers = Numbers.from_buffer(self.record.view(np.uint8).data)
+        self.numbers.joints, self.numbers.cameras = self._counts["joints"], self._counts["cameras"]
         self.numbers.period_s = 1.0 / settings.rate_hz
         self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
         self.numbers.known_s, self.numbers.filter_s = settings.limits.coast_s + 1.0, settings.filter_s
         self.numbers.gate = gate_threshold(settings.gate_sigma)
-        given = self._arrays
+        given = self.arrays
         given["noise_chi2"][:] = NOISE_CHI2
         given["camera_rates"][:] = [camera.rate_hz for camera in settings.cameras]
         given["velocity_max"][:] = settings.limits.velocity_max
@@ -112,25 +136,49 @@ class Workspace:
         """Collision thresholds (n,), (n,) from here on; None: nothing reaches them."""
         self.watches_loads = limits is not None
         efforts, following = limits or (np.inf, np.inf)
-        self._arrays["effort_limits"][:], self._arrays["following_limits"][:] = efforts, following
+        self.arrays["effort_limits"][:], self.arrays["following_limits"][:] = efforts, following
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""
         self._counts["markers"], self._counts["rows"] = len(arrays.marker_points), len(arrays.row_ids)
         self._view()
-        self.numbers.tip_first, self.numbers.lens_size = arrays.tip_first, arrays.lenses.shape[1]
-        for name in ("generators", "kinds", "zero", "marker_points", "matrices", "row_ids", "row_of"):
-            self._arrays[name][:] = getattr(arrays, name)
-        self._arrays["lenses"][:, : arrays.lenses.shape[1]] = arrays.lenses
-        self._arrays["scene_pixels"][:, : len(arrays.scene_points)] = arrays.scene_pixels
+        numbers, given = self.numbers, self.arrays
+        numbers.markers, numbers.tip_first = len(arrays.marker_points), arrays.tip_first
+        numbers.composition = arrays.composition
+        for name in (
+            "generators",
+            "kinds",
+            "zero",
+            "marker_points",
+            "matrices",
+            "camera_centres",
+            "row_ids",
+            "row_of",
+        ):
+            given[name][:] = getattr(arrays, name)
+        self.numbers.lens_size = arrays.lenses.shape[1]
+        given["lenses"][:, : arrays.lenses.shape[1]] = arrays.lenses
+        given["scene_pixels"][:, : len(arrays.scene_points)] = arrays.scene_pixels
         self.unseen_px[:] = arrays.unseen_px
+        present = self.prediction
+        self.scene = Scene(
+            present.operators, arrays.composition, given["matrices"], given["camera_centres"], given["body"],
+            self.pixels, given["usable"],
+        )  # fmt: skip
+        self.task = Task(
+            given["set_points"], given["wanted"], given["no_rates"], given["target_points"], given["target_known"],
+            given["centre"], given["centre_target"], given["face"],
+        )  # fmt: skip
+        self.aim: tuple[Any, ...] = ()
+        self.faced: FaceChoice | None = None
 
     def _view(self) -> None:
-        given = self._arrays = views(self.record, ARRAYS, self._counts)
+        given = self.arrays = views(self.record, ARRAYS, self._counts)
         self.sample: FloatArray = given["sample"]
         self.limits: Limits = given["effort_limits"], given["following_limits"]
         self.stated_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
         self.weights: FloatArray = given["weights"]
+        self.velocity: FloatArray = given["velocity"]
         self.pixels: FloatArray = given["pixels"]
         self.prediction = Prediction(
             given["operators"], given["points"], given["predicted"], given["jacobian"]
@@ -143,7 +191,7 @@ class Workspace:
 
     def residuals(self, t_shutter_ns: int) -> FrameResiduals:
         """The frame that was looked at last."""
-        given = self._arrays
+        given = self.arrays
         return FrameResiduals(
             t_shutter_ns, given["frame_innovation"], given["frame_spread"], given["frame_noise"],
             given["frame_seen"].view(np.bool_), given["frame_velocity"],

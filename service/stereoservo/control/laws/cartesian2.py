@@ -8,12 +8,21 @@ from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene,
 from stereoservo.control.laws.cartesian3 import (
     ROTATION,
     cartesian_reasons,
+    fill_step,
     velocity_step,
 )
 from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import Record
+from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.primitives import TRANSLATION
 
 COMPONENTS, UNITS = (TRANSLATION, ROTATION), ("", "rad")
+
+
+@kernel
+def cartesian2_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+    """The law's ``kernel``."""
+    fill_step(room, gain, dt_s, 2)
 
 
 def cartesian2(scene: Scene, task: Task, options: Options) -> LawStep:
@@ -39,6 +48,7 @@ LAW = Law(
     components=COMPONENTS,
     units=UNITS,
     reasons=cartesian2_reasons,
+    kernel=cartesian2_kernel,
     properties=LawProperties(
         centre="straight",
         face="kept likewise",

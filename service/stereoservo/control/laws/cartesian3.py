@@ -40,7 +40,7 @@ from stereoservo.control.step_correction import (
 )
 from stereoservo.kinematics.kernels import multiply4_into, transform_points, transform_points_into
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.primitives import (
     HINGE,
@@ -395,6 +395,27 @@ def cartesian3_step(
     return cartesian_step(operators, 0, task, camera_centres, Pace(gains, 0.0, math.inf, math.inf), False)
 
 
+@kernel
+def fill_step(room: Record, gain: float, dt_s: float, count: int) -> None:
+    """The step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
+    work = room[0]
+    n, m, c = work.joints, work.markers, work.eye_count
+    options = (gain, dt_s, math.inf, math.inf)
+    _normalised_step_into(
+        work.operators[: 16 * n].reshape((n, 4, 4)), work.composition, work.body[: 4 * m].reshape((m, 4)),
+        work.target_points[: 4 * m].reshape((m, 4)), work.face, work.centre, work.centre_target,
+        work.eyes[: 4 * c].reshape((c, 4)), options, work.velocity[:n],
+        work.components[: 2 * count].reshape((2, count)), work.component_status[:count],
+    )  # fmt: skip
+    work.conditioning = 1.0
+
+
+@kernel
+def cartesian3_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+    """The law's ``kernel``."""
+    fill_step(room, gain, dt_s, 3)
+
+
 def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:
     """The step of a law with ``count`` components, 3 or 2, each at the gain of ``options``."""
     velocity, components = np.empty(len(scene.operators)), np.empty((2, count))
@@ -415,8 +436,10 @@ def cartesian_reasons(
     status: IntArray,
 ) -> tuple[Reason, ...]:
     """What a step has to tell: components that the arm cannot make, or that wait. Empty when all move."""
-    reasons = []
+    reasons: list[Reason] = []
     codes = status.tolist()
+    if NOT_REACHABLE not in codes and WAITS not in codes and NO_FACE not in codes:
+        return ()
     stuck = all(code == WAITS for code in codes[:2]) and bool((allowed[:2] <= BLOCKED * task_error[:2]).all())
     for i, (component, in_unit) in enumerate(zip(components, units, strict=True)):
         left, may = float(task_error[i]), float(allowed[i])
@@ -459,6 +482,7 @@ LAW = Law(
     components=COMPONENTS,
     units=UNITS,
     reasons=cartesian3_reasons,
+    kernel=cartesian3_kernel,
     properties=LawProperties(
         centre="straight",
         face="kept: a component waits for the other",

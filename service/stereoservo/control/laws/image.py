@@ -7,7 +7,7 @@ a camera drops out.
 from __future__ import annotations
 
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
-from stereoservo.control.laws.stereo import image_reasons, image_velocity_step, standing
+from stereoservo.control.laws.stereo import image_kernel, image_reasons, image_velocity_step, standing
 
 
 def image(scene: Scene, task: Task, options: Options) -> LawStep:
@@ -21,6 +21,7 @@ LAW = Law(
     one_camera="suffices",
     options=("jacobian",),
     reasons=image_reasons,
+    kernel=image_kernel,
     properties=LawProperties(
         centre="far aside",
         face="not kept",

@@ -11,17 +11,18 @@ import math
 
 import numpy as np
 
-from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.law import DAMPING, Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.laws.stereo import (
     DESIRED,
     MEAN,
+    gain_held,
     held_gain,
     image_reasons,
     limited,
     pixel_gradients,
     velocities_into,
 )
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import add_equation, damped_solve
 
@@ -98,6 +99,24 @@ def points_step(
     return x, conditioning
 
 
+@kernel
+def points_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+    """The law's ``kernel``."""
+    work = room[0]
+    n, c, m = work.joints, work.cameras, work.markers
+    body = work.body[: 4 * m].reshape((m, 4))
+    seen = np.zeros(m)
+    for i in range(m):
+        for k in range(c):
+            seen[i] = max(seen[i], work.usable[k * m + i])
+        seen[i] *= 1.0 if work.target_known[i] > 0.0 else 0.0
+    velocity, work.conditioning = points_step(
+        work.operators[: 16 * n].reshape((n, 4, 4)), body, work.target_points[: 4 * m].reshape((m, 4)), seen,
+        pixel_metrics(work.matrices[: 12 * c].reshape((c, 3, 4)), body), gain_held(gain, dt_s), jacobian, DAMPING,
+    )  # fmt: skip
+    work.velocity[:n] = velocity
+
+
 def points(scene: Scene, task: Task, options: Options) -> LawStep:
     """``q̇ = gain·J⁺(M* − M)`` over the markers that any camera sees and whose goal is known, in pixels.
 
@@ -124,6 +143,7 @@ LAW = Law(
     one_camera="refused",
     options=("jacobian",),
     reasons=image_reasons,
+    kernel=points_kernel,
     properties=LawProperties(
         centre="aside, less",
         face="not kept",

@@ -8,15 +8,24 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from math import expm1, inf
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.law import JacobianChoice, Law, LawProperties, LawStep, Options, Scene, Task
+from stereoservo.control.law import (
+    DAMPING,
+    JacobianChoice,
+    Law,
+    LawProperties,
+    LawStep,
+    Options,
+    Scene,
+    Task,
+)
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import add_pixel_equations, damped_solve
 
@@ -178,6 +187,32 @@ def _image_step_into(
 
 
 @kernel
+def image_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+    """`image_step` of set-points that stand, as the ``kernel`` of a law."""
+    work = room[0]
+    n, c, m = work.joints, work.cameras, work.markers
+    view = View(
+        work.matrices[: 12 * c].reshape((c, 3, 4)), work.camera_centres[: 4 * c].reshape((c, 4)),
+        work.pixels[: 2 * c * m].reshape((c, m, 2)), work.set_points[: 2 * c * m].reshape((c, m, 2)),
+        work.no_rates[: 2 * c * m].reshape((c, m, 2)), work.usable[: c * m].reshape((c, m)),
+        work.wanted[: c * m].reshape((c, m)),
+    )  # fmt: skip
+    body = Body(
+        work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.target_known[:m]
+    )
+    operators = work.operators[: 16 * n].reshape((n, 4, 4))
+    work.conditioning = _image_step_into(
+        operators, view, body, gain_held(gain, dt_s), jacobian, DAMPING, work.velocity[:n]
+    )
+
+
+@kernel
+def gain_held(gain: float, dt_s: float) -> float:
+    """`held_gain` as a kernel."""
+    return -math.expm1(-gain * dt_s) / dt_s if dt_s > 0.0 else gain
+
+
+@kernel
 def limit_into(
     operators: FloatArray, centre: FloatArray, rotation_rate: float, translation_rate: float, x: FloatArray
 ) -> None:
@@ -209,8 +244,7 @@ def limit_into(
 
 def held_gain(options: Options) -> float:
     """The gain [1/s] of a velocity held for ``dt_s``: an error decays by ``exp(−gain dt_s)`` all the same."""
-    dt = options.dt_s
-    return -expm1(-options.gain * dt) / dt if dt > 0.0 else options.gain
+    return float(gain_held(options.gain, options.dt_s))
 
 
 def image_velocity_step(
@@ -263,6 +297,7 @@ LAW = Law(
     one_camera="refused",
     options=("jacobian",),
     reasons=image_reasons,
+    kernel=image_kernel,
     properties=LawProperties(
         centre="aside",
         face="not kept",

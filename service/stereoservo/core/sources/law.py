@@ -5,36 +5,49 @@ adaptive gain and tracking of a plan, until the error stays below its tolerance 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from operator import is_
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereoservo.control.face_choice import choose_face, law_scene
-from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
-from stereoservo.control.law_registry import LAWS
-from stereoservo.control.laws.stereo import ILL_CONDITIONED
+from stereoservo.control.face_choice import FaceChoice, choose_face, law_scene
+from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene, Task
+from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
+from stereoservo.core.sources.progress import Traits, examine_progress
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
+from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, KindArray
+from stereoservo.numerics.arrays import FloatArray, IntArray, KindArray, Record
 from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import damped_least_squares
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
-Progress = tuple[float | None, float | None]
-
+AIM = (
+    "used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target",
+)  # fmt: skip
+"""Arrays of a goal that a law's kernel has in the workspace."""
 SELF_MOTION_RATE = 0.5
 """[1/s], of a joint's half range: how fast self-motion takes it from a limit."""
 
 
 def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     """One step of a law: error, joint velocity, and whether the goal is reached or out of time."""
+    law = context.derived.laws[source.law]
+    if (
+        law.kernel is not None
+        and source.stream is None
+        and source.points == "predicted"
+        and context.weights is not None
+        and context.weights is context.derived.room.weights
+    ):  # the present is another in a step in which a camera's place is found
+        return _compiled_step(source, context, law, law.kernel)
     arrays, prediction, pixels = context.arrays, context.prediction, context.pixels
     if arrays is None or prediction is None or context.weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")
@@ -44,8 +57,9 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=not streamed)
     if ended is not None:
         return ended
-    law = context.derived.laws[source.law]
     scene, task = choose(source, context, *scene_and_task(source, context, arrays, found))
+    if not law.components:  # laws in the images work in all cameras, whatever a face shows them
+        scene = scene._replace(camera_centres=arrays.camera_centres)
     if law.planned:
         if source.plan is None and source.pose_known:
             hint = "the way is planned from where the arm comes to rest"
@@ -66,6 +80,67 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
         velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
         reasons=law.reasons(step),
     )  # fmt: skip
+
+
+def _compiled_step(
+    source: ServoGoal, context: StepContext, law: Law, kernel: Callable[[Record, float, float, int], None]
+) -> SourceOutput:
+    """`servo_step` of a goal that stands, by the ``kernel`` of its law."""
+    room = context.derived.room
+    _aim(room, source)
+    seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
+    error_px = numbers.error_px if numbers.measured else None
+    ended = run_ended(source, context, error_px, seen, source.wanted)
+    if ended is not None:
+        return ended
+    if source.pose_known and (context.observations or source.choice.cameras == 0):
+        scene, task = choose(source, context, room.scene, room.task)
+        _face(room, task.face, scene.camera_centres)
+    elif room.faced is not source.choice:
+        eyes = law_scene(room.scene, source.choice).camera_centres
+        _face(room, source.choice.triple, eyes, source.choice)
+    try:
+        kernel(room.record, gain_now(source, error_px), context.dt_s, source.jacobian)
+    except Exception as error:  # as any law: it ends its goal, never the loop
+        return _law_failed(source, context, error_px, error)
+    step = _found_step(room, len(law.components))
+    velocity = step.velocity
+    if len(velocity) > RIGID_FREEDOMS:
+        velocity = velocity + away_from_limits(context)
+    return SourceOutput(
+        velocity, True, source.goal.speed_scale, False, False, error_px, step.error, law.reasons(step)
+    )
+
+
+def _aim(room: Workspace, goal: ServoGoal) -> None:
+    """The law works on a ``goal``, whose arrays are replaced where it moves, and not written into."""
+    aim = (
+        goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
+        goal.centre_target, goal.pose_known,
+    )  # fmt: skip
+    if len(room.aim) == len(aim) and all(map(is_, aim, room.aim)):
+        return
+    room.aim, room.faced, given = aim, None, room.arrays
+    for name in AIM:
+        given[name][:] = getattr(goal, name)
+    given["target_known"][:] = goal.pose_known
+
+
+def _face(room: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
+    """The law works on a face of three markers (3,), before cameras with these centres (k, 4): as in the ``choice``."""
+    room.faced, given = choice, room.arrays
+    given["face"][:], given["eyes"][: len(eyes)] = triple, eyes
+    room.numbers.eye_count = len(eyes)
+
+
+def _found_step(room: Workspace, components: int) -> LawStep:
+    """What the law's kernel has found, of so many components."""
+    given, velocity = room.arrays, room.velocity.copy()
+    if components == 0:
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, room.numbers.conditioning)
+    found = given["components"].reshape(-1)[: 2 * components].reshape(2, -1).copy()
+    status = given["component_status"][:components].copy()
+    return LawStep(velocity, found[0], found[1], status, room.numbers.conditioning)
 
 
 class GoalError(NamedTuple):
@@ -121,6 +196,22 @@ def _goal_error(
     points[:] = body_points(generators, kinds, zero, joints, tip_first, marker_points)
     centre_into(generators, kinds, zero, joints, tip_first, points, centre_weights, centre_body, centre)
     return measured, largest, seen
+
+
+@kernel
+def measure_goal(block: Record, room: Record, q: FloatArray) -> int:
+    """`goal_error` of the goal in the ``room``; how many of its markers are seen."""
+    memory, work = block[0], room[0]
+    n, c, m = work.joints, work.cameras, work.markers
+    measured, work.error_px, seen = _goal_error(
+        work.weights[: c * m].reshape((c, m)), work.used[:c], work.wanted[: c * m].reshape((c, m)),
+        work.pixels[: 2 * c * m].reshape((c, m, 2)), work.set_points[: 2 * c * m].reshape((c, m, 2)),
+        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], q, memory.correction[:n],
+        work.tip_first != 0, work.marker_points[: 4 * m].reshape((m, 4)), work.centre_weights[:m], work.centre_body,
+        work.usable[: c * m].reshape((c, m)), work.body[: 4 * m].reshape((m, 4)), work.centre,
+    )  # fmt: skip
+    work.measured = int(measured)
+    return seen
 
 
 def activate_run(source: LawRun, context: StepContext) -> None:
@@ -259,8 +350,12 @@ def options(
     source: LawRun, context: StepContext, error_px: float | None, jacobian: int = int(JacobianChoice.CURRENT)
 ) -> Options:
     """How the law goes there in this step."""
-    gain = gain_at(GainCurve(source.gain_near, source.gain_far, source.gain_slope), error_px)
-    return Options(gain=gain, dt_s=context.dt_s, jacobian=jacobian)
+    return Options(gain_now(source, error_px), context.dt_s, jacobian)
+
+
+def gain_now(source: LawRun, error_px: float | None) -> float:
+    """The gain [1/s] of a goal at its error."""
+    return gain_at(GainCurve(source.gain_near, source.gain_far, source.gain_slope), error_px)
 
 
 def velocity_of(step: LawStep, joints: int) -> FloatArray:
@@ -303,7 +398,9 @@ def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -
 
 def _settled(source: LawRun, context: StepContext, error_px: float | None) -> bool:
     """Whether the error stayed below the tolerance for ``hold_frames`` frames of every camera on average."""
-    frames = sum(e.frames for e in context.state.cameras)
+    frames = 0
+    for estimate in context.state.cameras:
+        frames += estimate.frames
     new, cameras = frames - source.last_frames, len(context.state.cameras)
     if new >= cameras:
         source.last_frames = frames
@@ -355,29 +452,12 @@ def _planned_set_points(source: ServoGoal, scene: Scene) -> tuple[FloatArray, fl
     return pixels + share * np.where(given, source.set_points - goal_pixels, 0.0), share
 
 
-STUCK_S = 3.0
-"""Time of motion without a smaller error after which a law is said to be stuck."""
 AVERAGED_S = 0.5
 """Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
 SMALLER = 0.95
 """Of the least mean error so far, below which it counts as smaller."""
 LOOK_EVERY_S = 0.2
-NEAR_LIMIT = 0.087
-"""Room to a limit less its margin [rad or m] below which it is told: five degrees."""
-NEAR_SINGULAR = 2.0 * ILL_CONDITIONED
-FEW_MARKERS = 4
-TAIL = 10.0
-"""Times its tolerance, below which an error decays in the gain's tail."""
-TAIL_S = 2.0
-"""Least time that a tail takes to be told."""
-NOISE_SIGMAS = 3.0
-
-CAUSES = (
-    "KEEP_OUT", "JOINT_LIMIT", "INCIDENCES_CONTRADICT", "INCIDENCE_NOT_DRIVABLE", "NOT_REACHABLE", "NO_FACE",
-    "FEATURES_STALE", "TOO_FEW_MARKERS", "VISIBILITY_BLOCKED", "VISIBILITY_WAIT", "JACOBIAN_ILL_CONDITIONED",
-    "NEAR_SINGULAR", "VELOCITY_SCALED",
-)  # fmt: skip
-"""What may hold a law up, the most probable first."""
+Progress = tuple[float | None, float | None]
 
 
 def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
@@ -413,24 +493,26 @@ def servo_progress_reasons(
     source: ServoGoal, context: StepContext, reported: tuple[Reason, ...]
 ) -> tuple[Reason, ...]:
     """The progress reasons of a goal in set-points."""
+    return progress_reasons(source, context, reported, _servo_traits)
+
+
+def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
     local = source.law if context.derived.laws[source.law].path == "free" else ""
-    traits = _ProgressTraits(source.wanted, source.stream is not None, local)
-    return progress_reasons(source, context, reported, traits)
+    return _plain_traits(source, context)._replace(
+        wanted=source.wanted, moves=source.stream is not None, local_law=local
+    )
 
 
-class _ProgressTraits(NamedTuple):
-    """What differs by goal: set-points that count (c, m), whether they move, a law that may rest in a minimum."""
-
-    wanted: FloatArray | None = None
-    moves: bool = False
-    local_law: str = ""
-
-
-_PLAIN = _ProgressTraits()
+def _plain_traits(source: LawRun, context: StepContext) -> Traits:
+    error = source.error_px
+    return Traits(gain_now(source, error), 0.0 if error is None else _decay_s(source, error))
 
 
 def progress_reasons(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: _ProgressTraits = _PLAIN
+    source: LawRun,
+    context: StepContext,
+    told: tuple[Reason, ...],
+    traits: Callable[[Any, StepContext], Traits] = _plain_traits,
 ) -> tuple[Reason, ...]:
     """What a law's run shows over time beside the reasons ``told`` in this step; kept between two examinations."""
     seen = source.watch
@@ -443,124 +525,8 @@ def progress_reasons(
             seen.least_px, seen.least_s = max(seen.mean_px, 1e-9), source.moved_s
     every = max(1, round(LOOK_EVERY_S / context.dt_s))
     if context.state.step % every == 0:
-        seen.reasons = _examine_progress(source, context, told, traits)
+        seen.reasons = examine_progress(source, context, told, traits(source, context))
     if not seen.reasons:
         return ()
     codes = {reason.code for reason in told}
     return tuple(reason for reason in seen.reasons if reason.code not in codes)
-
-
-def _examine_progress(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: _ProgressTraits
-) -> list[Reason]:
-    found = [*_near_limits(context), *_near_singular(source, context), *_few_markers(source, context, traits)]
-    tail = _tail(source)
-    if tail is not None:
-        found.append(tail)
-    if not traits.moves:
-        stuck = _stall_reason(source, context, (*told, *found), traits)
-        if stuck is not None:
-            found.insert(0, stuck)
-    return found
-
-
-def _near_limits(context: StepContext) -> list[Reason]:
-    limits, moving = context.settings.limits, context.state.block.command
-    found = []
-    for j, name in enumerate(context.settings.joint_names):
-        for bound, side in ((limits.position_max[j], 1.0), (limits.position_min[j], -1.0)):
-            limit = float(bound) - side * limits.position_margin
-            room = side * (limit - float(context.q[j]))
-            if room < NEAR_LIMIT and side * moving[j] > 0.0:
-                hint = f"joint {name} is {max(room, 0.0):.3f} from its limit less the margin, and moves towards it"
-                found.append(Reason("NEAR_LIMIT", "info", name, float(context.q[j]), limit, "rad or m", hint))
-    return found
-
-
-def _near_singular(source: LawRun, context: StepContext) -> list[Reason]:
-    """By the pivots of the pixels' normal matrix: a small one is a motion that takes much and shows little."""
-    if context.prediction is None or context.weights is None:
-        return []
-    from_pivots = image_conditioning(context, source)
-    if from_pivots >= NEAR_SINGULAR or len(context.q) > 6:
-        return []
-    hint = "some motion of the body takes large joint motions here: expect it to be slow, or go round the singularity"
-    return [Reason("NEAR_SINGULAR", "info", "", from_pivots, NEAR_SINGULAR, "", hint)]
-
-
-def image_conditioning(context: StepContext, source: LawRun) -> float:
-    """Smallest Cholesky pivot of the normal matrix of all seen pixels over its largest diagonal; 0: singular."""
-    assert context.prediction is not None
-    assert context.weights is not None
-    n = len(context.q)
-    J = np.ascontiguousarray(context.prediction.jacobian).reshape(-1, n)
-    weights = np.repeat((context.weights * source.used[:, None] > 0.0).astype(np.float64).reshape(-1), 2)
-    _, conditioning = damped_least_squares(J, np.zeros(len(J)), weights, 0.0)
-    return float(conditioning)
-
-
-def _few_markers(source: LawRun, context: StepContext, traits: _ProgressTraits) -> list[Reason]:
-    if context.weights is None:
-        return []
-    usable = context.weights * source.used[:, None]
-    if traits.wanted is not None:
-        usable = usable * traits.wanted
-    seen = int((usable.max(axis=0) > 0.0).sum())
-    if seen >= FEW_MARKERS:
-        return []
-    hint = f"{seen} of the goal's markers are seen: one more that is hidden stops the arm, and the noise counts in full"
-    return [Reason("FEW_MARKERS", "info", "", float(seen), float(FEW_MARKERS), "markers", hint)]
-
-
-def _tail(source: LawRun) -> Reason | None:
-    error = source.error_px
-    if error is None or not source.tolerance_px < error < TAIL * source.tolerance_px:
-        return None
-    left_s = _decay_s(source, error)
-    if left_s < TAIL_S:
-        return None
-    gain = gain_at(GainCurve(source.gain_near, source.gain_far, source.gain_slope), error)
-    hint = (
-        f"near the goal the error falls to a third in {1.1 / gain:.1f} s: a higher gain (or one that rises near the "
-        "goal), or a wider tolerance, is faster"
-    )
-    return Reason("LOW_GAIN", "info", "", left_s, TAIL_S, "s", hint)
-
-
-def _stall_reason(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: _ProgressTraits
-) -> Reason | None:
-    error, since_s = source.error_px, source.moved_s - source.watch.least_s
-    if error is None or error <= source.tolerance_px or since_s < STUCK_S:
-        return None
-    codes = {reason.code: reason for reason in reversed(told)}
-    cause = next((codes[code] for code in CAUSES if code in codes), None)
-    noise = _noise_px(source, context)
-    if error <= NOISE_SIGMAS * noise:
-        cause = None
-        why = (
-            f"most probably the tolerance of {source.tolerance_px:g} px is below what the images allow: a marker has "
-            f"a deviation of {noise:.3f} px; widen it"
-        )
-    elif cause is not None:
-        why = f"most probably {cause.code} {cause.subject}".rstrip() + f": {cause.hint}"
-    elif traits.local_law:
-        law = traits.local_law
-        sure = " or ".join((*LAWS.on_path("straight")[:1], *LAWS.on_path("planned")[:1]))
-        why = f"most probably law {law!r} rests in a minimum beside the goal: take {sure}"
-    else:
-        why = "nothing holds it up that is known: has the goal's body another shape, or has a camera or marker moved?"
-    hint = f"the error is {error:.3f} px, no smaller for {since_s:.0f} s; {why}"
-    return Reason(
-        "STUCK", "slow", "" if cause is None else cause.subject, error, source.tolerance_px, "px", hint
-    )
-
-
-def _noise_px(source: LawRun, context: StepContext) -> float:
-    """Largest deviation [px] of one observation of a marker that is seen."""
-    if context.weights is None:
-        return 0.0
-    usable = context.weights * source.used[:, None]
-    if not bool((usable > 0.0).any()):
-        return 0.0
-    return 1.0 / float(usable[usable > 0.0].min())
