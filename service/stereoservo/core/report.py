@@ -9,7 +9,7 @@ from operator import is_
 
 import numpy as np
 
-from stereoservo.core.camera_state import CameraTiming
+from stereoservo.core.camera_state import CameraEstimate, CameraTiming
 from stereoservo.core.context import COMPILING, SourceOutput, StepContext
 from stereoservo.core.cycle import Event, Status, StepOutputs
 from stereoservo.core.estimate import masked_ids
