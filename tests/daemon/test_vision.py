@@ -205,6 +205,36 @@ def test_a_camera_that_falls_silent_is_opened_anew(bench: Bench) -> None:
     assert bench.camera.calls.count("configure") == 2
 
 
+@pytest.mark.parametrize("true_hz", [29.0, 30.0, 31.0, 45.0, 60.0])
+def test_a_camera_is_looked_at_seldom_and_its_frames_are_taken_soon(bench: Bench, true_hz: float) -> None:
+    """Of a camera that is described with 30 Hz; jitter of its frames is a tenth of its period."""
+    rng, poll_s, looks, waited = np.random.default_rng(1), 0.002, [0], []
+    due = [(k + 0.1 * rng.random()) / true_hz for k in range(1, round(10 * true_hz))]
+    start_ns = bench.clock.now_ns()
+
+    def poll() -> list[CameraObservation]:
+        now_s = (bench.clock.now_ns() - start_ns) * 1e-9
+        looks[0] += 1
+        arrived = 0
+        while due and due[0] <= now_s:
+            waited.append(now_s - due.pop(0))
+            arrived += 1
+        return [observation(len(waited), bench.clock.now_ns())] if arrived else []
+
+    bench.camera.poll = poll  # type: ignore[method-assign]
+    loop = camera_loop(
+        bench.pipeline, lambda kind, text: None, bench.clock.now_ns,
+        camera="left", poll_s=poll_s, period_s=1.0 / 30.0,
+    )  # fmt: skip
+    while due:
+        bench.clock.sleep(next(loop))
+    late = np.sort(waited[30:])
+    if true_hz < 40.0:
+        assert looks[0] < 5 * len(waited)  # 8 without the rhythm
+        assert late[round(0.9 * len(late))] <= poll_s + 1e-9
+    assert late[-1] <= max(1.0 / 30.0 - 0.9 / true_hz, 0.1 / true_hz) + 2 * poll_s
+
+
 def test_reports_wait_for_a_gateway_that_is_not_up_yet(tmp_path: Path) -> None:
     reporter = Reporter(tmp_path / "reports.sock", "vision-left", VirtualClock())
     reporter.report("camera_lost", "first")
