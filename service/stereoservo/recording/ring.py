@@ -28,7 +28,7 @@ AFTER_FAULT_S = 5.0
 """What is kept of a fault goes on for so long after it."""
 WAITING_BYTES = 16 << 20
 CLOSING_S = 3.0
-GATHERING_S = 0.1
+GATHERING_S = 0.04
 """Between two batches that are written: a thread that is woken for each message costs more than it writes."""
 
 Report = Callable[[str, str], None]
