@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import Event, encode
+from stereoservo.core.cycle import Event, check_observation, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import core_settings
 from stereoservo.core.state_encoding import encode_state
@@ -22,6 +22,7 @@ from stereoservo.daemon.ipc_messages import (
     Heartbeat,
     Hello,
     ServoState,
+    encode_observation,
     event_decoder,
     state_decoder,
     unpack_step_message,
@@ -570,11 +571,16 @@ def test_an_observation_of_wrong_shapes_never_reaches_the_core(
     now = bench.clock.now_ns()
     good = CameraObservation("left", 1, now, now, np.arange(3), np.zeros((3, 2)), np.zeros((3, 2, 2)))
     slot = bench.directories.observation_slot("left")
+    with pytest.raises(ValueError, match="needed"):  # a vision process takes none of its driver
+        check_observation(msgspec.structs.replace(good, **change))
     with SlotWriter(slot, OBSERVATION_CAPACITY, OBSERVATION_LAYOUT) as writer:
-        writer.write(encode(msgspec.structs.replace(good, **change)))
-        assert bench.links.observations() == ()
-        writer.write(encode(good))
-        assert len(bench.links.observations()) == 1
+        for data in (encode_observation(good)[:-8], encode_observation(good) + bytes(8)):
+            writer.write(data)
+            assert bench.links.observations() == ()
+        writer.write(encode_observation(good))
+        (taken,) = bench.links.observations()
+        check_observation(taken)
+        assert encode(taken) == encode(good)
     bench.links.close()
 
 

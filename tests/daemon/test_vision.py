@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import encode
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
     PRIOR_LAYOUT,
-    observation_decoder,
+    decode_observation,
+    encode_prior,
     report_decoder,
 )
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter
@@ -95,7 +95,7 @@ class Bench:
 
     def seen(self) -> int | None:
         data = self.newest.poll()
-        return None if data is None else observation_decoder.decode(data).seq
+        return None if data is None else decode_observation(data).seq
 
 
 @pytest.fixture
@@ -137,7 +137,7 @@ def test_a_detector_gets_a_fresh_prior_and_no_stale_one(tmp_path: Path) -> None:
     prior = Prior(
         "left", bench.clock.now_ns(), np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2))
     )
-    bench.priors.write(encode(prior))
+    bench.priors.write(encode_prior(prior))
     for _ in range(2):  # the second frame of the same prior gets it, too
         bench.camera.arriving = [bench.frame(2)]
         bench.pipeline.poll()
@@ -251,7 +251,7 @@ def test_reports_wait_for_a_gateway_that_is_not_up_yet(tmp_path: Path) -> None:
 
 def test_a_prior_that_cannot_be_read_is_left_out(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     prior = Prior("left", 5, np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2)))
-    bench.priors.write(encode(prior))
+    bench.priors.write(encode_prior(prior))
     assert bench.links.newest_prior() is not None
     for _ in range(5):
         bench.priors.write(b"\xff" * 100)

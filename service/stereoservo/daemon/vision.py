@@ -26,8 +26,9 @@ from stereoservo.daemon.ipc_messages import (
     PlanError,
     Report,
     RunPlan,
+    decode_prior,
+    encode_observation,
     load_plan,
-    prior_decoder,
 )
 from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
@@ -112,14 +113,14 @@ class VisionSlots:
         data = self._priors.poll()
         if data is not None:
             try:
-                self._prior = prior_decoder.decode(data)
+                self._prior = decode_prior(data)
             except Exception as error:  # a decoder may raise anything
                 self._boundary.refuse(error)
         return self._prior
 
     def publish_observation(self, observation: CameraObservation) -> None:
         """Replace the observation."""
-        self._observations.write(encode(observation))
+        self._observations.write(encode_observation(observation))
 
     def close(self) -> None:
         """Release both slots. Idempotent."""
