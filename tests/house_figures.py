@@ -157,8 +157,7 @@ def vision_path() -> CallPath:
         scenes = importlib.import_module("house_detectors.scenes")
     finally:
         sys.path.pop(0)
-    from stereoservo.core.cycle import encode
-    from stereoservo.daemon.ipc_messages import PRIOR_CAPACITY, PRIOR_LAYOUT
+    from stereoservo.daemon.ipc_messages import PRIOR_CAPACITY, PRIOR_LAYOUT, encode_prior
     from stereoservo.daemon.seqlock import SlotWriter
     from stereoservo.daemon.vision import CameraPipeline, VisionSlots
     from stereoservo.messages.directories import CellDirectories
@@ -175,9 +174,9 @@ def vision_path() -> CallPath:
         links = VisionSlots(directories, "left")
         pipeline = CameraPipeline(Driver(), scenes.make_detector(), links, scenes.Still())  # type: ignore[arg-type]
         pipeline.poll()
-        priors.write(encode(shot.prior()))
+        priors.write(encode_prior(shot.prior()))
         pipeline.poll()
-        priors.write(encode(shot.prior()))
+        priors.write(encode_prior(shot.prior()))
         path = traced(pipeline.poll)
         links.close()
         priors.close()

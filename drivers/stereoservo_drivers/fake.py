@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
@@ -203,6 +203,7 @@ class FakeCameraDriver(SimulatedCamera):
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         self._fake = decode_options(FakeCameraOptions, options, self.driver)
+        self._view: tuple[Any, ...] = ()
         super().__init__(self._fake, context)
 
     def describe(self) -> CameraDescription:
@@ -216,12 +217,12 @@ class FakeCameraDriver(SimulatedCamera):
     ) -> CameraObservation:
         """The markers that this camera sees with the ``arm`` where it is."""
         q, camera = arm.middle, self.camera.focused(self.focus)
-        pixels = self._image_of(camera, q)
+        pixels, seen = self._without_noise(camera, q)
         if arm.moves:
             for marker in range(len(pixels)):
                 for _ in range(SHUTTER_ROUNDS):
                     pixels[marker] = self._image_of(camera, arm.at(pixels[marker, 1]))[marker]
-        seen, ids = self.cell.visible(q, camera), self.cell.body.ids
+        ids = self.cell.body.ids
         part, pose = self.cell.workpiece, self.workpiece_pose()
         if part is not None and pose is not None:
             beside, _ = self.cell.in_world(camera, q).image_of(part.marker_positions(pose))
@@ -241,6 +242,13 @@ class FakeCameraDriver(SimulatedCamera):
             pixels=(pixels + noise)[seen],
             covariances=np.broadcast_to(np.eye(2) * sigma**2, (k, 2, 2)).copy(),
         )
+
+    def _without_noise(self, camera: PinholeCamera, q: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (k, 2) of the body's markers, and which of them are seen (k,): of an arm at rest those of before."""
+        view = (q.tobytes(), self.camera, self.focus)
+        if not self._view or self._view[:3] != view:
+            self._view = (*view, self._image_of(camera, q), self.cell.visible(q, camera))
+        return self._view[3].copy(), self._view[4].copy()
 
     def _image_of(self, camera: PinholeCamera, q: FloatArray) -> FloatArray:
         return self.cell.in_world(camera, q).image_of(self.cell.marker_positions(q))[0]

@@ -8,17 +8,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import encode
+from stereoservo.core.cycle import check_observation, encode
 from stereoservo.daemon.ipc_messages import (
     decode_observation,
+    decode_prior,
+    encode_observation,
+    encode_prior,
     event_decoder,
-    prior_decoder,
     report_decoder,
     state_decoder,
     to_servo_decoder,
     unpack_step_message,
 )
 from stereoservo.messages.decoding import RecordBoundary
+from stereoservo.ports.devices import CameraObservation, Prior
 
 CASES = [400, pytest.param(100_000, marks=[pytest.mark.slow, pytest.mark.timeout(7200)])]
 
@@ -39,6 +42,26 @@ def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.parametrize("k", [0, 1, 256])
+def test_observations_and_priors_come_back_bit_for_bit(k: int) -> None:
+    rng = np.random.default_rng(k)
+    ids, pixels, covariances = (
+        rng.permutation(1000)[:k] - 500,
+        rng.normal(size=(k, 2)),
+        rng.normal(size=(k, 2, 2)),
+    )
+    pixels[:1, 0] = np.nan
+    observation = CameraObservation("links-ü", 2**62, -5, 2**40, ids, pixels, covariances)
+    prior = Prior("right", 7, ids, pixels, rng.normal(size=(k, 2)), covariances)
+    assert encode(decode_observation(encode_observation(observation))) == encode(observation)
+    assert encode(decode_prior(encode_prior(prior))) == encode(prior)
+    one = msgspec.structs.replace(observation, ids=ids.astype(np.uint8), pixels=np.asfortranarray(pixels))
+    check_observation(one)
+    taken = decode_observation(encode_observation(one))
+    np.testing.assert_array_equal(taken.ids, one.ids)
+    np.testing.assert_array_equal(taken.pixels, pixels)
+
+
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of numbers that overflow
 @pytest.mark.parametrize("count", CASES)
 def test_a_damaged_observation_ends_no_step(bench: Any, count: int) -> None:
@@ -55,7 +78,7 @@ def test_a_damaged_observation_ends_no_step(bench: Any, count: int) -> None:
         newest = msgspec.structs.replace(last.observations[0], seq=10_000 + k, t_shutter_ns=now - 1_000_000)
         inputs = None
         with boundary:
-            observation = decode_observation(damaged(encode(newest), rng))
+            observation = decode_observation(damaged(encode_observation(newest), rng))
             inputs = msgspec.structs.replace(last, now_ns=now, observations=(observation,), joints=None)
             taken += 1
         if inputs is not None:
@@ -68,10 +91,10 @@ def test_a_damaged_observation_ends_no_step(bench: Any, count: int) -> None:
 @pytest.mark.parametrize(
     "decode",
     [
-        prior_decoder.decode, event_decoder.decode, state_decoder.decode, unpack_step_message,
+        decode_observation, decode_prior, event_decoder.decode, state_decoder.decode, unpack_step_message,
         report_decoder.decode, to_servo_decoder.decode,
     ],
-    ids=["prior", "event", "state", "steps", "report", "to_servo"],
+    ids=["observation", "prior", "event", "state", "steps", "report", "to_servo"],
 )  # fmt: skip
 def test_foreign_records_are_left_out(decode: Any) -> None:
     rng = np.random.default_rng(3)

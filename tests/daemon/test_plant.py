@@ -97,6 +97,40 @@ def test_orders_reach_the_drives_and_stop_them_when_they_cease(cell: Cell) -> No
     assert not cell.driver.read_state().velocities.any()
 
 
+def test_at_rest_the_drives_are_told_so_often_enough_and_obey_motion_and_stop_at_once(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[int, bool]] = []
+    write = cell.fake.write_velocity
+
+    def noted(velocities: Any) -> Any:
+        told.append((cell.clock.now_ns(), bool(velocities.any())))
+        return write(velocities)
+
+    monkeypatch.setattr(cell.fake, "write_velocity", noted)
+    cell.driver.activate()
+    rest, motion = np.zeros(6), np.full(6, 0.1)
+    for _ in range(100):
+        cell.driver.write_velocity(rest)
+        cell.run(0.004)
+    times = np.array([t_ns for t_ns, _ in told])
+    assert 10 < len(told) < 30  # of 100 orders
+    assert np.diff(times).max() <= 0.25e9 * TIMEOUT_S
+    cell.driver.write_velocity(motion)
+    cell.run(0.001)
+    assert told[-1] == (cell.clock.now_ns(), True)
+    cell.run(0.02)
+    cell.driver.write_velocity(rest)
+    cell.run(0.001)
+    assert told[-1] == (cell.clock.now_ns(), False)
+    cell.driver.write_velocity(rest)
+    stopped: list[int] = []
+    monkeypatch.setattr(cell.fake, "stop", lambda: stopped.append(cell.clock.now_ns()))
+    cell.driver.stop()
+    cell.run(0.001)
+    assert stopped == [cell.clock.now_ns()]
+
+
 def test_a_velocity_beyond_the_drives_limit_is_told(cell: Cell) -> None:
     cell.driver.activate()
     beyond = 10.0 * np.array([joint.velocity_max for joint in cell.driver.describe().joints])

@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import Event, encode
+from stereoservo.core.cycle import Event, check_observation, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import core_settings
+from stereoservo.core.state_encoding import encode_state
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
@@ -21,6 +22,7 @@ from stereoservo.daemon.ipc_messages import (
     Heartbeat,
     Hello,
     ServoState,
+    encode_observation,
     event_decoder,
     state_decoder,
     unpack_step_message,
@@ -57,6 +59,7 @@ from stereoservo.ports.devices import (
     JointSpec,
     JointState,
 )
+from stereoservo.recording import step_records
 from stereoservo.recording.step_layout import decode_step
 from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart
 
@@ -430,7 +433,9 @@ def test_a_restarted_gateway_gets_the_events_that_it_missed_and_no_other(bench: 
     assert [event.seq for event in bench.events] == list(range(1, known + 2))
 
 
-def test_records_begin_with_a_checkpoint_and_a_full_ring_makes_a_counted_gap(bench: Bench) -> None:
+def test_records_begin_with_a_checkpoint_and_a_full_ring_makes_a_counted_gap(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ring = RingReader(bench.directories.steps_ring)
     bench.run(4)
     assert ring.read(100) == []  # nobody reads yet: nothing is written
@@ -447,16 +452,22 @@ def test_records_begin_with_a_checkpoint_and_a_full_ring_makes_a_counted_gap(ben
     writer = bench.links._steps
     while writer.write(filled):
         pass
+    encoded: list[int] = []
+    monkeypatch.setattr(
+        step_records, "encode_state", lambda state: encoded.append(state.step) or encode_state(state)
+    )
     while bench.process._stream.dropped == 0:
         bench.run(50)
-    dropped_first = bench.process._stream.dropped
+    bench.run(100)
+    pause = bench.process._stream._try_again
+    assert np.diff(encoded).min() > pause > 10  # the whole state is not encoded in every step
     drained = [unpack_step_message(data) for data in ring.read(100_000) if data != filled]
     assert not any(isinstance(r, RecordedCheckpoint) and r.lost for r in drained)
     last = max(decode_step(r.data).step for r in drained if isinstance(r, RecordedStep))
-    bench.run(2)
+    bench.run(pause + 2)
     gap, after, *_ = [unpack_step_message(data) for data in ring.read(100)]
     assert isinstance(gap, RecordedCheckpoint)
-    assert gap.lost == dropped_first
+    assert gap.lost == bench.process._stream.dropped
     assert isinstance(after, RecordedStep)
     assert decode_step(after.data).step == last + gap.lost + 1
     ring.detach()
@@ -560,11 +571,16 @@ def test_an_observation_of_wrong_shapes_never_reaches_the_core(
     now = bench.clock.now_ns()
     good = CameraObservation("left", 1, now, now, np.arange(3), np.zeros((3, 2)), np.zeros((3, 2, 2)))
     slot = bench.directories.observation_slot("left")
+    with pytest.raises(ValueError, match="needed"):  # a vision process takes none of its driver
+        check_observation(msgspec.structs.replace(good, **change))
     with SlotWriter(slot, OBSERVATION_CAPACITY, OBSERVATION_LAYOUT) as writer:
-        writer.write(encode(msgspec.structs.replace(good, **change)))
-        assert bench.links.observations() == ()
-        writer.write(encode(good))
-        assert len(bench.links.observations()) == 1
+        for data in (encode_observation(good)[:-8], encode_observation(good) + bytes(8)):
+            writer.write(data)
+            assert bench.links.observations() == ()
+        writer.write(encode_observation(good))
+        (taken,) = bench.links.observations()
+        check_observation(taken)
+        assert encode(taken) == encode(good)
     bench.links.close()
 
 

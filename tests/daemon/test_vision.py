@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereoservo.core.cycle import encode
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
     PRIOR_LAYOUT,
-    observation_decoder,
+    decode_observation,
+    encode_prior,
     report_decoder,
 )
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter
@@ -95,7 +95,7 @@ class Bench:
 
     def seen(self) -> int | None:
         data = self.newest.poll()
-        return None if data is None else observation_decoder.decode(data).seq
+        return None if data is None else decode_observation(data).seq
 
 
 @pytest.fixture
@@ -137,7 +137,7 @@ def test_a_detector_gets_a_fresh_prior_and_no_stale_one(tmp_path: Path) -> None:
     prior = Prior(
         "left", bench.clock.now_ns(), np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2))
     )
-    bench.priors.write(encode(prior))
+    bench.priors.write(encode_prior(prior))
     for _ in range(2):  # the second frame of the same prior gets it, too
         bench.camera.arriving = [bench.frame(2)]
         bench.pipeline.poll()
@@ -205,6 +205,36 @@ def test_a_camera_that_falls_silent_is_opened_anew(bench: Bench) -> None:
     assert bench.camera.calls.count("configure") == 2
 
 
+@pytest.mark.parametrize("true_hz", [29.0, 30.0, 31.0, 45.0, 60.0])
+def test_a_camera_is_looked_at_seldom_and_its_frames_are_taken_soon(bench: Bench, true_hz: float) -> None:
+    """Of a camera that is described with 30 Hz; jitter of its frames is a tenth of its period."""
+    rng, poll_s, looks, waited = np.random.default_rng(1), 0.002, [0], []
+    due = [(k + 0.1 * rng.random()) / true_hz for k in range(1, round(10 * true_hz))]
+    start_ns = bench.clock.now_ns()
+
+    def poll() -> list[CameraObservation]:
+        now_s = (bench.clock.now_ns() - start_ns) * 1e-9
+        looks[0] += 1
+        arrived = 0
+        while due and due[0] <= now_s:
+            waited.append(now_s - due.pop(0))
+            arrived += 1
+        return [observation(len(waited), bench.clock.now_ns())] if arrived else []
+
+    bench.camera.poll = poll  # type: ignore[method-assign]
+    loop = camera_loop(
+        bench.pipeline, lambda kind, text: None, bench.clock.now_ns,
+        camera="left", poll_s=poll_s, period_s=1.0 / 30.0,
+    )  # fmt: skip
+    while due:
+        bench.clock.sleep(next(loop))
+    late = np.sort(waited[30:])
+    if true_hz < 40.0:
+        assert looks[0] < 5 * len(waited)  # 8 without the rhythm
+        assert late[round(0.9 * len(late))] <= poll_s + 1e-9
+    assert late[-1] <= max(1.0 / 30.0 - 0.9 / true_hz, 0.1 / true_hz) + 2 * poll_s
+
+
 def test_reports_wait_for_a_gateway_that_is_not_up_yet(tmp_path: Path) -> None:
     reporter = Reporter(tmp_path / "reports.sock", "vision-left", VirtualClock())
     reporter.report("camera_lost", "first")
@@ -221,7 +251,7 @@ def test_reports_wait_for_a_gateway_that_is_not_up_yet(tmp_path: Path) -> None:
 
 def test_a_prior_that_cannot_be_read_is_left_out(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     prior = Prior("left", 5, np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2)))
-    bench.priors.write(encode(prior))
+    bench.priors.write(encode_prior(prior))
     assert bench.links.newest_prior() is not None
     for _ in range(5):
         bench.priors.write(b"\xff" * 100)

@@ -147,6 +147,7 @@ def test_installed_kernels_are_used_where_they_fit(acme: Path, tmp_path: Path) -
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_a_release_s_kernels_in_a_fresh_environment(tmp_path: Path) -> None:
     root = Path(__file__).parents[2]
     python = tmp_path / "venv" / "bin" / "python"
@@ -160,7 +161,7 @@ def test_a_release_s_kernels_in_a_fresh_environment(tmp_path: Path) -> None:
 
     do(sys.executable, "-m", "venv", str(tmp_path / "venv"))
     install = (str(python), "-m", "pip", "install", "--quiet", "--constraint", str(root / "constraints.txt"))
-    do(*install, str(root), "hatchling")
+    do(*install, f"{root}[demo]", "hatchling")
     wheel = (
         str(python),
         "-m",

@@ -1,5 +1,6 @@
-"""Messages between the processes of one cell as structs with msgpack codecs (run plan, requests, heartbeats, servo
-state, reports), and the capacities and layouts of their shared-memory slots.
+"""Messages between the processes of one cell: structs with msgpack codecs (run plan, requests, heartbeats, servo state,
+reports), and, what passes with every frame, bytes of fixed places; the capacities and layouts of their shared-memory
+slots.
 """
 
 from __future__ import annotations
@@ -8,8 +9,9 @@ import struct
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
-from stereoservo.core.cycle import Event, Status, check_observation, decode_array, encode
+from stereoservo.core.cycle import Event, Status, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import CameraSection, CellFile
@@ -19,6 +21,7 @@ from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.messages.goals import Request
 from stereoservo.messages.recording_request import RecordedImages
 from stereoservo.messages.servo_state import COMMISSIONING_SPEED, MAX_PLAN_BYTES, LoopStatistics, plan_path
+from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
@@ -29,8 +32,8 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.recording.step_records import RecordedStep, StepMessage
 
-OBSERVATION_LAYOUT = "CameraObservation.1"
-PRIOR_LAYOUT = "Prior.1"
+OBSERVATION_LAYOUT = "CameraObservation.2"
+PRIOR_LAYOUT = "Prior.2"
 OBSERVATION_CAPACITY = 1 << 16
 PRIOR_CAPACITY = 1 << 16
 STATE_CAPACITY = 1 << 16
@@ -130,11 +133,59 @@ class Report(msgspec.Struct, frozen=True):
     """Of a recording of images that has ended."""
 
 
+def encode_observation(observation: CameraObservation) -> bytes:
+    """An observation of right shapes (`core.cycle.check_observation`) as bytes of fixed places."""
+    name, o = observation.camera.encode(), observation
+    head = _OBSERVATION.pack(len(name), len(o.ids), o.seq, o.t_shutter_ns, o.t_received_ns)
+    return head + _padded(name) + _places(o.ids, o.pixels, o.covariances)
+
+
 def decode_observation(data: bytes) -> CameraObservation:
-    """An observation with arrays of the right shapes. Raises msgspec.MsgspecError, ValueError."""
-    observation = observation_decoder.decode(data)
-    check_observation(observation)
-    return observation
+    """Inverse of :func:`encode_observation`. Raises ValueError, before anything is allocated."""
+    name, k, (seq, shutter_ns, received_ns), numbers = _apart(data, _OBSERVATION, 7)
+    return CameraObservation(
+        name, seq, shutter_ns, received_ns, np.ndarray((k,), np.int64, numbers),
+        np.ndarray((k, 2), np.float64, numbers, 8 * k), np.ndarray((k, 2, 2), np.float64, numbers, 24 * k),
+    )  # fmt: skip
+
+
+def encode_prior(prior: Prior) -> bytes:
+    """A prior as bytes of fixed places."""
+    name = prior.camera.encode()
+    head = _PRIOR.pack(len(name), len(prior.ids), prior.t_ns)
+    return head + _padded(name) + _places(prior.ids, prior.pixels, prior.velocities, prior.covariances)
+
+
+def decode_prior(data: bytes) -> Prior:
+    """Inverse of :func:`encode_prior`. Raises ValueError, before anything is allocated."""
+    name, k, (t_ns,), numbers = _apart(data, _PRIOR, 9)
+    return Prior(
+        name, t_ns, np.ndarray((k,), np.int64, numbers), np.ndarray((k, 2), np.float64, numbers, 8 * k),
+        np.ndarray((k, 2), np.float64, numbers, 24 * k), np.ndarray((k, 2, 2), np.float64, numbers, 40 * k),
+    )  # fmt: skip
+
+
+def _places(ids: IntArray, *numbers: FloatArray) -> bytes:
+    parts = [ids.astype(np.int64, copy=False).tobytes()]
+    parts += [array.astype(np.float64, copy=False).tobytes() for array in numbers]
+    return b"".join(parts)
+
+
+def _apart(data: bytes, head: struct.Struct, words: int) -> tuple[str, int, tuple[int, ...], bytearray]:
+    """Camera, number of markers, numbers of the head, and ``words`` of 8 bytes a marker."""
+    if len(data) < head.size:
+        raise ValueError(f"{len(data)} bytes; the head alone has {head.size}")
+    length, k, *stamps = head.unpack_from(data)
+    at = head.size + length + -length % 8
+    if len(data) != at + 8 * words * k:
+        raise ValueError(
+            f"{len(data)} bytes; {k} markers and a name of {length} bytes have {at + 8 * words * k}"
+        )
+    return data[head.size : head.size + length].decode(), k, tuple(stamps), bytearray(data[at:])
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % 8)
 
 
 def pack_step_message(message: StepMessage) -> bytes:
@@ -160,9 +211,11 @@ class PlanError(DamagedError):
 to_servo_decoder = msgspec.msgpack.Decoder(ToServo, dec_hook=decode_array)
 event_decoder = msgspec.msgpack.Decoder(Event, dec_hook=decode_array)
 state_decoder = msgspec.msgpack.Decoder(ServoState, dec_hook=decode_array)
-observation_decoder = msgspec.msgpack.Decoder(CameraObservation, dec_hook=decode_array)
-prior_decoder = msgspec.msgpack.Decoder(Prior, dec_hook=decode_array)
 _steps_decoder = msgspec.msgpack.Decoder(StepMessage, dec_hook=decode_array)
+_OBSERVATION, _PRIOR = struct.Struct("<IIqqq"), struct.Struct("<IIq")
+"""Bytes of the camera's name, markers; sequence number and stamps. Name, ids, pixels and what else there is follow,
+each from a multiple of 8 bytes on.
+"""
 _STEP = struct.Struct("<IIq")
 """Before a step in the ring: mark, steps lost before it, time. What is rare is msgpack, which no mark begins."""
 _STEP_MARK = 0xC1C1C1C1  # a byte that msgpack never uses

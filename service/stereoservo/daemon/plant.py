@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -32,7 +32,6 @@ from stereoservo.daemon.plant_driver import (
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import AuxiliaryDriver, Clock, DriverError, JointDriver
@@ -42,6 +41,8 @@ MOVING_RATE_HZ = 1000.0
 SETTLES_NS = 500_000_000
 """For so long after the last motion the plant keeps this pace."""
 FAILED_READ_EVERY_NS = 100_000_000
+REPEAT_NS = 20_000_000
+"""At rest: how often the order to stay there is repeated to the drives, at least; four times in their time-out."""
 EXIT_SETUP = 3
 
 
@@ -68,26 +69,31 @@ class PlantProcess:
             self.session, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan)
         )
         """The newest orders that were obeyed."""
-        self._state = PlantState(
-            self.session, 0, 0, 0, 0, joints, False, False, np.zeros((4, joints)), self._done.auxiliary, b""
-        )
+        self._values = np.zeros((4, joints))
         self._remarks = Remarks()
+        self._state = PlantState(
+            self.session, 0, 0, 0, 0, joints, False, False,
+            self._values.tobytes() + self._done.auxiliary.tobytes(), msgspec.msgpack.encode(self._remarks),
+        )  # fmt: skip
         self._configured = False
-        self._moved_ns = self._read_ns = 0
+        self._moved_ns = self._read_ns = self._ordered_ns = 0
+        self._repeat_ns = min(REPEAT_NS, round(0.25e9 * self._description.command_timeout_s))
         self._orders = SlotReader(directories.plant_orders_slot, PLANT_ORDERS_LAYOUT)
         self._slot = SlotWriter(directories.plant_state_slot, PLANT_CAPACITY, PLANT_STATE_LAYOUT)
 
     def step(self) -> None:
         """Obey what was ordered since the last step, bring the drives up to now, and tell their state."""
         record = self._orders.poll()
-        if record is not None:
-            orders = Orders.decoded(record, len(self._done.velocities))
-            if orders.session == self.session:
-                self._obey(orders)
-        if self._configured and self._clock.now_ns() >= self._read_ns:
-            with self._failing():
+        try:
+            if record is not None:
+                orders = Orders.decoded(record, len(self._done.velocities))
+                if orders.session == self.session and not self._repeats(orders):
+                    self._obey(orders)
+            if self._configured and self._clock.now_ns() >= self._read_ns:
                 self._read()
-        self._slot.write(self._state._replace(remarks=msgspec.msgpack.encode(self._remarks)).encoded())
+        except DriverError as error:
+            self._fail(error)
+        self._slot.write(self._state.encoded())
         self._beat(PLANT_HANG_S)
 
     @property
@@ -95,30 +101,44 @@ class PlantProcess:
         """Whether the arm moves, or did a short while ago."""
         return self._clock.now_ns() - self._moved_ns < SETTLES_NS
 
+    def _repeats(self, orders: Orders) -> bool:
+        """Whether these orders are to stay at rest, as those before, and the drives were told so a moment ago."""
+        done = self._done
+        return (
+            orders.velocity_number != done.velocity_number  # nothing else is new
+            and (orders.call, orders.stops) == (done.call, done.stops)
+            and (orders.auxiliary_number, orders.auxiliary_stops)
+            == (done.auxiliary_number, done.auxiliary_stops)
+            and not (orders.velocities.any() or done.velocities.any())
+            and 0 <= self._clock.now_ns() - self._ordered_ns < self._repeat_ns
+        )
+
     def _obey(self, orders: Orders) -> None:
-        """Do what is ordered and was not done yet: the stop first, then lifecycle calls, then motion."""
+        """Do what is ordered and was not done yet: the stop first, then lifecycle calls, then motion. Raises
+        DriverError.
+        """
         done, self._done = self._done, orders
         if orders.stops != done.stops:
             self.driver.stop()
         if orders.auxiliary_stops != done.auxiliary_stops and self._auxiliary is not None:
             self._auxiliary.stop_auxiliary()
-        with self._failing():
-            if orders.call != done.call:
-                self._state = self._state._replace(call=orders.call)
-                self._read_ns = 0
-                self._beat(DRIVER_CALL_S)
-                self._change(active=orders.active)
-            if orders.velocity_number != done.velocity_number and orders.active:
-                report = self.driver.write_velocity(orders.velocities)
-                differs = not np.array_equal(report.sent, orders.velocities)
-                sent = tuple(report.sent.tolist()) if differs else ()
-                if (report.reasons, sent) != (self._remarks.reasons, self._remarks.sent):
-                    self._remarks = Remarks(reasons=report.reasons, sent=sent)
-            if orders.auxiliary_number != done.auxiliary_number and self._auxiliary is not None:
-                values = dict(zip(self._names, orders.auxiliary.tolist(), strict=True))
-                asked = {name: value for name, value in values.items() if value == value}
-                if asked:
-                    self._auxiliary.write_auxiliary(asked)
+        if orders.call != done.call:
+            self._state = self._state._replace(call=orders.call)
+            self._read_ns = 0
+            self._beat(DRIVER_CALL_S)
+            self._change(active=orders.active)
+        if orders.velocity_number != done.velocity_number and orders.active:
+            self._ordered_ns = self._clock.now_ns()
+            report = self.driver.write_velocity(orders.velocities)
+            differs = not np.array_equal(report.sent, orders.velocities)
+            sent = tuple(report.sent.tolist()) if differs else ()
+            if (report.reasons, sent) != (self._remarks.reasons, self._remarks.sent):
+                self._remark(Remarks(reasons=report.reasons, sent=sent))
+        if orders.auxiliary_number != done.auxiliary_number and self._auxiliary is not None:
+            values = dict(zip(self._names, orders.auxiliary.tolist(), strict=True))
+            asked = {name: value for name, value in values.items() if value == value}
+            if asked:
+                self._auxiliary.write_auxiliary(asked)
 
     def _change(self, *, active: bool) -> None:
         if active:
@@ -131,37 +151,33 @@ class PlantProcess:
 
     def _read(self) -> None:
         sample = self.driver.read_state()
-        state = self._state
-        values = np.zeros_like(state.values)
+        values = self._values
         values[0], values[1] = sample.positions, sample.velocities
-        for row, given in ((2, sample.efforts), (3, sample.following_errors)):
-            if given is not None:
-                values[row] = given
+        values[2] = 0.0 if sample.efforts is None else sample.efforts
+        values[3] = 0.0 if sample.following_errors is None else sample.following_errors
         if self._done.velocities.any() or values[1].any():
             self._moved_ns = self._clock.now_ns()
-        self._state = state._replace(
-            seq=sample.seq, t_ns=sample.t_ns, values=values, auxiliary=self._auxiliary_values(),
+        self._state = self._state._replace(
+            seq=sample.seq, t_ns=sample.t_ns, numbers=values.tobytes() + self._auxiliary_values(),
             has_efforts=sample.efforts is not None, has_following=sample.following_errors is not None,
         )  # fmt: skip
 
-    def _auxiliary_values(self) -> FloatArray:
-        if self._auxiliary is None or not self._names:
-            return self._state.auxiliary
-        found = self._auxiliary.read_auxiliary()
-        return np.array([found.get(name, np.nan) for name in self._names])
+    def _auxiliary_values(self) -> bytes:
+        if not self._names:
+            return b""
+        found = {} if self._auxiliary is None else self._auxiliary.read_auxiliary()
+        return np.array([found.get(name, np.nan) for name in self._names]).tobytes()
 
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
-        """What the driver raises stops it and is told; it is asked for a sample again after a pause."""
-        try:
-            yield
-        except DriverError as error:
-            self.driver.stop()
-            self._remarks = Remarks(
-                error.code, str(error), error.retry, self._remarks.reasons, self._remarks.sent
-            )
-            self._state = self._state._replace(failures=self._state.failures + 1)
-            self._read_ns = self._clock.now_ns() + FAILED_READ_EVERY_NS
+    def _remark(self, remarks: Remarks) -> None:
+        self._remarks = remarks
+        self._state = self._state._replace(remarks=msgspec.msgpack.encode(remarks))
+
+    def _fail(self, error: DriverError) -> None:
+        """Stop the drives and tell what they raised; they are asked for a sample again after a pause."""
+        self.driver.stop()
+        self._remark(Remarks(error.code, str(error), error.retry, self._remarks.reasons, self._remarks.sent))
+        self._state = self._state._replace(failures=self._state.failures + 1)
+        self._read_ns = self._clock.now_ns() + FAILED_READ_EVERY_NS
 
     def close(self) -> None:
         """Brake, release. Idempotent."""

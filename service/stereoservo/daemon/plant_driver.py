@@ -7,6 +7,7 @@ missed is missing later; a plant obeys those that are addressed to its own sessi
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import time
@@ -46,7 +47,7 @@ SILENT_NS = 20_000_000
 """Without a sample for so long it is looked whether the plant's process lives."""
 
 
-class Orders(NamedTuple):
+class Orders(msgspec.Struct, eq=False):
     """What the servo process wants of the drives of plant ``session``: numbers of the newest lifecycle ``call``, of the
     ``stops``, of the velocity and of the auxiliary order ``asked``, and of ``auxiliary_stops``; ``active``: drives on.
     ``velocities`` (n,); ``auxiliary`` (m,), NaN where nothing is ordered.
@@ -64,14 +65,20 @@ class Orders(NamedTuple):
 
     def encoded(self) -> bytes:
         """As a record."""
-        return _ORDERS.pack(*self[:7]) + self.velocities.tobytes() + self.auxiliary.tobytes()
+        head = _ORDERS.pack(
+            self.session, self.call, self.active, self.stops, self.velocity_number, self.auxiliary_number,
+            self.auxiliary_stops,
+        )  # fmt: skip
+        return head + self.velocities.tobytes() + self.auxiliary.tobytes()
 
     @classmethod
     def decoded(cls, record: bytes, joints: int) -> Self:
         """From a record for so many joints."""
-        session, call, active, *numbers = _ORDERS.unpack_from(record)
+        session, call, active, stops, velocity, auxiliary, halts = _ORDERS.unpack_from(record)
         values = np.frombuffer(record, dtype=np.float64, offset=_ORDERS.size)
-        return cls._make((session, call, bool(active), *numbers, values[:joints], values[joints:]))
+        return cls(
+            session, call, bool(active), stops, velocity, auxiliary, halts, values[:joints], values[joints:]
+        )
 
 
 class Remarks(msgspec.Struct, frozen=True, array_like=True):
@@ -88,8 +95,9 @@ class Remarks(msgspec.Struct, frozen=True, array_like=True):
 
 class PlantState(NamedTuple):
     """State of a plant's drives: its ``session``, the last ``call`` that it has answered, the number of ``failures``
-    so far, and the newest sample (``seq`` 0: there is none): ``values`` (4, n) of positions, velocities, efforts and
-    following errors, of which the last two may not be there; ``auxiliary`` (m,), NaN where unknown; `Remarks`, encoded.
+    so far, and the newest sample (``seq`` 0: there is none). ``numbers``, as bytes, taken apart where they are asked
+    for: of so many ``joints`` positions, velocities, efforts and following errors, of which the last two may not be
+    there; then auxiliary values, NaN where unknown. ``remarks``: `Remarks`, encoded.
     """
 
     session: int
@@ -100,30 +108,32 @@ class PlantState(NamedTuple):
     joints: int
     has_efforts: bool
     has_following: bool
-    values: FloatArray
-    auxiliary: FloatArray
+    numbers: bytes
     remarks: bytes
 
     def encoded(self) -> bytes:
         """As a record."""
-        return _STATE.pack(*self[:8]) + self.values.tobytes() + self.auxiliary.tobytes() + self.remarks
+        return _STATE.pack(*self[:8]) + self.numbers + self.remarks
 
     @classmethod
     def decoded(cls, record: bytes, auxiliaries: int) -> Self:
         """From a record with so many auxiliary values."""
         head = _STATE.unpack_from(record)
-        count = 4 * head[5]
-        values = np.frombuffer(record, np.float64, count + auxiliaries, _STATE.size).copy()
-        tail = record[_STATE.size + 8 * values.size :]
-        return cls._make((*head, values[:count].reshape(4, -1), values[count:], tail))
+        end = _STATE.size + 8 * (4 * head[5] + auxiliaries)
+        return cls._make((*head, record[_STATE.size : end], record[end:]))
 
     def sample(self) -> JointState:
-        """The newest joint sample."""
-        positions, velocities, efforts, following = self.values
+        """The newest joint sample, in arrays of its own."""
+        values = np.frombuffer(bytearray(self.numbers), np.float64, 4 * self.joints)
+        positions, velocities, efforts, following = values.reshape(4, -1)
         return JointState(
             self.seq, self.t_ns, positions, velocities, efforts if self.has_efforts else None,
             following if self.has_following else None,
         )  # fmt: skip
+
+    def auxiliary(self) -> FloatArray:
+        """Auxiliary values (m,)."""
+        return np.frombuffer(self.numbers, np.float64, offset=32 * self.joints)
 
 
 class PlantDriver:
@@ -234,7 +244,7 @@ class PlantDriver:
         """Order velocities (n,); what was sent, and why, is of the order before. Raises DriverError."""
         orders = self._orders
         asked = np.array(qd, dtype=np.float64)
-        if asked.shape != orders.velocities.shape or not np.all(np.isfinite(asked)):
+        if asked.shape != orders.velocities.shape or not all(map(math.isfinite, asked.tolist())):
             raise DriverError(
                 "shape",
                 f"write_velocity() got {asked.tolist()}; {orders.velocities.size} finite velocities are valid",
@@ -269,7 +279,7 @@ class PlantDriver:
         """The newest known values by name."""
         if self._state is None:
             return {}
-        found = zip(self._names, self._state.auxiliary.tolist(), strict=True)
+        found = zip(self._names, self._state.auxiliary().tolist(), strict=True)
         return {name: value for name, value in found if value == value}
 
     def stop_auxiliary(self) -> None:
@@ -281,7 +291,8 @@ class PlantDriver:
     # -- records --------------------------------------------------------------------------------------------
 
     def _send(self, **changes: Any) -> None:
-        self._orders = self._orders._replace(**changes)
+        for name, value in changes.items():
+            setattr(self._orders, name, value)
         if not self._closed:  # a stop may come later than that; there is no power then
             self._writer.write(self._orders.encoded())
 

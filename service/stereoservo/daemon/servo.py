@@ -157,7 +157,7 @@ class ServoProcess:
             self._latch_fault(error, now_ns)
             return
         self._differences = report.reasons
-        if not np.array_equal(report.sent, outputs.command):
+        if report.sent is not report.asked and not np.array_equal(report.sent, outputs.command):
             self._sent = np.array(report.sent, dtype=np.float64)
 
     def _order_auxiliary(self, inputs: StepInputs, outputs: StepOutputs, now_ns: int) -> None:
@@ -269,7 +269,7 @@ class ServoProcess:
         if self._auxiliary is not None and (inputs.requests or outputs.events):
             self._order_auxiliary(inputs, outputs, now_ns)
         self._apply_driver_request(outputs, now_ns)
-        self._moving = outputs.status.source != "hold" or bool(np.any(outputs.status.command))
+        self._moving = outputs.status.source != "hold" or bool(outputs.status.command.any())
         self._publish(outputs, pacing)
         self._stream.after(inputs, outputs)
         self._beat(SERVO_HANG_S)

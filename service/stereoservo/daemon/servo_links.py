@@ -21,6 +21,7 @@ from stereoservo.daemon.ipc_messages import (
     ServoState,
     ToServo,
     decode_observation,
+    encode_prior,
     pack_step_message,
     to_servo_decoder,
 )
@@ -148,7 +149,7 @@ class ProcessLinks:
 
     def publish_prior(self, prior: Prior) -> None:
         """Write a camera's prior slot."""
-        self._priors[prior.camera].write(encode(prior))
+        self._priors[prior.camera].write(encode_prior(prior))
 
     def publish_state(self, state: ServoState) -> None:
         """Write the state slot, with notes on the records that were left out."""

@@ -26,8 +26,9 @@ from stereoservo.daemon.ipc_messages import (
     PlanError,
     Report,
     RunPlan,
+    decode_prior,
+    encode_observation,
     load_plan,
-    prior_decoder,
 )
 from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
@@ -60,6 +61,8 @@ SILENT_CAMERA_S = 2.0
 """A camera that delivers nothing for so long is closed and opened again."""
 QUIET_PERIODS = 0.6
 """Of a camera, after a frame, in which nobody looks for the next one: one that is so early is taken a little later."""
+LOOKS = 2
+"""For a frame, in vain: with more of them the next one is looked for later."""
 PRIOR_MAX_AGE_S = 0.5
 EXIT_SETUP = 3
 
@@ -110,14 +113,14 @@ class VisionSlots:
         data = self._priors.poll()
         if data is not None:
             try:
-                self._prior = prior_decoder.decode(data)
+                self._prior = decode_prior(data)
             except Exception as error:  # a decoder may raise anything
                 self._boundary.refuse(error)
         return self._prior
 
     def publish_observation(self, observation: CameraObservation) -> None:
         """Replace the observation."""
-        self._observations.write(encode(observation))
+        self._observations.write(encode_observation(observation))
 
     def close(self) -> None:
         """Release both slots. Idempotent."""
@@ -207,6 +210,30 @@ class CameraPipeline:
         return prior
 
 
+class Quiet:
+    """How long nobody looks for a camera's next frame: from ``QUIET_PERIODS`` of its period on longer, until a frame
+    comes after ``LOOKS`` looks in vain, and shorter at once where one may have waited. ``period_s`` 0: not at all.
+    """
+
+    def __init__(self, period_s: float, poll_s: float) -> None:
+        self._least_s, self._most_s, self._poll_s = QUIET_PERIODS * period_s, period_s, poll_s
+        self._looks = 0
+        self._s = self._least_s
+
+    def look_in_vain(self) -> None:
+        """Count a look that found no frame."""
+        self._looks += 1
+
+    def after_frame(self) -> float:
+        """Seconds from the look that found a frame."""
+        if self._looks == 0:
+            self._s = max(self._s - LOOKS * self._poll_s, self._least_s)
+        elif self._looks > LOOKS:
+            self._s = min(self._s + 0.5 * self._poll_s, self._most_s)
+        self._looks = 0
+        return self._s
+
+
 def poll_interval_s(rate_hz: float) -> float:
     """Seconds between two polls of a camera of ``rate_hz`` that has delivered nothing."""
     return min(0.002, 0.1 / rate_hz)
@@ -219,14 +246,15 @@ def camera_loop(
     *,
     camera: str,
     poll_s: float,
-    quiet_s: float = 0.0,
+    period_s: float = 0.0,
 ) -> Generator[float]:
     """Generator that runs a camera for ever and yields the seconds to wait before it is resumed; closing it closes
-    the camera. It is polled every ``poll_s``, and not for ``quiet_s`` after it has delivered.
+    the camera. It is polled every ``poll_s``, and, with frames every ``period_s``, not in between (`Quiet`).
 
     Every failure is reported once and answered by a reconnect after a growing pause.
     """
     pause_s = FIRST_PAUSE_S
+    quiet = Quiet(period_s, poll_s)
     down = False
     while True:
         try:
@@ -241,10 +269,11 @@ def camera_loop(
                     if down:
                         down = False
                         report("camera_back", f"camera {camera} delivers again")
-                    yield max(quiet_s - (heard_ns - polled_ns) * 1e-9, 0.0)
+                    yield max(quiet.after_frame() - (heard_ns - polled_ns) * 1e-9, 0.0)
                 elif (now_ns() - heard_ns) * 1e-9 > SILENT_CAMERA_S:
                     raise DriverError("silent", f"no image for {SILENT_CAMERA_S:g} s", retry=True)
                 else:
+                    quiet.look_in_vain()
                     yield poll_s
         except DriverError as error:
             if not down:
@@ -316,7 +345,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
                 clock.now_ns,
                 camera=camera,
                 poll_s=poll_interval_s(description.rate_hz),
-                quiet_s=QUIET_PERIODS / description.rate_hz,
+                period_s=1.0 / description.rate_hz,
             )
             run_camera(loop, lambda: termination.asked, sleep=clock.sleep, between=between)
     finally:

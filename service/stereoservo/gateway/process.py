@@ -92,6 +92,8 @@ from stereoservo.messages.wire import (
 )
 
 STATE_EVERY_S = 0.05
+STEPS_EVERY_S = 0.05
+"""How often step records are taken: their ring has room for seconds of them, and a batch costs less than each alone."""
 IDLE_S = 0.003
 FINAL_PASSES = 100
 LAST_EVENTS_S = 3.0
@@ -168,7 +170,7 @@ class Gateway:
         )
         self._state: StateMessage | None = None
         self._state_heard = 0.0
-        self._state_sent = 0.0
+        self._state_sent = self._steps_taken = 0.0
         self._recordings = Recordings(plan, self.log, self._notes.tell)
         self._servo.records = self._recordings.wants_steps
         self._handled = HandledEvents(directories.runtime / "handled.slot", self._notes.tell)
@@ -199,6 +201,24 @@ class Gateway:
         self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
         self._schema_queries = session.declare_queryable(keys.any_schema, RingChannel(32))
         self._model_queries = session.declare_queryable(keys.model, RingChannel(32))
+        self._sources: tuple[tuple[Any, Callable[[Any], None]], ...] = (
+            (self._goal_puts, self._intake.goal_sample),
+            (self._goal_queries, self._intake.goal_query),
+            *((queryable, self._intake.command_query) for queryable in self._command_queries),
+            *(
+                (queryable, partial(self._answer, work=self._gateway_command))
+                for queryable in self._gateway_queries
+            ),
+            (self._event_queries, partial(self._answer, work=self._events_from, key=self.keys.event)),
+            (self._state_queries, partial(self._answer, work=self._newest_state, key=self.keys.state)),
+            (
+                self._info_queries,
+                partial(self._answer, work=lambda _: encode(self.info()), key=self.keys.info),
+            ),
+            (self._schema_queries, partial(self._answer, work=self._schema)),
+            (self._any_command_queries, self._answer_wrong_key),
+            (self._model_queries, partial(self._answer, work=self._model, key=self.keys.model)),
+        )
         self._alive = session.liveliness().declare_token(keys.alive)
 
     def _publish_event(self, payload: bytes) -> None:
@@ -227,7 +247,8 @@ class Gateway:
             self._greeted = True
             self._calibration.load(self._state.model_epoch)
         events = self._servo.events()
-        self._read_state()
+        if events:  # who hears of one finds no older state
+            self._read_state()
         for event in events:
             self._core_event(event)
         busy = self._queries() or bool(events)
@@ -237,7 +258,8 @@ class Gateway:
             self._previews.poll()
         self._publish_state()
         self._read_reports()
-        self._take_steps()
+        if time.monotonic() - self._steps_taken >= STEPS_EVERY_S:
+            self._take_steps()
         self._recordings.poll()
         self.goals.poll()
         self._calibration.poll()
@@ -248,6 +270,7 @@ class Gateway:
         return busy
 
     def _take_steps(self, limit: int = 512) -> None:
+        self._steps_taken = time.monotonic()
         for item in self._servo.steps(limit):
             self._recordings.take(item)
         if self._recordings.refused:  # the next request to record begins anew
@@ -256,25 +279,7 @@ class Gateway:
 
     def _queries(self) -> bool:
         busy = False
-        sources: tuple[tuple[Any, Callable[[Any], None]], ...] = (
-            (self._goal_puts, self._intake.goal_sample),
-            (self._goal_queries, self._intake.goal_query),
-            *((queryable, self._intake.command_query) for queryable in self._command_queries),
-            *(
-                (queryable, partial(self._answer, work=self._gateway_command))
-                for queryable in self._gateway_queries
-            ),
-            (self._event_queries, partial(self._answer, work=self._events_from, key=self.keys.event)),
-            (self._state_queries, partial(self._answer, work=self._newest_state, key=self.keys.state)),
-            (
-                self._info_queries,
-                partial(self._answer, work=lambda _: encode(self.info()), key=self.keys.info),
-            ),
-            (self._schema_queries, partial(self._answer, work=self._schema)),
-            (self._any_command_queries, self._answer_wrong_key),
-            (self._model_queries, partial(self._answer, work=self._model, key=self.keys.model)),
-        )
-        for source, take in sources:
+        for source, take in self._sources:
             for _ in range(DRAIN):
                 item = source.try_recv()
                 if item is None:
@@ -322,6 +327,7 @@ class Gateway:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
+        self._take_steps()  # those until now belong to what was recorded so far
         if not request.on:
             text = self._recordings.stop()
             self._servo.records = self._recordings.wants_steps
@@ -341,6 +347,7 @@ class Gateway:
         return encode(self.log.since(int(number)))
 
     def _newest_state(self, query: Any) -> bytes:
+        self._read_state()
         if self._state is None:
             return encode(Reply(False, "the servo process has shown no state yet", boot=self.boot))
         return encode(self._state)
@@ -395,10 +402,10 @@ class Gateway:
                 continue
             with boundary:
                 observation = decode_observation(data)
-                payload = encode(features_message(observation))
                 publisher = self._publishers.features[observation.camera]
                 self._marker_cache.add(observation)
-                publisher.put(payload)
+                if publisher.matching_status.matching:
+                    publisher.put(encode(features_message(observation)))
 
     def _read_state(self) -> None:
         now = time.monotonic()
@@ -435,10 +442,12 @@ class Gateway:
 
     def _publish_state(self) -> None:
         now = time.monotonic()
-        if self._state is None or now - self._state_sent < STATE_EVERY_S:
+        if now - self._state_sent < STATE_EVERY_S:
             return
         self._state_sent = now
-        self._publishers.state.put(encode(self._state))
+        self._read_state()
+        if self._state is not None and self._publishers.state.matching_status.matching:
+            self._publishers.state.put(encode(self._state))
 
     def _read_reports(self) -> None:
         self._reports.accept()

@@ -28,6 +28,8 @@ AFTER_FAULT_S = 5.0
 """What is kept of a fault goes on for so long after it."""
 WAITING_BYTES = 16 << 20
 CLOSING_S = 3.0
+GATHERING_S = 0.04
+"""Between two batches that are written: a thread that is woken for each message costs more than it writes."""
 
 Report = Callable[[str, str], None]
 """Is told the kind of an event, ``ring_kept`` or ``warning``, and its message."""
@@ -194,7 +196,8 @@ class RingThread:
         self._ring = FlightRing(directory, limits, lambda kind, message: self.said.append((kind, message)))
         self._waiting: deque[StepMessage | int] = deque()
         self._bytes = self._lost = 0
-        self._ending = False
+        self._idle = False
+        self._ending = threading.Event()
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="flight-ring", daemon=True)
         self._thread.start()
@@ -215,39 +218,48 @@ class RingThread:
             if self._lost and isinstance(message, RecordedCheckpoint):
                 message, self._lost = msgspec.structs.replace(message, lost=message.lost + self._lost), 0
             self._bytes += size
-            self._waiting.append(message)
-            self._changed.notify()
+            self._put(message)
 
     def keep(self, t_ns: int) -> None:
         """Keep the ring aside, with what follows the fault at ``t_ns``."""
         with self._changed:
-            self._waiting.append(t_ns)
+            self._put(t_ns)
+
+    def _put(self, item: StepMessage | int) -> None:
+        self._waiting.append(item)
+        if self._idle:
+            self._idle = False
             self._changed.notify()
 
     def close(self) -> None:
         """Write what waits and end the segment, within ``CLOSING_S``. Idempotent."""
+        self._ending.set()
         with self._changed:
-            self._ending = True
             self._changed.notify()
         self._thread.join(CLOSING_S)
 
     def _run(self) -> None:
-        while (item := self._next()) is not None:
-            if isinstance(item, int):
-                self._ring.keep(item)
-            else:
-                self._ring.take(item)
+        while items := self._batch():
+            for item in items:
+                if isinstance(item, int):
+                    self._ring.keep(item)
+                else:
+                    self._ring.take(item)
+            with self._changed:
+                self._bytes -= sum(_size(item) for item in items if not isinstance(item, int))
         self._ring.close()
 
-    def _next(self) -> StepMessage | int | None:
+    def _batch(self) -> list[StepMessage | int]:
+        """What waits, all of it, once there is something; empty at the end."""
+        self._ending.wait(GATHERING_S)
         with self._changed:
-            while not self._waiting and not self._ending:
+            while not self._waiting and not self._ending.is_set():
+                self._idle = True
                 self._changed.wait()
-            if not self._waiting:
-                return None
-            item = self._waiting.popleft()
-            self._bytes -= 0 if isinstance(item, int) else _size(item)
-            return item
+            self._idle = False
+            items = list(self._waiting)
+            self._waiting.clear()
+            return items
 
 
 def _size(message: StepMessage) -> int:

@@ -73,6 +73,8 @@ def _processor() -> str:
 
 
 CHECKPOINT_EVERY_S = 5.0
+TRY_AGAIN_S = 0.1
+"""After a checkpoint that found no room: one encodes the whole state."""
 
 
 class RecordingStart(msgspec.Struct, frozen=True, tag="start", array_like=True, eq=False):
@@ -111,7 +113,8 @@ class StepSink(Protocol):
 
 
 class StepStream:
-    """Sends each step, and a checkpoint at the start, every ``CHECKPOINT_EVERY_S`` and after a gap.
+    """Sends each step, and a checkpoint at the start, every ``CHECKPOINT_EVERY_S`` and after a gap; one that the
+    recorder could not take is made anew after ``TRY_AGAIN_S``, and no step is sent after a gap before it.
 
     ``dropped`` counts the steps that a recorder could not take.
     """
@@ -122,6 +125,8 @@ class StepStream:
         self._connected: StepSink | None = None
         self._sink: StepSink | None = None
         self._since_checkpoint = 0
+        self._try_again = max(1, round(TRY_AGAIN_S * rate_hz))
+        self._pause = 0
         self._lost = 0
         self._encoder = StepEncoder()
         self.dropped = 0
@@ -131,13 +136,17 @@ class StepStream:
         if sink is not self._connected:
             self._connected = sink
             self._sink = sink if sink is not None and sink.send(self._start) else None
-            self._since_checkpoint, self._lost = self._every, 0
+            self._since_checkpoint, self._lost, self._pause = self._every, 0, 0
         if self._sink is None:
             return
-        if self._since_checkpoint >= self._every or self._lost:
+        if self._pause:
+            self._pause -= 1
+        elif self._since_checkpoint >= self._every or self._lost:
             state = RecordedCheckpoint(now_ns, core.state.step, encode_state(core.state), self._lost)
             if self._sink.send(state):
                 self._since_checkpoint, self._lost = 0, 0
+            else:
+                self._pause = self._try_again
 
     def after(self, inputs: StepInputs, outputs: StepOutputs) -> None:
         """Send the step's record."""

@@ -217,8 +217,5 @@ def _hermite(
 ) -> FloatArray:
     h = (after[0] - before[0]) * 1e-9
     s = (t_ns - before[0]) / (after[0] - before[0])
-    h00 = (1 + 2 * s) * (1 - s) ** 2
-    h01 = s * s * (3 - 2 * s)
-    return (
-        h00 * before[1] + s * (1 - s) ** 2 * h * before[2] + h01 * after[1] - s * s * (1 - s) * h * after[2]
-    )
+    way = s * s * (3 - 2 * s) * (after[1] - before[1])  # exactly none of an arm that stands
+    return before[1] + way + s * (1 - s) * h * ((1 - s) * before[2] - s * after[2])

@@ -57,6 +57,14 @@ def test_before_the_first_sample_the_arm_stood_there_and_after_the_last_nobody_k
     assert history.at(1008 * MS + 1) is None
 
 
+def test_an_arm_that_stands_stands_still_to_the_last_bit():
+    history = TrueJointHistory.in_memory(2)
+    place = np.random.default_rng(0).normal(size=2)
+    for k in range(3):
+        history.append(k * 4 * MS, place, np.zeros(2))
+    assert all(np.array_equal(history.at(t_ns), place) for t_ns in range(0, 8 * MS, 77_777))
+
+
 def test_times_must_grow():
     history = TrueJointHistory.in_memory(2)
     fill(history, 3)
