@@ -28,6 +28,7 @@ from stereoservo.cli.output import (
     JsonOption,
     OperatorOption,
     emit,
+    goals_beginning,
     marker_ids,
     note,
     read_file,
@@ -44,7 +45,9 @@ Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
 """The process that waits for a goal holds its lease: when it dies, the arm stops."""
 
-NameArgument = Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")]
+NameArgument = Annotated[
+    str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.", autocompletion=goals_beginning)
+]
 RelativeToOption = Annotated[
     str | None,
     typer.Option(help="Of a taught goal: workpiece (which may have moved) or cameras (which have)."),
