@@ -15,12 +15,9 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
+from documented import PAGES, ROOT, documented, markers
 from stereoservo.cli.dispatch import app
 
-ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    [*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("deploy/*/README.md")]
-)
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_]*\d*")
 """A word that stands for a value of the reader's."""
 
@@ -82,6 +79,19 @@ def test_every_documented_command_is_one(page: Path) -> None:
 def test_commands_that_are_none_are_found() -> None:
     text = "    stereoservo gaol mycell dock\n    stereoservo goal mycell --chekc\nas `stereoservo status --all` says\n"
     assert sum(bool(examined(command, whole)) for command, whole in commands(text)) == 3
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_that_are_not_executed_say_why(page: Path) -> None:
+    """tests/hil/test_documented_commands.py executes all others."""
+    text = page.read_text(encoding="utf-8")
+    found = documented(text)
+    for marker in markers(text):
+        assert any(one.command.startswith(marker.beginning) for one in found), marker
+        assert len(marker.why.split()) > 1, marker
+        for named in re.findall(r"\b(?:tests|\.ci)/[\w/.]*\w", marker.why):
+            assert (ROOT / named).exists(), f"{marker}: no {named}"
+    assert text.count("<!-- not executed") + text.count("<!-- slow") == len(markers(text))
 
 
 def anchors(page: Path) -> set[str]:
