@@ -29,7 +29,7 @@ PUBLIC = (
     "stereoservo_drivers.contracts", "stereoservo_drivers.kit", "stereoservo.control.contracts", "stereoservo.client",
 )  # fmt: skip
 """What others import: suites that makers of drivers subclass, the goal client. All of it is an entry point."""
-FOUND_BY_NAME = ("run_", "report_", "draw_", "show_")
+FOUND_BY_NAME = ("run_", "report_", "draw_", "show_", "compare_")
 """Functions that an experiment's declaration finds in the modules that it names."""
 KEPT_HEADING = "## Kept for later work"
 NEUTRAL_DECORATORS = {

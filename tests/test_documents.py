@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -15,12 +16,9 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
+from documented import PAGES, ROOT, documented, markers
 from stereoservo.cli.dispatch import app
 
-ROOT = Path(__file__).parents[1]
-PAGES = sorted(
-    [*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("deploy/*/README.md")]
-)
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_]*\d*")
 """A word that stands for a value of the reader's."""
 
@@ -84,6 +82,19 @@ def test_commands_that_are_none_are_found() -> None:
     assert sum(bool(examined(command, whole)) for command, whole in commands(text)) == 3
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_that_are_not_executed_say_why(page: Path) -> None:
+    """tests/hil/test_documented_commands.py executes all others."""
+    text = page.read_text(encoding="utf-8")
+    found = documented(text)
+    for marker in markers(text):
+        assert any(one.command.startswith(marker.beginning) for one in found), marker
+        assert len(marker.why.split()) > 1, marker
+        for named in re.findall(r"\b(?:tests|\.ci)/[\w/.]*\w", marker.why):
+            assert (ROOT / named).exists(), f"{marker}: no {named}"
+    assert text.count("<!-- not executed") + text.count("<!-- slow") == len(markers(text))
+
+
 def anchors(page: Path) -> set[str]:
     """Anchors of a page's headings, as they are made on the site and where repositories are hosted."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.M)
@@ -103,6 +114,17 @@ def test_every_link_leads_somewhere(page: Path) -> None:
         if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
             broken.append(target)
     assert broken == []
+
+
+def test_the_package_index_shows_the_readme_without_links_into_the_repository() -> None:
+    """As `hatch-fancy-pypi-readme` makes it when the wheel is built."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for one in project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]:
+        text = re.sub(one["pattern"], one["replacement"], text)
+    assert re.findall(r"\]\((?!https?:)[^)]*\)", text) == []
+    assert "<!--" not in text
+    assert "CONTRIBUTING.md" in text
 
 
 @cache

@@ -19,6 +19,7 @@ from typer.models import CommandInfo
 import stereoservo
 from stereoservo.cli.early_stop import RaisedStop
 from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
+from stereoservo.cli.verb_groups import EXAMPLES, grouped
 from stereoservo.ports import plugins
 
 COMMANDS: dict[str, str] = {
@@ -64,6 +65,9 @@ class LazyGroup(TyperGroup):
     not affect the others.
     """
 
+    names_only = False
+    """While the shell completes names: no command is imported for its text."""
+
     def list_commands(self, ctx: Any) -> list[str]:
         extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
         return [*COMMANDS, *extra]
@@ -71,6 +75,8 @@ class LazyGroup(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name not in self.list_commands(ctx):
             return None
+        if self.names_only and (described := _described(cmd_name, _places()[cmd_name])) is not None:
+            return described
         try:
             function = _load(cmd_name)
         except plugins.PluginError as error:
@@ -85,18 +91,36 @@ class LazyGroup(TyperGroup):
             )
         return _command(cmd_name, function)
 
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Commands and options of the program that begin so."""
+        self.names_only = True
+        try:
+            return super().shell_complete(ctx, incomplete)
+        finally:
+            self.names_only = False
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The list of ``--help``: no command is imported for it whose text can be read from its source."""
-        names = self.list_commands(ctx)
-        width = formatter.width - 6 - max(len(name) for name in names)
-        places = {plugin.name: plugin.value for plugin in plugins.list_plugins(plugins.COMMANDS)}
-        places |= {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
-        rows = []
-        for name in names:
-            command = _described(name, places[name]) or self.get_command(ctx, name)
-            rows.append((name, command.get_short_help_str(width)))
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
+        """The groups of ``--help``: no command is imported for it whose text can be read from its source."""
+        places = _places()
+        for heading, names in grouped(self.list_commands(ctx)):
+            commands = [
+                (name, _described(name, places[name]) or self.get_command(ctx, name)) for name in names
+            ]
+            with formatter.section(heading):
+                formatter.write_dl([(name, command.get_short_help_str(WHOLE)) for name, command in commands])
+            example = next((EXAMPLES[name] for name in names if name in EXAMPLES), "")
+            if example:
+                formatter.write_text(f"  for example: stereoservo {example}")
+
+
+WHOLE = 1000
+"""Characters of a command's first sentence that are shown: all."""
+
+
+def _places() -> dict[str, str]:
+    """Where each command is: ``module:function``."""
+    extra = {plugin.name: plugin.value for plugin in plugins.list_plugins(plugins.COMMANDS)}
+    return extra | {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
 
 
 def _described(name: str, where: str) -> Any:
@@ -141,15 +165,16 @@ def _broken(code: str, message: str) -> Any:
 def _command(name: str, function: Any, context_settings: dict[Any, Any] | None = None) -> Any:
     """Typer command of one function."""
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
+    epilog = f"Example: stereoservo {EXAMPLES[name]}" if name in EXAMPLES else None
     single.registered_commands.append(
-        CommandInfo(name=name, callback=function, context_settings=context_settings)
+        CommandInfo(name=name, callback=function, context_settings=context_settings, epilog=epilog)
     )
     command = get_command(single)
     command.name = name
     return command
 
 
-app = typer.Typer(cls=LazyGroup, add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(cls=LazyGroup, no_args_is_help=True, rich_markup_mode=None)
 
 
 def _version(value: bool) -> None:

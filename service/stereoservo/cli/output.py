@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO
 
 import msgspec
 import typer
@@ -15,9 +16,36 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 
+
+def cells_beginning(incomplete: str) -> list[str]:
+    """Live cells and cell files whose names begin so, for the shell's completion."""
+    from stereoservo.messages.discovery import live_cells
+
+    folder = Path(incomplete if incomplete.endswith("/") else Path(incomplete).parent)
+    files = sorted(str(path) for path in folder.glob("*.toml"))
+    return [name for name in [*(info.cell for info in live_cells()), *files] if name.startswith(incomplete)]
+
+
+def goals_beginning(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Taught goals of the command's cell whose names begin so, for the shell's completion: the daemon is asked."""
+    from stereoservo.client import Client
+
+    try:
+        with Client(ctx.params["cell"], endpoint=ctx.params.get("endpoint")) as client:
+            names = [goal.name for goal in client.info().taught]
+    except Exception:  # a prompt has no place for a message; the command itself says what is wrong
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON object on stdout.")]
 CellArgument = Annotated[
-    str, typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml).")
+    str,
+    typer.Argument(
+        metavar="CELL",
+        help="Name of a live cell, or path of a cell file (*.toml).",
+        autocompletion=cells_beginning,
+    ),
 ]
 EndpointOption = Annotated[
     str | None,
@@ -47,6 +75,15 @@ def emit(result: Any, text: str, as_json: bool) -> None:
     sys.stdout.flush()
 
 
+def coloured(text: str, colour: str, stream: TextIO) -> str:
+    """The text in bold and that colour where the stream is a terminal, unless ``NO_COLOR`` is set."""
+    return (
+        typer.style(text, fg=colour, bold=True)
+        if stream.isatty() and not os.environ.get("NO_COLOR")
+        else text
+    )
+
+
 def note(message: str) -> None:
     """Print progress and remarks on stderr; a full disk there loses them alone."""
     with suppress(OSError):
@@ -56,7 +93,7 @@ def note(message: str) -> None:
 def fail(error: BaseException, as_json: bool) -> None:
     """Print a failure: the message on stderr, and ``{"error": …}`` on stdout with ``--json``."""
     message = str(error) or type(error).__name__
-    note(f"error: {message}")
+    note(f"{coloured('error:', 'red', sys.stderr)} {message}")
     if as_json:
         body: dict[str, Any] = {"code": code_of(error), "message": message}
         reply = getattr(error, "reply", None)

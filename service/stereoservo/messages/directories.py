@@ -163,7 +163,10 @@ def state_root() -> Path:
     """``$STEREOSERVO_STATE_DIR``, else ``~/.local/state/stereoservo``."""
     if given := os.environ.get(STATE_VARIABLE):
         return Path(given).absolute()
-    return Path.home() / ".local" / "state" / "stereoservo"
+    given = os.environ.get("XDG_STATE_HOME", "")
+    # A relative path is to be ignored, says the specification of these directories.
+    base = Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
+    return base / "stereoservo"
 
 
 def cell_directories(cell: str) -> CellDirectories:

@@ -13,22 +13,36 @@ import typer
 from rich.console import Console
 
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS, find_experiment
-from stereoservo_sim.experiments.experiment import ExperimentError, Option
+from stereoservo_sim.experiments.experiment import ExperimentError, Option, show_comparisons
 from stereoservo_sim.progress import progress_bar
 
+ALL = "all"
 COMMON = {
     "seed": (0, Annotated[int, typer.Option(min=0, help="Seed of everything random.")]),
     "plot": (None, Annotated[Path | None, typer.Option(help="Write pictures into this folder.")]),
+    "html": (
+        None,
+        Annotated[Path | None, typer.Option(help="all: write one page with every table and figure.")],
+    ),
     "as_json": (False, Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]),
 }
 """Options that every experiment takes: default and type."""
 
 
-def reproduce(experiment: str, seed: int, plot: Path | None, as_json: bool, **given: Any) -> None:
+def reproduce(
+    experiment: str, seed: int, plot: Path | None, html: Path | None, as_json: bool, **given: Any
+) -> None:
     """Run an experiment again and print our figures beside those to compare with."""
     # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
+        if experiment == ALL:
+            _all(seed, plot, html, as_json, given)
+            return
+        if html is not None:
+            raise ExperimentError(
+                "option", f"--html writes the page of `reproduce {ALL}`; {experiment}: --plot DIR"
+            )
         chosen = find_experiment(experiment)
         if plot is not None:
             _make_folder(plot)
@@ -39,14 +53,51 @@ def reproduce(experiment: str, seed: int, plot: Path | None, as_json: bool, **gi
             answer["plots"] = [str(path) for path in chosen.draw(result, plot)]
     except (ExperimentError, OSError) as error:
         _fail(error, as_json)
+    compared = chosen.compare(answer)
     if as_json:
+        if compared:
+            answer["compared"] = [row._asdict() for row in compared]
         print(json.dumps(answer, allow_nan=False))
         return
     console = Console(markup=False)
     chosen.show(answer, console)
-    verdict = chosen.verdict(answer)
-    if verdict:
-        console.print(f"verdict: {sum(verdict.values())} of {len(verdict)} statements beside the thesis hold")
+    if compared:
+        show_comparisons(compared, console)
+
+
+def _all(seed: int, plot: Path | None, html: Path | None, as_json: bool, given: dict[str, Any]) -> None:
+    """Run every experiment of the thesis; print each one's rows as they come. Raises ExperimentError, OSError."""
+    from stereoservo_sim.experiments.thesis_page import Reproduction, answer_of_all, page, reproduce_all
+
+    if plot is not None:
+        raise ExperimentError(
+            "option", f"`reproduce {ALL}` takes --html FILE, which holds the figures, not --plot"
+        )
+    seeds = given.pop("seeds", None)
+    if asked := [name for name, value in given.items() if value is not None]:
+        raise ExperimentError("option", f"{ALL} does not take --{asked[0].replace('_', '-')}")
+    if html is not None:
+        _make_folder(html.parent)
+        with html.open("a"):  # what cannot be written is told before the minutes that it takes
+            pass
+    console = Console(markup=False)
+
+    def done(one: Reproduction) -> None:
+        if not as_json:
+            console.print(f"{one.experiment.name}: {one.experiment.summary}")
+            show_comparisons(one.compared, console)
+
+    with progress_bar() as progress:
+        found = reproduce_all(seed, seeds, progress, done)
+    if html is not None:
+        html.write_text(page(found, seed), encoding="utf-8")
+    answer = answer_of_all(found, seed)
+    if as_json:
+        print(json.dumps(answer | ({} if html is None else {"html": str(html)}), allow_nan=False))
+        return
+    console.print("all: " + ", ".join(f"{count} {verdict}" for verdict, count in answer["verdicts"].items()))
+    if html is not None:
+        console.print(f"wrote {html}")
 
 
 def _signature() -> inspect.Signature:
@@ -57,7 +108,9 @@ def _signature() -> inspect.Signature:
         for option in declared.options:
             options.setdefault(option.name, option)
             takers.setdefault(option.name, []).append(declared.name)
-    which = typer.Argument(help="Which one: " + ", ".join(EXPERIMENTS) + ".")
+    which = typer.Argument(
+        help=f"{ALL} (every table and figure of the thesis), or one: " + ", ".join(EXPERIMENTS) + "."
+    )
     parameters = [_parameter("experiment", Annotated[str, which], inspect.Parameter.empty)]
     for name, option in options.items():
         owner = takers[name][0] if len(takers[name]) == 1 else "Simulated experiments"

@@ -6,26 +6,26 @@ its figures) holds
 
 - ``run_NAME(*, seed, progress, **options)``: the result,
 - ``draw_NAME(result, folder)``: writes the figures, gives their paths,
+- ``compare_NAME(answer)``: the thesis's figures beside ours, each with a verdict; left out where it gives none,
 - ``show_NAME(answer, console)``: prints the answer for people; left out where :func:`show_rows` serves.
 
 Where the result is not the JSON answer itself, ``reported_by`` of the declaration names the function that makes it.
-Every answer has ``experiment``, ``seed``, ``rows`` and, where the thesis gives values, ``thesis``. Statements of
-``beside_thesis`` that hold or do not (booleans) are the verdict.
+Every answer has ``experiment``, ``seed``, ``rows`` and, where the thesis gives values, ``thesis``.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
+from stereoservo_sim.experiments.comparison import Comparison, tally
 from stereoservo_sim.progress import ProgressCall
 
 LISTED, WIDEST = 200, 400
@@ -124,14 +124,11 @@ class Experiment:
         for path in answer.get("plots", []):
             console.print(f"wrote {path}")
 
-    def verdict(self, answer: dict[str, Any]) -> dict[str, bool]:
-        """Statements of the comparison with the thesis, true or false; those of several rows together."""
-        statements: dict[str, bool] = {}
-        for item in answer.get("beside_thesis", []):
-            for name, value in item.items():
-                if isinstance(value, bool):
-                    statements[name] = statements.get(name, True) and value
-        return statements
+    def compare(self, answer: dict[str, Any]) -> list[Comparison]:
+        """The thesis's figures beside those of the answer, a verdict each; empty where it has none."""
+        compared = self._optional(self._named("compare"))
+        found: list[Comparison] = [] if compared is None else compared(answer)
+        return found
 
     def _named(self, what: str) -> str:
         return f"{what}_{self.name.replace('-', '_')}"
@@ -152,7 +149,7 @@ class Experiment:
 
 
 def show_rows(answer: dict[str, Any], console: Console) -> None:
-    """Print the rows as a table, a spread as its median and the 16th to 84th percentile; then the thesis's values.
+    """Print the rows as a table, a spread as its median and the 16th to 84th percentile.
 
     ``title`` describes the rows where they are not medians over seeds. More than ``LISTED`` rows are left to ``--json``
     where a summary stands beside the thesis.
@@ -163,22 +160,46 @@ def show_rows(answer: dict[str, Any], console: Console) -> None:
         console.print(f"{title}; all {len(rows)} rows: --json, curves: --plot DIR")
     else:
         names = list(rows[0])
-        table = Table(title=title, title_justify="left")
-        for name in names:
-            table.add_column(
-                name, justify="left" if isinstance(rows[0][name], str) else "right", no_wrap=True
-            )
-        for row in rows:
-            table.add_row(*(cell_text(row[name]) for name in names))
-        # A table cut off is useless: a narrow terminal wraps the lines instead.
-        wide = console.options.update(width=WIDEST)
-        needed = Measurement.get(console, wide, table).maximum
-        Console(file=console.file, width=max(console.width, needed), markup=False).print(table)
-    for item in answer.get("beside_thesis", []):
-        console.print(
-            "beside the thesis: " + ", ".join(f"{key} {cell_text(value)}" for key, value in item.items())
+        whole_table(
+            console,
+            title,
+            {name: "left" if isinstance(rows[0][name], str) else "right" for name in names},
+            [[cell_text(row[name]) for name in names] for row in rows],
         )
-    console.print(f"thesis: {json.dumps(answer['thesis'])}")
+    for item in answer.get("beside_thesis", []):
+        console.print("summary: " + ", ".join(f"{key} {cell_text(value)}" for key, value in item.items()))
+
+
+def whole_table(
+    console: Console, title: str, columns: Mapping[str, Literal["left", "right"]], rows: list[list[str]]
+) -> None:
+    """Print a table of which nothing is cut off: on a narrow terminal its lines wrap."""
+    table = Table(title=title, title_justify="left")
+    for name, justify in columns.items():
+        table.add_column(name, justify=justify, no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    needed = Measurement.get(console, console.options.update(width=WIDEST), table).maximum
+    whole = Console(
+        file=console.file, width=max(console.width, needed), markup=False, record=console.record,
+        force_terminal=console.is_terminal, no_color=console.no_color,
+    )  # fmt: skip
+    whole.print(table)
+
+
+def show_comparisons(compared: list[Comparison], console: Console) -> None:
+    """Print the thesis's figures beside ours, and how many rows have each verdict."""
+    whole_table(
+        console,
+        "beside the thesis",
+        dict.fromkeys(("thesis", "what", "its value", "ours", "verdict"), "left"),
+        [[row.item, row.what, row.thesis, row.ours, row.verdict] for row in compared],
+    )
+    for row in compared:
+        if row.why:
+            console.print(f"{row.item}, {row.what}: {row.verdict}: {row.why}")
+    counted = ", ".join(f"{count} {verdict}" for verdict, count in tally(compared).items() if count)
+    console.print(f"verdicts: {counted}")
 
 
 def cell_text(value: Any) -> str:

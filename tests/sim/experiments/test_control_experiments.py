@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from oracles.thesis_verdicts import changed
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
 from stereoservo_sim.experiments.laws import projective_vs_euclidean as compared
 from stereoservo_sim.experiments.laws import tasks_abc
@@ -129,6 +130,12 @@ def test_benchmark_figures_and_tables(half_turn, tmp_path):
     assert all(path.stat().st_size > 10_000 for path in draw_benchmark_180(half_turn, tmp_path))
 
 
+def test_verdicts_of_the_benchmark_are_the_known_ones(half_turn):
+    compared = EXPERIMENTS["benchmark-180"].compare(half_turn)
+    assert len(compared) > 8
+    assert changed("benchmark-180", compared) == []
+
+
 @pytest.mark.slow
 def test_an_rx90_is_placed_where_it_drives_the_benchmark():
     task = benchmark_task("aside")
@@ -169,6 +176,12 @@ def test_the_hard_task_bends_the_markers_ways_with_coarse_calibration(abc):
     assert own["converged"]
     assert own["image_path_ratio"] < 1.1
     assert coarse["image_path_ratio"] > 1.2 or not coarse["converged"]
+
+
+def test_verdicts_of_the_tasks_are_the_known_ones(abc):
+    compared = EXPERIMENTS["tasks-abc"].compare(abc)
+    assert {row.item for row in compared} >= {"fig. 8.6", "fig. 8.8", "fig. 8.9", "fig. 8.10"}
+    assert changed("tasks-abc", compared) == []
 
 
 def test_abc_figures(abc, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
+from oracles.thesis_verdicts import changed
 from stereoservo.calibration.pan_tilt_head import feed_forward
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
 from stereoservo_sim.experiments.rotations.homing import draw_homing, run_homing
@@ -179,6 +180,7 @@ def test_homing_stands_at_the_bound(tmp_path, seeds):
         assert row["bound_images_alone_deg"] <= row["bound_deg"]
         assert row["rms_deg"] < row["thesis_better_than_deg"]
     assert all(math.isfinite(value) for value in numbers(answer))
+    assert changed("homing", EXPERIMENTS["homing"].compare(answer)) == []
     assert draw_homing(answer, tmp_path)[0].stat().st_size > 10_000
 
 

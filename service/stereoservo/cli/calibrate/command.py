@@ -224,23 +224,39 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    if not console.is_terminal:
+        return run(_telling(_lines(what)))
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=1.0)
+        return run(_telling(lambda done, told: bar.update(task, completed=done, description=told or what)))
 
-        def progress(event: EventMessage) -> None:
-            if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
-                note(event.message)
-            if event.progress is None:
-                return
-            fitting = event.kind.startswith("fit")
-            done = (
-                TRIALS_SHARE + (1 - TRIALS_SHARE) * event.progress
-                if fitting
-                else TRIALS_SHARE * event.progress
-            )
-            bar.update(task, completed=done, description=event.message or what)
 
-        return run(progress)
+def _lines(what: str) -> Callable[[float, str], None]:
+    """Progress as plain lines on stderr, one each tenth."""
+    said = -1
+
+    def tell(done: float, told: str) -> None:
+        nonlocal said
+        if int(10 * done) > said:
+            said = int(10 * done)
+            note(f"{what}: {100 * done:.0f} %{f': {told}' if told else ''}")
+
+    return tell
+
+
+def _telling(tell: Callable[[float, str], None]) -> Callable[[EventMessage], None]:
+    """What hands the progress of events, 0 to 1 with its message, to ``tell``, and prints warnings."""
+
+    def progress(event: EventMessage) -> None:
+        if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
+            note(event.message)
+        if event.progress is None:
+            return
+        fitting = event.kind.startswith("fit")
+        share = 1 - TRIALS_SHARE if fitting else TRIALS_SHARE
+        tell((TRIALS_SHARE if fitting else 0.0) + share * event.progress, event.message)
+
+    return progress
 
 
 # -- check --------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from __future__ import annotations
 import resource
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +17,7 @@ import typer
 
 from stereoservo.cli.doctor.cameras import examine_cameras
 from stereoservo.cli.doctor.joints import examine_joints, permission
-from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
+from stereoservo.cli.output import CommandError, JsonOption, coloured, emit, shipped_or_path
 from stereoservo.client import SessionError
 from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
 from stereoservo.daemon.ipc_messages import RunPlan
@@ -116,9 +117,9 @@ def examine_pictures(
 
 def line_of(finding: ExaminationFinding) -> str:
     """A finding as text for a terminal."""
-    mark = {True: "ok", False: "FAILED", None: "note"}[finding.ok]
+    mark, colour = {True: ("ok", "green"), False: ("FAILED", "red"), None: ("note", "yellow")}[finding.ok]
     remedy = f"\n{'':20}cure: {finding.remedy}" if finding.remedy else ""
-    return f"{mark:6} {finding.name:12} {finding.message}{remedy}"
+    return f"{coloured(f'{mark:6}', colour, sys.stdout)} {finding.name:12} {finding.message}{remedy}"
 
 
 def _drivers(plan: RunPlan) -> str:

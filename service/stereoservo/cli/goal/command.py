@@ -28,6 +28,7 @@ from stereoservo.cli.output import (
     JsonOption,
     OperatorOption,
     emit,
+    goals_beginning,
     marker_ids,
     note,
     read_file,
@@ -47,7 +48,9 @@ WAITING_LEASE_S = 2.0
 FOR_POSTURES = ("taught", "features")
 """Kinds of targets whose postures are told."""
 
-NameArgument = Annotated[str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.")]
+NameArgument = Annotated[
+    str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.", autocompletion=goals_beginning)
+]
 RelativeToOption = Annotated[
     str | None,
     typer.Option(help="Of a taught goal: workpiece (which may have moved) or cameras (which have)."),

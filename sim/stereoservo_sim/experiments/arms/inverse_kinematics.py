@@ -22,6 +22,7 @@ from stereoservo.kinematics.inverse.solver import inverse_kinematics
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.arms.arm_families import FAMILIES, ArmFamily, SingularPose
 from stereoservo_sim.experiments.arms.euclidean_inverse import EuclideanAxes
+from stereoservo_sim.experiments.comparison import Comparison, of_statement
 from stereoservo_sim.progress import ProgressCall
 
 POSES = 100
@@ -96,6 +97,27 @@ def run_inverse_kinematics(*, seeds: int, seed: int, progress: ProgressCall) -> 
             "joint errors against the metric solver, rad or m; singular, unreachable, self-motion: handled of tried",
         ],
     }
+
+
+def compare_inverse_kinematics(answer: dict[str, Any]) -> list[Comparison]:
+    """Chapter 6: whether every solution of a metric solver is found, a family a row."""
+    found = []
+    for row in answer["rows"]:
+        metric = row["solutions"] is not None
+        tried = {name: row[name] for name in ("singular", "unreachable", "self_motion") if row[name]}
+        handled = all(told.split(" of ")[0] == told.split(" of ")[1] for told in tried.values())
+        ours = (
+            f"{row['found_share']:.1%} of {row['solutions']}"
+            if metric
+            else f"{row['solved']} of {row['poses']} reached"
+        )
+        complete = row["solved"] == row["poses"] and (not metric or row["found_share"] == 1.0)
+        ours += "".join(f"; {name.replace('_', '-')} {told}" for name, told in tried.items())
+        found.append(
+            of_statement("chapter 6", row["family"], "all solutions, from operators alone", ours, complete and handled,
+                         "see the row's columns")
+        )  # fmt: skip
+    return found
 
 
 def family_row(name: str, family: ArmFamily, poses: int, rng: np.random.Generator) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from stereoservo.kinematics.covariance import propagated
 from stereoservo.kinematics.denavit_hartenberg import KnownLength, conventions, dh_values
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.experiments.arms.thesis_robot import SIGMA, thesis_cell, trial_motions
+from stereoservo_sim.experiments.arms.thesis_robot import BASELINE, SIGMA, thesis_cell, trial_motions
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SyntheticCell
@@ -214,21 +214,24 @@ class RobotRuns:
     images: tuple[ImageErrors, ...]
     chi2: FloatArray
     freedom: int
+    sigma: float
 
 
-def simulate(seeds: int, seed: int, progress: ProgressCall) -> RobotRuns:
-    """Calibrate the thesis's robot ``seeds`` times with fresh noise."""
-    cell = thesis_cell()
+def simulate(
+    seeds: int, seed: int, progress: ProgressCall, sigma: float = SIGMA, baseline: float = BASELINE
+) -> RobotRuns:
+    """Calibrate the thesis's robot ``seeds`` times with fresh noise ``sigma`` [px] and this ``baseline`` [m]."""
+    cell = thesis_cell(baseline)
     motions = trial_motions(cell)
-    bound = cramer_rao(cell, cell.trials(SIGMA, np.random.default_rng(seed), positions=motions))
+    bound = cramer_rao(cell, cell.trials(sigma, np.random.default_rng(seed), positions=motions))
     values, reported, images, chi2 = [], [], [], []
     freedom = 0
     for k in range(seeds):
         rng = np.random.default_rng([seed, k])
-        trials = cell.trials(SIGMA, rng, positions=motions)
+        trials = cell.trials(sigma, rng, positions=motions)
         model = fit_model(trials, epoch=1).model
         home_pixels = cell.pixels(cell.home[None])[:, 0]
-        home_pixels = home_pixels + rng.normal(0.0, SIGMA, home_pixels.shape)
+        home_pixels = home_pixels + rng.normal(0.0, sigma, home_pixels.shape)
         found, covariance = propagated(model, tables)
         values.append(found)
         reported.append(np.sqrt(np.diag(covariance)))
@@ -236,8 +239,16 @@ def simulate(seeds: int, seed: int, progress: ProgressCall) -> RobotRuns:
         if model.statistics is not None:
             chi2.append(model.statistics.chi2)
             freedom = model.statistics.degrees_of_freedom
-        progress("calibrations", k + 1, seeds)
+        progress(f"calibrations at {sigma:g} px, {100 * baseline:.0f} cm", k + 1, seeds)
     truth = tables(exact_model(cell))
     return RobotRuns(
-        cell, np.array(values), np.array(reported), truth, bound, tuple(images), np.array(chi2), freedom
+        cell,
+        np.array(values),
+        np.array(reported),
+        truth,
+        bound,
+        tuple(images),
+        np.array(chi2),
+        freedom,
+        sigma,
     )

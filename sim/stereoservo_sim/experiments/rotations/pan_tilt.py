@@ -15,13 +15,14 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
 from stereoservo.calibration.pan_tilt_head import feed_forward
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.joint_reprojection import SeenChain, seen_chain
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.experiments.comparison import Comparison, of_error, of_limit, of_statement
+from stereoservo_sim.experiments.experiment import whole_table
 from stereoservo_sim.experiments.rotations.thesis_head import (
     ASSUMPTIONS,
     CALIBRATING_POINTS,
@@ -245,6 +246,45 @@ def _path_lengths(cell: SyntheticCell) -> tuple[float, float]:
     return pan, tilt
 
 
+def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
+    """Table 4.1 beside our medians with drifting tracks, as the thesis's are."""
+    names = {"delta_u_sd": "deviation of Δu", "delta_v_sd": "deviation of Δv", "delta_lr": "Δ_LR"}
+    found = []
+    for row in answer["rows"]:
+        if row["noise"] != "drifting":
+            continue
+        said = answer["thesis"][row["condition"]]
+        means = ("delta_u_mean", "delta_v_mean")
+        found.append(
+            of_limit("table 4.1", f"{row['condition']}: larger mean of Δu and Δv", max(abs(said[m]) for m in means),
+                     max(abs(row[m]["median"]) for m in means), "px", said="")
+        )  # fmt: skip
+        for key, name in names.items():
+            why = f"{row['perfect_calibration_delta_lr']['median']:.2f} px with the head known: noise"
+            found.append(
+                of_error("table 4.1", f"{row['condition']}: {name}", said[key], row[key]["median"], "px", why)
+            )
+    moved = next(
+        row for row in answer["rows"] if (row["condition"], row["noise"]) == ("feed-forward", "drifting")
+    )
+    equal = [(row["condition"], row["delta_l"]["median"], row["delta_r"]["median"]) for row in answer["rows"]
+             if row["noise"] == "drifting" and row["condition"] != "feed-forward"]  # fmt: skip
+    return [
+        *found,
+        *(
+            of_statement(
+                "fig. 4.8",
+                f"{condition}: left and right image",
+                "equal error distributions",
+                f"{left:.3f} and {right:.3f} px",
+                abs(left - right) < 0.1 * right,
+            )
+            for condition, left, right in equal
+        ),
+        of_limit("fig. 4.9", "mean prediction error, Δ_LR", 1.0, moved["delta_lr"]["median"], "px"),
+    ]
+
+
 def draw_pan_tilt(answer: dict[str, Any], folder: Path) -> list[Path]:
     """Histograms of errors and distances of the first seed (fig. 4.8), and Δ over its 35 predictions (fig. 4.9)."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -298,17 +338,15 @@ def show_pan_tilt(answer: dict[str, Any], console: Console) -> None:
     }
     for noise in dict.fromkeys(row["noise"] for row in answer["rows"]):
         rows = [row for row in answer["rows"] if row["noise"] == noise]
-        table = Table(
-            title=f"{noise} tracks, {answer['seeds']} seeds: medians [px] (thesis)", title_justify="left"
+        whole_table(
+            console,
+            f"{noise} tracks, {answer['seeds']} seeds: medians [px] (thesis)",
+            {"": "left", **dict.fromkeys((row["condition"] for row in rows), "right")},
+            [
+                [name, *(_beside(row[key], answer["thesis"][row["condition"]].get(key)) for row in rows)]
+                for key, name in measures.items()
+            ],
         )
-        table.add_column("")
-        for row in rows:
-            table.add_column(row["condition"], justify="right")
-        for key, name in measures.items():
-            table.add_row(
-                name, *(_beside(row[key], answer["thesis"][row["condition"]].get(key)) for row in rows)
-            )
-        console.print(table)
 
 
 def _beside(ours: dict[str, Any], thesis: float | None) -> str:

@@ -144,6 +144,56 @@ def cramer_rao(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigma: float) 
     return Bound(joint[3 * n :, 3 * n :], joint)
 
 
+def cramer_rao_estimated(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigma: float) -> Bound:
+    """As `cramer_rao`, with the second camera unknown as well: what is left when F comes from the same images.
+
+    ``plane`` is (3n + 3, 3n + 3) here: of the noise-free images' structure in the estimated cameras, points first, and
+    the plane, since both move with the cameras.
+    """
+    P = np.array([camera.P for camera in rig.cameras])
+    points = to_homogeneous(X)
+    pixels = images_of(rig, np.concatenate([X[None], X + shifts[:, None]]))
+    chart, x = shared_plane(np.eye(4)[3], np.hstack([shifts, np.zeros((len(shifts), 1))]))
+    charts = np.broadcast_to(np.eye(4)[:, :3], (len(X), 4, 3))
+    displacements, slopes = with_rest(chart.displacements)(x)
+    at = linearise(read_images(P, pixels, sigma), displacements, slopes, points, charts)
+    n, q = len(X), len(x)
+    by_camera = _second_camera_slopes(P[1], points @ displacements.transpose(0, 2, 1), sigma)
+    rows = at.motion.shape[1]
+    J = np.zeros((n, rows, 3 * n + q + 12))
+    for i in range(n):
+        J[i, :, 3 * i : 3 * i + 3] = at.points[i]
+    J[:, :, 3 * n : 3 * n + q], J[:, :, 3 * n + q :] = at.motion, by_camera
+    flat = J.reshape(n * rows, -1)
+    size = np.linalg.norm(flat, axis=0)
+    # Five directions stay free, of the projective frame that keeps the first camera, and of the second one's scale.
+    values, vectors = np.linalg.eigh((flat / size).T @ (flat / size))
+    root = vectors[:, FRAME:] / np.sqrt(values[FRAME:]) / size[:, None]
+    of_camera = root[3 * n + q :]
+    still = slice(0, 2 * len(P))
+    structure = np.concatenate(
+        [-np.linalg.pinv(at.points[i, still]) @ by_camera[i, still] @ of_camera for i in range(n)]
+    )
+    plane = np.vstack([structure, root[3 * n : 3 * n + 3]])
+    joint = root[: 3 * n + 3]
+    return Bound(plane @ plane.T, joint @ joint.T)
+
+
+FRAME = 5
+"""Freedoms of a projective frame that has one camera given, with the other's scale."""
+
+
+def _second_camera_slopes(P: FloatArray, moved: FloatArray, sigma: float) -> FloatArray:
+    """Derivatives (n, 4 s, 12) of the residuals of points (s, n, 4) in the entries of the second camera P (3, 4)."""
+    m = moved @ P.T
+    ideal = m[..., :2] / m[..., 2:]
+    slopes = np.zeros((*moved.shape[:2], 2, 2, 12))
+    for axis in (0, 1):
+        slopes[..., 1, axis, 4 * axis : 4 * axis + 4] = moved / m[..., 2:]
+        slopes[..., 1, axis, 8:] = -ideal[..., axis, None] * moved / m[..., 2:]
+    return np.asarray(slopes.transpose(1, 0, 2, 3, 4).reshape(moved.shape[1], -1, 12) / sigma)
+
+
 def pair_covariance(rig: StereoRig, X: FloatArray, sigma: float) -> FloatArray:
     """Covariance (3n, 3n) [m²] of points X (n, 3) triangulated in one stereo image with noise ``sigma`` [px]."""
     P = np.array([camera.P for camera in rig.cameras])

@@ -1,0 +1,78 @@
+"""``reproduce all``: every table and figure of the thesis with a verdict, on one page that needs nothing else."""
+
+import json
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+from oracles.thesis_verdicts import KNOWN, changed
+from stereoservo.cli.dispatch import app
+from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.comparison import MEANINGS, of_error, of_limit, of_statement
+from stereoservo_sim.experiments.thesis_contents import CONTENTS, REPRODUCED
+from stereoservo_sim.experiments.thesis_page import page, reproduce_all
+
+
+def silent(stage, done, total):
+    """No progress."""
+
+
+def test_verdict_words():
+    assert of_error("t", "w", 1.0, 0.79, "mm").verdict == "better"
+    assert of_error("t", "w", 1.0, 1.2, "mm", "why").why == ""
+    worse = of_error("t", "w", 1.0, 1.3, "mm", "because")
+    assert (worse.verdict, worse.why, worse.ours) == ("worse", "because", "1.3 mm")
+    assert of_error("t", "w", None, 1.3, "mm", lost="no value").why == "no value"
+    assert of_limit("t", "w", 0.5, 0.5, "mm").verdict == "agrees"
+    assert of_limit("t", "w", 0.5, 0.51, "mm").verdict == "worse"
+    assert of_statement("t", "w", "fails", "does not", False, "why").verdict == "not reproduced"
+
+
+def test_every_table_and_figure_has_an_experiment_or_says_why_none():
+    for item in CONTENTS:
+        assert bool(item.experiment) != bool(item.instead), item
+    assert {item.experiment for item in CONTENTS if item.experiment} == set(REPRODUCED)
+    assert {key[0] for key in KNOWN} == set(REPRODUCED)
+    assert set(KNOWN.values()) <= set(MEANINGS)
+
+
+def test_the_page_holds_verdicts_and_figures_and_fetches_nothing():
+    found = reproduce_all(0, 2, silent, names=("grid",))
+    text = page(found, 0)
+    assert text.count('src="data:image/png;base64,') == len(found[0].figures) == 1
+    assert not re.search(r'(?:src|href)="(?!data:image/png|#)', text)
+    for row in found[0].compared:
+        assert row.what in text
+    assert "homing: not run" in text
+
+
+def test_options_of_all(tmp_path):
+    for words, said in (
+        (["all", "--plot", str(tmp_path)], "--html FILE"),
+        (["all", "--data", str(tmp_path)], "all does not take --data"),
+        (["grid", "--html", str(tmp_path / "a.html")], "`reproduce all`"),
+        (["all", "--html", str(tmp_path)], "directory"),
+    ):
+        run = CliRunner().invoke(app, ["reproduce", *words, "--json"])
+        assert run.exit_code == 1
+        assert said in json.loads(run.stdout)["error"]["message"]
+
+
+def test_no_experiment_of_the_thesis_prints_raw_json():
+    """Of the tables for people; here with the shortest of them."""
+    run = CliRunner().invoke(app, ["reproduce", "grid", "--seeds", "1"])
+    assert run.exit_code == 0, run.output
+    assert not re.search(r'[{\[]"|\{\'', run.output)
+    assert "verdicts: " in run.output
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_verdicts_of_the_whole_thesis_are_the_known_ones():
+    found = reproduce_all(0, None, silent)
+    for one in found:
+        assert changed(one.experiment.name, one.compared) == []
+        assert one.figures
+    assert {(one.experiment.name, row.item, row.what) for one in found for row in one.compared} == set(KNOWN)
+    assert set(REPRODUCED) <= set(EXPERIMENTS)
