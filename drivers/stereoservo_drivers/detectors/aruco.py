@@ -28,6 +28,7 @@ from stereoservo_drivers.detectors import tag_registration
 from stereoservo_drivers.detectors.acquisition import noise_level
 from stereoservo_drivers.detectors.frame_images import SMALLEST_IMAGE, sized_image
 from stereoservo_drivers.detectors.tag_registration import (
+    FIRST_BLUR_PX,
     DictionaryName,
     dictionary,
     register_tag,
@@ -43,6 +44,10 @@ SAME_TAG = 0.25
 ROOM_PX = 12.0
 ROOM = 0.35
 """Room about a prior's tag in the window that is searched: pixels, and parts of the tag's size."""
+MOST_WINDOWS = 0.5
+"""Where windows have more than this part of the image's pixels, the image is searched instead, once."""
+LEAST_THRESHOLD_WINDOW, LARGEST_THRESHOLD_WINDOW = 5, 23
+"""Windows [px] of the adaptive thresholds, by steps of nine; the largest alone finds most tags."""
 GATE_SIGMA, GATE_PX = 5.0, 3.0
 """How far from its prior a corner may be for the prior to decide between two tags of one id."""
 Refinement = Literal["pattern", "subpixel", "apriltag", "none"]
@@ -98,8 +103,9 @@ class _Found:
 class TagDetector:
     """Detects corners of square tags with ids and covariances. One thread at a time.
 
-    A tag's identity is read from its cells in every image. With a fresh prior a tag is looked for in a window about
-    it; tags without one, and all when none is found, in the whole image. Of a tag that is seen twice nothing is
+    A tag's identity is read from its cells in every image. With a fresh prior its pattern is fitted where it is
+    expected; where it is not there it is looked for in a window about that place; tags without a prior, and all when
+    none is found, in the whole image. Of a tag that is seen twice nothing is
     reported, unless a prior is near one of the two and not the other. A tag that is not whole in the image, or of
     which a cell does not show what the code says (refinement ``pattern``), is not reported. Ids are reported in
     ascending order. The same frame and prior give the same observation.
@@ -117,7 +123,11 @@ class TagDetector:
         self._cells = {tag: tag_cells(name, tag) for tag in self._ids}
         stated = STATED_PX[self.options.refinement]
         self._floor_px = stated if self.options.floor_px is None else self.options.floor_px
-        self._detector = _opencv_detector(self.options)
+        self._markers = np.array(sorted(self._tag_of), dtype=np.int64)
+        rows = {tag: k for k, tag in enumerate(self._ids)}
+        self._corner_of = np.array([(rows[t], c) for _, (t, c) in sorted(self._tag_of.items())])
+        self._detector = _opencv_detector(self.options, LEAST_THRESHOLD_WINDOW)
+        self._quick = _opencv_detector(self.options, LARGEST_THRESHOLD_WINDOW)
         self._size = self.options.image_size
         tag_registration.compile_kernels()
 
@@ -132,12 +142,16 @@ class TagDetector:
         image = sized_image(frame, self.camera, self._size)
         self._size = (image.shape[1], image.shape[0])
         expected = self._expected(frame, prior)
-        found: dict[int, _Found] = {}
-        for tag, places in expected.items():
-            one = self._search_window(image, tag, places)
-            if one is not None:
-                found[tag] = one
-        missing = [tag for tag in self._ids if tag not in expected or not found]
+        found = self._found_at(image, expected)
+        astray = {tag: places for tag, places in expected.items() if tag not in found}
+        windows = {tag: _window(image, *places) for tag, places in astray.items()}
+        if sum(window.size for window, _ in windows.values()) <= MOST_WINDOWS * image.size:
+            for tag, (window, origin) in windows.items():
+                one = self._search_window(image, window, origin, tag, expected[tag])
+                if one is not None:
+                    found[tag] = one
+            astray = {}
+        missing = [tag for tag in self._ids if tag in astray or tag not in expected or not found]
         if missing:
             found |= self._search(image, missing, expected)
         return self._observation(frame, found)
@@ -147,36 +161,50 @@ class TagDetector:
         if prior is None or abs(frame.t_shutter_ns - prior.t_ns) * 1e-9 > self.options.max_prior_age_s:
             return {}
         dt_s = (frame.t_shutter_ns - prior.t_ns) * 1e-9
-        corners: dict[int, dict[int, tuple[FloatArray, float]]] = {}
-        for k, marker in enumerate(prior.ids.tolist()):
-            place = prior.pixels[k] + dt_s * prior.velocities[k]
-            variance = float(np.trace(prior.covariances[k]))
-            if marker in self._tag_of and np.isfinite(place).all() and 0.0 <= variance < np.inf:
-                tag, corner = self._tag_of[marker]
-                corners.setdefault(tag, {})[corner] = (place, float(np.sqrt(variance)))
+        at = np.minimum(np.searchsorted(self._markers, prior.ids), len(self._markers) - 1)
+        places = prior.pixels + dt_s * prior.velocities
+        variances = prior.covariances[:, 0, 0] + prior.covariances[:, 1, 1]
+        usable = np.isfinite(places).all(axis=1) & (variances >= 0.0) & (variances < np.inf)
+        usable &= self._markers[at] == prior.ids
+        corners, sigmas = np.full((len(self._ids), 4, 2), np.nan), np.zeros((len(self._ids), 4))
+        row, corner = self._corner_of[at[usable]].T
+        corners[row, corner] = places[usable]
+        sigmas[row, corner] = np.sqrt(variances[usable])
         height, width = frame.image.shape
-        expected = {}
-        for tag, four in corners.items():
-            places = np.array([four[c][0] for c in range(4) if c in four])
-            inside = ((places > -0.5) & (places < np.array([width, height]) - 0.5)).all()
-            if len(four) == 4 and inside:
-                expected[tag] = (places, np.array([four[c][1] for c in range(4)]))
-        return expected
+        inside = ((corners > -0.5) & (corners < np.array([width, height]) - 0.5)).all(axis=(1, 2))
+        tags = list(self._ids)
+        return {tags[k]: (corners[k], sigmas[k]) for k in np.flatnonzero(inside)}
+
+    def _found_at(
+        self, image: ImageArray, expected: Mapping[int, tuple[FloatArray, FloatArray]]
+    ) -> dict[int, _Found]:
+        """Tags whose pattern is right where it is expected: no search, and no other tag of this id can be as near."""
+        found: dict[int, _Found] = {}
+        if self.options.refinement != "pattern":
+            return found
+        for tag, (corners, sigmas) in expected.items():
+            gates = GATE_SIGMA * sigmas + GATE_PX
+            side = float(np.hypot(*(corners[2] - corners[0])) / np.sqrt(2.0))
+            if gates.max() > side:
+                continue
+            blur_px = min(max(FIRST_BLUR_PX, sigmas.max()), side / len(self._cells[tag]) / 3.0)
+            one = self._measured(image, tag, corners, blur_px)
+            if one is not None and (np.hypot(*(one.corners - corners).T) <= gates).all():
+                found[tag] = one
+        return found
 
     def _search_window(
-        self, image: ImageArray, tag: int, places: tuple[FloatArray, FloatArray]
+        self,
+        image: ImageArray,
+        window: ImageArray,
+        origin: FloatArray,
+        tag: int,
+        places: tuple[FloatArray, FloatArray],
     ) -> _Found | None:
-        corners, sigmas = places
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        margin = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
-        height, width = image.shape
-        left, top = np.maximum(np.floor(low - margin), 0).astype(int).tolist()
-        right = int(min(high[0] + margin + 1, width))
-        bottom = int(min(high[1] + margin + 1, height))
-        if right - left < SMALLEST_IMAGE or bottom - top < SMALLEST_IMAGE:
+        """Search for ``tag`` in a window of the image."""
+        if min(window.shape) < SMALLEST_IMAGE:
             return None
-        quads = self._quads(image[top:bottom, left:right], {tag}).get(tag, [])
-        origin = np.array([left, top], dtype=np.float64)
+        quads = self._quads(self._detector, window, {tag}).get(tag, [])
         return self._chosen(image, tag, [quad + origin for quad in quads], places)
 
     def _search(
@@ -185,18 +213,26 @@ class TagDetector:
         tags: Iterable[int],
         expected: Mapping[int, tuple[FloatArray, FloatArray]],
     ) -> dict[int, _Found]:
-        """Search for ``tags`` in the whole image."""
-        chosen = {
-            tag: self._chosen(image, tag, quads, expected.get(tag))
-            for tag, quads in self._quads(image, set(tags)).items()
-        }
-        return {tag: found for tag, found in chosen.items() if found is not None}
+        """Search for ``tags`` in the whole image: with one threshold, and with all of them unless each is found."""
+        wanted = set(tags)
+        found: dict[int, _Found] = {}
+        for detector in (self._quick, self._detector):
+            chosen = {
+                tag: self._chosen(image, tag, quads, expected.get(tag))
+                for tag, quads in self._quads(detector, image, wanted).items()
+            }
+            found = {tag: one for tag, one in chosen.items() if one is not None}
+            if len(found) == len(wanted):
+                break
+        return found
 
-    def _quads(self, image: ImageArray, tags: set[int]) -> dict[int, list[FloatArray]]:
+    def _quads(
+        self, detector: cv2.aruco.ArucoDetector, image: ImageArray, tags: set[int]
+    ) -> dict[int, list[FloatArray]]:
         """Quadrilaterals (4, 2) [px] that OpenCV decodes as one of ``tags``."""
         image = np.ascontiguousarray(image)  # it may be a window
         searched = cv2.GaussianBlur(image, (5, 5), 1.0) if noise_level(image) > NOISY else image
-        corners, ids, _ = self._detector.detectMarkers(searched)
+        corners, ids, _ = detector.detectMarkers(searched)
         quads: dict[int, list[FloatArray]] = {}
         for quad, tag in zip(corners, [] if ids is None else np.ravel(ids).tolist(), strict=True):
             if tag in tags:
@@ -222,10 +258,12 @@ class TagDetector:
             finds = [f for f in finds if (np.linalg.norm(f.corners - corners, axis=1) <= gates).all()]
         return finds[0] if len(finds) == 1 else None
 
-    def _measured(self, image: ImageArray, tag: int, quad: FloatArray) -> _Found | None:
+    def _measured(
+        self, image: ImageArray, tag: int, quad: FloatArray, blur_px: float = FIRST_BLUR_PX
+    ) -> _Found | None:
         floor = self._floor_px**2 * np.eye(2)
         if self.options.refinement == "pattern":
-            fit = register_tag(image, quad, self._cells[tag])
+            fit = register_tag(image, quad, self._cells[tag], blur_px)
             if fit is None or fit.contrast < self.options.min_contrast:
                 return None
             return _Found(fit.corners, fit.covariances + floor)
@@ -256,7 +294,17 @@ def _same(one: FloatArray, other: FloatArray) -> bool:
     return float(np.linalg.norm(one.mean(axis=0) - other.mean(axis=0))) < SAME_TAG * side
 
 
-def _opencv_detector(options: TagOptions) -> cv2.aruco.ArucoDetector:
+def _window(image: ImageArray, corners: FloatArray, sigmas: FloatArray) -> tuple[ImageArray, FloatArray]:
+    """Part of an image about expected ``corners`` (4, 2), and its first pixel (2,)."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
+    height, width = image.shape
+    left, top = np.maximum(np.floor(low - margin), 0).astype(int).tolist()
+    right, bottom = int(min(high[0] + margin + 1, width)), int(min(high[1] + margin + 1, height))
+    return image[top:bottom, left:right], np.array([left, top], dtype=np.float64)
+
+
+def _opencv_detector(options: TagOptions, least_window: int) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = _METHODS[options.refinement]
     # what noise flips, the registration's own reading forgives; without it a tag must read as what it is
@@ -265,7 +313,8 @@ def _opencv_detector(options: TagOptions) -> cv2.aruco.ArucoDetector:
     parameters.minMarkerDistanceRate = 0.02
     parameters.minGroupDistance = 0.05
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25
-    parameters.adaptiveThreshWinSizeMin = 5
+    parameters.adaptiveThreshWinSizeMin = least_window
+    parameters.adaptiveThreshWinSizeMax = LARGEST_THRESHOLD_WINDOW
     parameters.adaptiveThreshWinSizeStep = 9
     return cv2.aruco.ArucoDetector(dictionary(options.dictionary), parameters)
 

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from stereoservo.ports.devices import Clock, DriverError
+from stereoservo_drivers.video.chunked import ChunkedDecoder
 from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, MultipartPart, number_in
 from stereoservo_drivers.video.options import Place, VideoOptions, place_of
 from stereoservo_drivers.video.pictures import check_size, jpeg_flag, jpeg_size
@@ -42,6 +43,7 @@ class MjpegSource:
         self._socket: socket.socket | None = None
         self._response: http.client.HTTPResponse | None = None
         self._parser: MultipartParser | None = None
+        self._chunked: ChunkedDecoder | None = None
         self._interrupted = False
         self._over = False
         self._spoiled = 0
@@ -62,6 +64,7 @@ class MjpegSource:
             raise self._place.error("http", f"sent on more than {REDIRECTIONS} times; use the last address")
         self._response = response
         self._parser = MultipartParser(self._boundary(response))
+        self._chunked = ChunkedDecoder() if self._is_chunked(response) else None
         if self._socket is not None:
             self._socket.settimeout(self._options.read_timeout_s)
 
@@ -124,10 +127,15 @@ class MjpegSource:
             )
         return boundary
 
+    def _is_chunked(self, response: http.client.HTTPResponse) -> bool:
+        coding = response.getheader("Transfer-Encoding", "identity").strip().lower()
+        if coding not in ("identity", "chunked"):
+            raise self._place.error("http", f"sends Transfer-Encoding {coding!r}; chunked is read, and none")
+        return coding == "chunked"
+
     def read(self) -> SourcePicture | None:
         """The newest whole image, waiting for one; None: it was damaged. Raises DriverError."""
         parts: list[MultipartPart] = []
-        assert self._response is not None
         assert self._parser is not None
         for _ in range(MOST_READS):
             if parts and not self._readable():
@@ -135,7 +143,7 @@ class MjpegSource:
             if self._over:
                 raise self._place.error("connection_lost", "the server ended the stream", retry=True)
             try:
-                data = self._response.read1(CHUNK)
+                data = self._received()
             except TimeoutError as error:
                 raise self._place.error(
                     "silent", f"nothing came for {self._options.read_timeout_s:g} s", retry=True
@@ -144,14 +152,25 @@ class MjpegSource:
                 raise self._place.error(
                     "connection_lost", f"the connection broke ({error})", retry=True
                 ) from error
+            t_ns = self._clock.now_ns()
             self._over = not data
             try:
-                parts += self._parser.feed(data, self._clock.now_ns())
+                if self._chunked is not None:
+                    data = self._chunked.feed(data)
+                    self._over = self._over or self._chunked.ended
+                parts += self._parser.feed(data, t_ns)
             except MultipartError as error:
                 raise self._place.error(error.code, str(error)) from error
             if self._over and parts:
                 break
         return self._decoded(parts[-1], len(parts) - 1) if parts else None
+
+    def _received(self) -> bytes:
+        """Bytes behind the head as the connection has them, one wait at most; none: its end. What `http.client` read
+        with the head comes first.
+        """
+        assert self._response is not None
+        return self._response.fp.read1(CHUNK)
 
     def _readable(self) -> bool:
         connection = self._socket

@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
+from stereoservo_drivers.video.pictures import jpeg_size
+
 LARGEST_PART = 50_000_000
 LONGEST_HEADERS = 16384
+_JPEG_END = b"\xff\xd9"
 _HEADERS_END = re.compile(rb"\A\r?\n|\r?\n\r?\n")
 """An empty line; the first, where a part has no headers."""
 
@@ -30,7 +33,11 @@ class MultipartPart:
 
 
 class MultipartParser:
-    """Parses bytes as they arrive into whole parts. Resynchronises after a part of wrong length."""
+    """Parses bytes as they arrive into whole parts. Resynchronises after a part of wrong length.
+
+    A JPEG picture without a stated length is complete with its end marker: the boundary behind it may be sent with the
+    next picture only.
+    """
 
     def __init__(self, boundary: str, largest: int = LARGEST_PART) -> None:
         # Half of the servers write the boundary's leading "--" into the header already: both end in this.
@@ -114,6 +121,12 @@ class MultipartParser:
         if boundary >= 0:
             boundary -= self._buffer[:boundary].endswith(b"\r")
             return self._complete(part, boundary, cut=length is not None)
+        if (
+            length is None
+            and self._buffer.endswith((_JPEG_END, _JPEG_END + b"\r\n"))
+            and jpeg_size(self._buffer)
+        ):
+            return self._complete(part, self._buffer.rindex(_JPEG_END) + 2, cut=False)
         if len(self._buffer) > self._largest:
             raise MultipartError("frame_too_large", f"a picture above {self._largest} bytes without an end")
         self._rescan_from_tail()

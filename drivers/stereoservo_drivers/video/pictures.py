@@ -56,7 +56,7 @@ def size_error(place: Place, options: VideoOptions, width: int, height: int) -> 
     )
 
 
-def jpeg_size(data: bytes) -> tuple[int, int] | None:
+def jpeg_size(data: bytes | bytearray) -> tuple[int, int] | None:
     """Width and height of JPEG data that are whole (begin marker, frame header, end marker after it), or None.
 
     Decoders fill up what is missing without a word. Cameras may pad behind the end; within coded data no end marker can

@@ -89,6 +89,7 @@ class CaptureSource:
         times = [
             cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(self._options.open_timeout_s * 1e3),
             cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(self._options.read_timeout_s * 1e3),
+            cv2.CAP_PROP_N_THREADS, 1,  # of several, FFmpeg holds a picture back for each
         ]  # fmt: skip
         return cv2.VideoCapture(self._place.url.geturl(), cv2.CAP_FFMPEG, times)
 

@@ -15,6 +15,7 @@ from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import CameraObservation, DriverContext, Frame, Prior
 from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_sim.benchmarks.features_robustness import robustness
+from stereoservo_sim.benchmarks.features_tags import tags
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
@@ -92,7 +93,8 @@ def run_features(repetitions: int, seed: int, progress: ProgressCall) -> dict[st
     """Milliseconds per image of 640x480: search without a prior, windows at a prior of 14 dots, two images at priors of
     four, one labelling pass.
 
-    And what is found how well, in four pictures a repetition of each of the conditions of ``robustness``.
+    And what is found how well, in four pictures a repetition of each of the conditions of ``robustness``; and
+    twelve tags.
     """
     shown = pictures(seed, progress)
     count = max(100, 20 * repetitions)
@@ -113,5 +115,6 @@ def run_features(repetitions: int, seed: int, progress: ProgressCall) -> dict[st
         "cold_over_baseline": medians["cold"] / baseline,
         "tracking_over_baseline": medians["tracking"] / baseline,
         "tracking_2x4_over_baseline": medians["tracking_2x4"] / baseline,
+        "tags": tags(repetitions, seed),
         "robustness": robustness(shown.detector, 4 * repetitions, seed, progress),
     }

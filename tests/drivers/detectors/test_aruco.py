@@ -242,6 +242,45 @@ def test_a_window_is_all_that_is_searched_when_every_tag_has_a_prior():
     assert np.abs(observation.pixels - project(other, CORNERS)).max() < 0.05
 
 
+def twelve_tags(rng):
+    """A frame of tags 0 to 11, and their corners (48, 2)."""
+    scene, corners = TagScene([], noise=2.0), []
+    for k in range(12):
+        at = (90.0 + 153 * (k % 4), 85.0 + 155 * (k // 4))
+        H = tag_view(80, rng.uniform(0, 50), *rng.uniform(0, 2 * np.pi, 2), at)
+        scene.tags.append((print_of(k), H))
+        corners.append(project(H, CORNERS))
+    return as_frame(scene.render(rng)), np.concatenate(corners)
+
+
+def test_no_quadrilaterals_are_searched_where_priors_are_right_and_few_times_where_they_are_not(monkeypatch):
+    """Never more searches with priors than the two of an image without them: windows are small or not used."""
+    rng = np.random.default_rng(13)
+    frame, corners = twelve_tags(rng)
+    detector = make_detector(tags=list(range(12)))
+    cold = detector.detect(frame, None)
+    assert len(cold.ids) == 48
+    searched, quads = [], detector._quads
+    monkeypatch.setattr(
+        detector, "_quads", lambda d, image, tags: searched.append(image.size) or quads(d, image, tags)
+    )
+    for off_px, most in ((0.7, 0), (60.0, 2 * frame.image.size)):
+        searched.clear()
+        places = corners + rng.normal(0.0, 0.7, corners.shape) + (off_px if most else 0.0)
+        prior = Prior(
+            "left",
+            frame.t_shutter_ns,
+            np.arange(48),
+            places,
+            np.zeros((48, 2)),
+            np.tile(np.eye(2), (48, 1, 1)),
+        )
+        observation = detector.detect(frame, prior)
+        assert observation.ids.tolist() == list(range(48))
+        np.testing.assert_allclose(observation.pixels, cold.pixels, atol=0.005)
+        assert sum(searched) <= most
+
+
 def test_unusable_priors_fall_back_to_the_whole_image():
     rng = np.random.default_rng(12)
     H = tag_view(60, 30, 1.0, 0.4, (200, 240))

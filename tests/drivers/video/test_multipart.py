@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stereoservo_drivers.video.chunked import ChunkedDecoder
 from stereoservo_drivers.video.multipart import MultipartError, MultipartParser
 
 BODIES = st.lists(st.binary(max_size=40).filter(lambda b: b"\n--edge" not in b), min_size=1, max_size=5)
@@ -99,3 +100,27 @@ def test_any_bytes_are_taken_or_refused(data):
     else:
         found = "taken" if sum(len(part.body) for part in parts) <= len(data) else "made up"
     assert found in ("taken", "frame_too_large", "not_mjpeg")
+
+
+@settings(max_examples=60)
+@given(st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=5), st.lists(st.integers(0, 400)))
+def test_a_chunked_body_comes_out_whole_however_it_comes_in(bodies, cuts):
+    chunks = [b'%x ; a="b"\r\n%b\r\n' % (len(body), body) for body in bodies]
+    data = b"".join(chunks) + b"0\r\nTrailer: x\r\n\r\n"
+    decoder = ChunkedDecoder()
+    edges = [0, *sorted({min(cut, len(data)) for cut in cuts}), len(data)]
+    assert b"".join(decoder.feed(data[a:b]) for a, b in pairwise(edges)) == b"".join(bodies)
+    assert decoder.ended
+    whole = ChunkedDecoder()
+    assert (
+        b"".join(whole.feed(chunk[:-2]) for chunk in chunks[:1]) == bodies[0]
+    )  # its line end is not waited for
+
+
+@pytest.mark.parametrize(
+    "data", [b"x\r\n", b"\r\n", b"-1\r\n", b"1\r\nabc\r\n", b"1" * 5000, b"f" * 17 + b"\r\n"]
+)
+def test_what_is_no_chunk_is_told(data):
+    with pytest.raises(MultipartError) as caught:
+        ChunkedDecoder().feed(data)
+    assert caught.value.code == "http"

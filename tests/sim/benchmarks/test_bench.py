@@ -91,6 +91,8 @@ def test_features_find_the_dots():
     assert result["dots_found"]["least"] >= 7
     baseline = "cv2_threshold_and_connected_components"
     assert set(result["ms"]) == {"cold", "tracking", "tracking_2x4", baseline}
+    assert result["tags"]["corners_found"] == 1.0
+    assert result["tags"]["rms_px"] < 0.012
     for row in result["robustness"]:
         low, high = row["tracked"]["all_faces_wilson_95"]
         assert low <= row["tracked"]["all_faces"] / row["tracked"]["frames"] <= high
