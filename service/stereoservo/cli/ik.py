@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereoservo.cli.goal.target_options import make_goal, target_tree
+from stereoservo.cli.goal.target_options import PLANNED_LAW, make_goal, target_tree
 from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, emit
 from stereoservo.client import Client
 from stereoservo.client.errors import RefusedError
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from stereoservo.kinematics.model import CellModel
     from stereoservo.numerics.arrays import FloatArray
 
-PLANNED_LAW = "trajectory"
 OWN_SIGMA_PX = 0.1
 """What images and model differ by beside the noise that is stated, where the fit does not say."""
 

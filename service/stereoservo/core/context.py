@@ -13,12 +13,13 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law import Law
+from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CameraEstimate, CoreState
+from stereoservo.core.state import CoreState
 from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport

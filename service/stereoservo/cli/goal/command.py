@@ -16,6 +16,7 @@ import typer
 from stereoservo.cli import interruption
 from stereoservo.cli.goal.image_set_points import FRAMES, feature_tree, read_images, require_cameras
 from stereoservo.cli.goal.target_options import (
+    PLANNED_LAW,
     adaptive,
     make_goal,
     stream_lines,
@@ -203,8 +204,6 @@ def goal(
     """Send a goal and wait for its end. Ctrl-C cancels it."""
     if images is None and (at or frames != FRAMES):
         raise CommandError("usage", "--at and --frames go with --images DIR")
-    if gain is not None and adaptive_gain is not None:
-        raise CommandError("usage", "--gain and --adaptive-gain: one of them")
     stream: Stream | None = None
     found: tuple[SetPoints, ...] = ()
     target: dict[str, Any] = {}
@@ -223,16 +222,8 @@ def goal(
         target = target_tree(name, joint, set_points, files, relative_to, common)
     ends_in: dict[str, float] | None = None
     if posture is not None:
-        if (
-            file is not None
-            or stream is not None
-            or endpoint is not None
-            or target.get("kind") not in FOR_POSTURES
-        ):
-            raise CommandError("usage", "--posture goes with NAME or --set-points, on the cell's host")
-        from stereoservo.cli import ik  # numerics: for this alone
-
-        ends_in, law = ik.posture(cell, target, posture, operator), law or ik.PLANNED_LAW
+        local = file is None and stream is None and endpoint is None
+        ends_in, law = _ends_in(cell, target if local else {}, posture, operator), law or PLANNED_LAW
     if file is not None:
         requested = decode(read_file(file), Goal)
     else:
@@ -240,7 +231,7 @@ def goal(
             target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
             cameras=camera or None, profile=profile, posture=ends_in,
-            gain=gain if adaptive_gain is None else adaptive(adaptive_gain),
+            gain=_one_gain(gain, adaptive_gain),
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
         )  # fmt: skip
@@ -249,10 +240,29 @@ def goal(
     with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
         require_cameras(client, found)
         if check or requested.check:
-            reply = client.check(requested)
-            emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), json)
+            _checked(client, requested, json)
         else:
             _run(client, requested, stream, wait, json)
+
+
+def _ends_in(cell: str, target: dict[str, Any], number: int, operator: str | None) -> dict[str, float]:
+    """Joints by name of the posture ``number`` that reaches a target as on the wire. Raises CommandError."""
+    if target.get("kind") not in FOR_POSTURES:
+        raise CommandError("usage", "--posture goes with NAME or --set-points, on the cell's host")
+    from stereoservo.cli.ik import posture  # numerics: for this alone
+
+    return posture(cell, target, number, operator)
+
+
+def _one_gain(gain: float | None, adaptive_gain: str | None) -> float | dict[str, float] | None:
+    if gain is not None and adaptive_gain is not None:
+        raise CommandError("usage", "--gain and --adaptive-gain: one of them")
+    return gain if adaptive_gain is None else adaptive(adaptive_gain)
+
+
+def _checked(client: Client, requested: Goal, as_json: bool) -> None:
+    reply = client.check(requested)
+    emit(reply, reply.message + ("" if reply.plan is None else f"\n{plan_table(reply.plan)}"), as_json)
 
 
 def _followed(source: str) -> tuple[dict[str, Any], Stream]:

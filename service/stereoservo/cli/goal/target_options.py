@@ -21,6 +21,8 @@ from stereoservo.messages.wire import MessageError, decode, encode
 KINDS = {"points": "points", "displacement": "displacement", "incidence": "incidence"}
 """Options that take a target as a file, and its kind."""
 SOURCES = ("triangulated", "predicted")
+PLANNED_LAW = "trajectory"
+"""Whose plan ends in a posture of choice."""
 
 
 class StreamLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
