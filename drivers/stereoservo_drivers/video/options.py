@@ -42,8 +42,13 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     are looked for in the directory of the cell file. ``width``, ``height`` [px]: asked of a device, and checked
     against the first picture of any source. ``rate_hz``: asked of a device; the grid on which missing frames are
     counted; the rate of files that carry no stamps. ``latency_s``: from the shutter to the reception, subtracted from
-    the time of reception (recordings with stamps of their own carry it already). ``exposure``, ``gain``: in units of
-    the device; ``pixel_format``: four letters such as ``MJPG``, which many USB cameras need for their full rate.
+    the time of reception (recordings with stamps of their own carry it already). ``pixel_format``: four letters
+    such as ``MJPG``, which many USB cameras need for their full rate.
+
+    Controls of a device (V4L2), each left alone where it is not stated, and read back: ``exposure`` [0.1 ms with UVC
+    cameras], ``gain`` and ``focus`` in units of the device, ``white_balance`` [K]; a number locks it, ``"auto"`` lets
+    the camera choose. ``power_line_hz``: the flicker filter, 0 for none. ``rate_priority``: automatic exposure must not
+    lower the frame rate.
 
     ``channel``: gray, or one colour's own. ``flip``: how the picture is turned before anything sees it.
     ``open_timeout_s``: from connecting to the first picture. ``read_timeout_s``: without a picture for so long the
@@ -60,8 +65,12 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     height: Pixels
     rate_hz: Annotated[float, Meta(ge=0.1, le=1000)] = 30.0
     latency_s: Annotated[float, Meta(ge=0, le=10)] = 0.0
-    exposure: float | None = None
+    exposure: float | Literal["auto"] | None = None
     gain: float | None = None
+    focus: float | Literal["auto"] | None = None
+    white_balance: float | Literal["auto"] | None = None
+    power_line_hz: Literal[0, 50, 60] | None = None
+    rate_priority: bool | None = None
     pixel_format: str = ""
     channel: Channel = "gray"
     flip: Flip = "none"
@@ -105,6 +114,10 @@ def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[Vi
         ):
             if value != usual:
                 raise _wrong(name, value, f"is for files and numbered pictures; source is {place.shown}")
+    if place.kind != "device":
+        for name in ("focus", "white_balance", "power_line_hz", "rate_priority"):
+            if getattr(decoded, name) is not None:
+                raise _wrong(name, getattr(decoded, name), f"is for devices; source is {place.shown}")
     if decoded.read_timeout_s * decoded.rate_hz < 2.0:
         raise _wrong(
             "read_timeout_s",

@@ -11,11 +11,10 @@ import cv2
 
 from stereoservo.numerics.arrays import ImageArray
 from stereoservo.ports.devices import Clock
+from stereoservo_drivers.video import v4l2
 from stereoservo_drivers.video.options import Place, VideoOptions
 
 Settings = dict[str, tuple[float | None, float | None]]
-MANUAL_EXPOSURE = 1.0
-"""``V4L2_EXPOSURE_MANUAL`` of Linux' videodev2.h."""
 
 
 @dataclass(frozen=True)
@@ -113,11 +112,31 @@ class CaptureSource:
         self._ask("width", cv2.CAP_PROP_FRAME_WIDTH, float(options.width))
         self._ask("height", cv2.CAP_PROP_FRAME_HEIGHT, float(options.height))
         self._ask("rate_hz", cv2.CAP_PROP_FPS, options.rate_hz)
-        if options.exposure is not None:
-            self._ask("manual_exposure", cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE)
-            self._ask("exposure", cv2.CAP_PROP_EXPOSURE, options.exposure)
-        if options.gain is not None:
-            self._ask("gain", cv2.CAP_PROP_GAIN, options.gain)
+        try:
+            with v4l2.opened(self._place.shown) as ioctl:
+                self._check_size(ioctl)
+                self.settings.update(apply_controls(ioctl, options))
+        except ValueError as error:
+            raise self._place.error("setting", str(error)) from error
+        except OSError as error:
+            raise self._place.error(
+                "not_opened", f"takes no settings ({error.strerror})", retry=True
+            ) from error
+
+    def _check_size(self, ioctl: v4l2.Ioctl) -> None:
+        """Raises DriverError, with the device's modes, where it takes another size than asked."""
+        got = self.settings["width"][1], self.settings["height"][1]
+        if None in got or got == (self._options.width, self._options.height):
+            return
+        known = "; ".join(map(str, v4l2.modes(ioctl))) or "it lists none"
+        raise self._place.error(
+            "image_size",
+            f"has no {self._options.width}x{self._options.height} px with these options and takes "
+            f"{got[0]:g}x{got[1]:g}. "
+            f"Its modes: {known}. Set width, height and pixel_format to one of them",
+            got=got,
+            asked=(self._options.width, self._options.height),
+        )
 
     def _ask(self, name: str, what: int, value: float) -> None:
         """Set a property and read it back. An unsupported or adjusted one is no error: the settings report it."""
@@ -145,3 +164,37 @@ class CaptureSource:
         """Release the device or the stream."""
         if self._capture is not None:
             self._capture.release()
+
+
+def apply_controls(ioctl: v4l2.Ioctl, options: VideoOptions) -> Settings:
+    """Set the controls that ``options`` state, what they lock before what they set, and return what was asked and what
+    the device reads back, None where it has no such control. Raises ValueError for a value out of its range.
+    """
+    settings: Settings = {}
+
+    def ask(name: str, value: float) -> int | None:
+        got = v4l2.set_control(ioctl, name, round(value))
+        settings[name] = float(value), None if got is None else float(got)
+        return got
+
+    if options.exposure == "auto":
+        if ask("auto_exposure", v4l2.EXPOSURE_APERTURE_PRIORITY) is None:
+            ask("auto_exposure", v4l2.EXPOSURE_AUTO)
+    elif options.exposure is not None:
+        ask("auto_exposure", v4l2.EXPOSURE_MANUAL)
+        ask("exposure", options.exposure)
+    for automatic, name, value in (
+        ("autofocus", "focus", options.focus),
+        ("auto_white_balance", "white_balance", options.white_balance),
+    ):
+        if value is not None:
+            ask(automatic, value == "auto")
+            if value != "auto":
+                ask(name, value)
+    if options.gain is not None:
+        ask("gain", options.gain)
+    if options.power_line_hz is not None:
+        ask("power_line", v4l2.POWER_LINE[options.power_line_hz])
+    if options.rate_priority is not None:
+        ask("exposure_changes_rate", not options.rate_priority)
+    return settings

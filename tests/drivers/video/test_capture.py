@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import shutil
+import subprocess
 import threading
 import time
+from contextlib import nullcontext
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
@@ -11,7 +17,7 @@ import pytest
 
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.video import sources
+from stereoservo_drivers.video import sources, v4l2
 from stereoservo_drivers.video.options import Place, VideoOptions
 from stereoservo_drivers.video.reader import Reader
 from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
@@ -85,7 +91,7 @@ def test_a_device_that_is_no_camera(camera):
 
 
 class Device:
-    """Stands for `cv2.VideoCapture` of a camera that knows exposure in steps of 5, and no gain."""
+    """Stands for `cv2.VideoCapture` of a camera."""
 
     def __init__(self, *_):
         self.values = {cv2.CAP_PROP_FPS: 30.0}
@@ -98,9 +104,7 @@ class Device:
 
     def set(self, what, value):
         self.order.append(what)
-        if what == cv2.CAP_PROP_GAIN:
-            return False
-        self.values[what] = value // 5 * 5 if what == cv2.CAP_PROP_EXPOSURE else value
+        self.values[what] = value
         return True
 
     def get(self, what):
@@ -118,33 +122,174 @@ class Device:
         self.left = 0
 
 
+class Kernel:
+    """Stands for the ioctls of a UVC camera: controls with range and step, as videodev2.h has them; no gain."""
+
+    def __init__(self):
+        base, camera = 0x980900, 0x9A0900
+        self.ranges = {
+            camera + 1: (0, 3, 1), camera + 2: (3, 2047, 5), camera + 3: (0, 1, 1), camera + 12: (0, 1, 1),
+            camera + 10: (0, 250, 5), base + 12: (0, 1, 1), base + 26: (2800, 6500, 10), base + 24: (0, 2, 1),
+        }  # fmt: skip
+        self.values = {}
+        self.order = []
+
+    def __call__(self, request, structure):
+        if request == v4l2.QUERY_CONTROL:
+            if structure.id not in self.ranges:
+                raise OSError(errno.EINVAL, "no such control")
+            structure.minimum, structure.maximum, structure.step = self.ranges[structure.id]
+        elif request == v4l2.SET_CONTROL:
+            if structure.id == 0x9A0901 and structure.value in (0, 2):
+                raise OSError(errno.EINVAL, "no such entry of the menu")
+            least, _, step = self.ranges[structure.id]
+            self.values[structure.id] = least + (structure.value - least) // step * step
+            self.order.append(structure.id)
+        elif request == v4l2.GET_CONTROL:
+            structure.value = self.values[structure.id]
+        else:
+            self.enumerate(request, structure)
+
+    def enumerate(self, request, structure):
+        modes = {"YUYV": {(640, 480): (30, 15)}, "MJPG": {(640, 480): (60,), (1280, 720): (30,)}}
+        if request == v4l2.ENUM_FORMAT:
+            names = list(modes)
+            if structure.index >= len(names):
+                raise OSError(errno.EINVAL, "the end")
+            structure.pixelformat = int.from_bytes(names[structure.index].encode(), "little")
+            return
+        sizes = modes[int(structure.pixel_format).to_bytes(4, "little").decode()]
+        entries = list(sizes) if request == v4l2.ENUM_SIZES else sizes[structure.width, structure.height]
+        if structure.index >= len(entries):
+            raise OSError(errno.EINVAL, "the end")
+        structure.type = 1
+        if request == v4l2.ENUM_SIZES:
+            structure.sizes[0], structure.sizes[1] = entries[structure.index]
+        else:
+            structure.intervals[0], structure.intervals[1] = 1, entries[structure.index]
+
+
 @pytest.fixture
-def device(monkeypatch, tmp_path):
+def device(monkeypatch):
     made = Device()
+    made.kernel = Kernel()
     monkeypatch.setattr(sources.cv2, "VideoCapture", lambda *_: made)
     monkeypatch.setattr(CaptureSource, "_check_device", lambda self: None)
+    monkeypatch.setattr(sources.v4l2, "opened", lambda _path: nullcontext(made.kernel))
     return made
 
 
 def test_what_a_device_is_asked_for_and_what_it_took(camera, device):
-    driver = camera(0, exposure=123.0, gain=7.0, pixel_format="MJPG", rate_hz=60.0)
+    driver = camera(
+        0, exposure=124.0, gain=7.0, pixel_format="MJPG", rate_hz=60.0, focus=30, white_balance=4000,
+        power_line_hz=50, rate_priority=True,
+    )  # fmt: skip
     driver.configure()
     settings = driver.statistics().settings
-    assert settings["exposure"] == (123.0, 120.0)
-    assert settings["gain"] == (7.0, None)
     assert settings["width"] == (WIDTH, WIDTH)
     assert settings["rate_hz"] == (60.0, 60.0)
     assert device.order[0] == cv2.CAP_PROP_FOURCC  # the format decides on the sizes that can be had
-    assert device.order.index(cv2.CAP_PROP_AUTO_EXPOSURE) < device.order.index(cv2.CAP_PROP_EXPOSURE)
+    controls = {name: settings[name] for name in settings if name in v4l2.CONTROLS}
+    assert controls == {
+        "auto_exposure": (1.0, 1.0), "exposure": (124.0, 123.0), "gain": (7.0, None), "autofocus": (0.0, 0.0),
+        "focus": (30.0, 30.0), "auto_white_balance": (0.0, 0.0), "white_balance": (4000.0, 4000.0),
+        "power_line": (1.0, 1.0), "exposure_changes_rate": (0.0, 0.0),
+    }  # fmt: skip
+    order = device.kernel.order
+    for lock, value in (
+        ("auto_exposure", "exposure"),
+        ("autofocus", "focus"),
+        ("auto_white_balance", "white_balance"),
+    ):
+        assert order.index(v4l2.CONTROLS[lock]) < order.index(v4l2.CONTROLS[value])
     driver.close()
     assert driver.statistics().settings == settings
+
+
+def test_a_device_chooses_itself_where_that_is_asked(camera, device):
+    driver = camera(0, exposure="auto", focus="auto", white_balance="auto", rate_priority=False)
+    driver.configure()
+    settings = driver.statistics().settings
+    assert settings["auto_exposure"] == (3.0, 3.0)  # aperture priority: what UVC cameras call automatic
+    assert (
+        settings["autofocus"]
+        == settings["auto_white_balance"]
+        == settings["exposure_changes_rate"]
+        == (1.0, 1.0)
+    )
+    assert not {"exposure", "focus", "white_balance"} & set(settings)
 
 
 def test_a_device_is_left_alone_where_nothing_is_asked(camera, device):
     driver = camera(0)
     driver.configure()
-    assert not {cv2.CAP_PROP_EXPOSURE, cv2.CAP_PROP_GAIN, cv2.CAP_PROP_AUTO_EXPOSURE} & set(device.order)
+    assert device.kernel.order == []
     assert set(driver.statistics().settings) == {"width", "height", "rate_hz"}
+
+
+def test_a_value_out_of_range_is_told_with_the_range(camera, device):
+    with pytest.raises(DriverError) as caught:
+        camera(0, focus=500).configure()
+    assert caught.value.code == "setting"
+    assert "focus = 500; this device takes 0 to 250 in steps of 5" in str(caught.value)
+
+
+def test_a_size_that_a_device_has_not_is_told_with_its_modes(camera, device, monkeypatch):
+    monkeypatch.setattr(
+        device, "get", lambda what: 640.0 if what == cv2.CAP_PROP_FRAME_WIDTH else device.values[what]
+    )
+    with pytest.raises(DriverError) as caught:
+        camera(0).configure()
+    assert caught.value.code == "image_size"
+    assert "YUYV 640x480 at 30, 15 Hz; MJPG 640x480 at 60 Hz; MJPG 1280x720 at 30 Hz" in str(caught.value)
+
+
+@pytest.mark.skipif(
+    shutil.which("gcc") is None or not Path("/usr/include/linux/videodev2.h").exists(),
+    reason="needs gcc and the kernel's headers",
+)
+def test_structures_requests_and_controls_are_those_of_the_kernels_header(tmp_path):
+    structures = {
+        "v4l2_queryctrl": v4l2.QueryControl, "v4l2_control": v4l2.Control, "v4l2_fmtdesc": v4l2.FormatDescription,
+        "v4l2_frmsizeenum": v4l2.FrameSize, "v4l2_frmivalenum": v4l2.FrameInterval,
+    }  # fmt: skip
+    renamed = {("v4l2_frmsizeenum", "sizes"): "discrete", ("v4l2_frmivalenum", "intervals"): "discrete"}
+    expected = {}
+    for name, structure in structures.items():
+        expected[f"sizeof(struct {name})"] = ctypes.sizeof(structure)
+        for field, _ in structure._fields_:
+            theirs = renamed.get((name, field), field)
+            expected[f"offsetof(struct {name}, {theirs})"] = getattr(structure, field).offset
+    expected |= {
+        "VIDIOC_QUERYCTRL": v4l2.QUERY_CONTROL, "VIDIOC_G_CTRL": v4l2.GET_CONTROL, "VIDIOC_S_CTRL": v4l2.SET_CONTROL,
+        "VIDIOC_ENUM_FMT": v4l2.ENUM_FORMAT, "VIDIOC_ENUM_FRAMESIZES": v4l2.ENUM_SIZES,
+        "VIDIOC_ENUM_FRAMEINTERVALS": v4l2.ENUM_INTERVALS, "V4L2_CTRL_FLAG_DISABLED": v4l2.DISABLED,
+        "V4L2_BUF_TYPE_VIDEO_CAPTURE": v4l2.CAPTURE, "V4L2_FRMSIZE_TYPE_DISCRETE": v4l2.DISCRETE,
+        "V4L2_FRMIVAL_TYPE_DISCRETE": v4l2.DISCRETE, "V4L2_EXPOSURE_AUTO": v4l2.EXPOSURE_AUTO,
+        "V4L2_EXPOSURE_MANUAL": v4l2.EXPOSURE_MANUAL,
+        "V4L2_EXPOSURE_APERTURE_PRIORITY": v4l2.EXPOSURE_APERTURE_PRIORITY,
+        "V4L2_CID_POWER_LINE_FREQUENCY_DISABLED": v4l2.POWER_LINE[0],
+        "V4L2_CID_POWER_LINE_FREQUENCY_50HZ": v4l2.POWER_LINE[50],
+        "V4L2_CID_POWER_LINE_FREQUENCY_60HZ": v4l2.POWER_LINE[60],
+    }  # fmt: skip
+    theirs = {
+        "auto_exposure": "EXPOSURE_AUTO", "exposure": "EXPOSURE_ABSOLUTE",
+        "exposure_changes_rate": "EXPOSURE_AUTO_PRIORITY", "autofocus": "FOCUS_AUTO",
+        "focus": "FOCUS_ABSOLUTE", "auto_white_balance": "AUTO_WHITE_BALANCE",
+        "white_balance": "WHITE_BALANCE_TEMPERATURE", "gain": "GAIN", "power_line": "POWER_LINE_FREQUENCY",
+    }  # fmt: skip
+    expected |= {f"V4L2_CID_{theirs[name]}": number for name, number in v4l2.CONTROLS.items()}
+    lines = [f'printf("%lu\\n", (unsigned long)({what}));' for what in expected]
+    source = tmp_path / "header.c"
+    source.write_text(
+        "#include <stdio.h>\n#include <stddef.h>\n#include <linux/videodev2.h>\nint main(void) {\n"
+        + "\n".join(lines) + "\nreturn 0; }\n"
+    )  # fmt: skip
+    subprocess.run(["gcc", "-o", str(tmp_path / "header"), str(source)], check=True)
+    printed = subprocess.run(
+        [str(tmp_path / "header")], check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert dict(zip(expected, map(int, printed), strict=True)) == expected
 
 
 def test_an_unplugged_device_is_lost(camera, device):
