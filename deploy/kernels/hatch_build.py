@@ -16,7 +16,12 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
-from stereoservo.numerics.kernel_cache import levels_here
+try:
+    from stereoservo.numerics.kernel_cache import levels_here
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"{error}: kernels are compiled in an environment that holds the whole release: pip install '.[demo]' hatchling"
+    ) from error
 
 RUNS = (["warmup"], ["demo", "--lockstep", "--json"], ["bench", "features", "--json", "--repetitions", "1"])
 """Commands that run every kernel: of the loop; of the fit, and of dots; of all detectors."""

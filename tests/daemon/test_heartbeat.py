@@ -100,21 +100,12 @@ def test_limits_are_those_of_the_page() -> None:
 
 def test_a_gateway_has_its_longer_limit_while_it_serves_a_request_and_no_longer(bench: Bench) -> None:
     gateway = MagicMock(
-        _announce_due_s=None, _state=None, _observations=[], _stop=MagicMock(enables=[]), _command_queries=[],
-        _gateway_queries=[], _heartbeat=bench.process,
+        _announce_due_s=None, _state=None, _observations=[], _stop=MagicMock(enables=[]), _steps_taken=0.0,
+        _heartbeat=bench.process,
     )  # fmt: skip
     gateway._servo.events.return_value = ()
-    for source in (
-        "goal_puts",
-        "goal_queries",
-        "event_queries",
-        "state_queries",
-        "info_queries",
-        "schema_queries",
-        "any_command_queries",
-        "model_queries",
-    ):
-        getattr(gateway, f"_{source}").try_recv.side_effect = lambda: None
+    queries = MagicMock()
+    queries.try_recv.side_effect = lambda: None
     gateway._queries = lambda: Gateway._queries(gateway)
     clock = [1000.0]
     served = []
@@ -129,12 +120,12 @@ def test_a_gateway_has_its_longer_limit_while_it_serves_a_request_and_no_longer(
         assert hung_after(59.9) == ""
         assert "(limit 60 s)" in hung_after(60.1)
 
-    gateway._intake.goal_query = serve
+    gateway._sources = ((queries, serve),)
     assert not Gateway.run_once(gateway)
     assert hung_after(0.0) == ""
     assert hung_after(4.9) == ""
     assert "(limit 5 s)" in hung_after(5.1)
-    gateway._goal_queries.try_recv.side_effect = ["a query", None]
+    queries.try_recv.side_effect = ["a query", None]
     assert Gateway.run_once(gateway)
     assert served == ["a query"]
     clock[0] += 1000.0

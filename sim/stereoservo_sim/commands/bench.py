@@ -47,6 +47,12 @@ def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     return run_features(repetitions, seed, progress)
 
 
+def _idle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.live_loop.idle import run_idle
+
+    return run_idle(repetitions, seed, progress)
+
+
 def _loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.live_loop.loop import run_loop
 
@@ -107,6 +113,7 @@ BENCHES: dict[str, Bench] = {
     "cycle": _cycle,
     "faults": _faults,
     "features": _features,
+    "idle": _idle,
     "kills": _kills,
     "loop": _loop,
     "page": _page,
@@ -127,8 +134,8 @@ def bench(
         typer.Option(
             min=1,
             help="Timed fits of `calibration`, trials of each of `faults`, ten of `kills`, two virtual minutes of "
-            "`soak`, two real ones of `soak-live`, commands of `startup`, pairs of segments of `loop` and `page`; the "
-            "others take a multiple.",
+            "`soak`, two real ones of `soak-live`, commands of `startup`, segments of `idle`, pairs of them of `loop` "
+            "and `page`; the others take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,

@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from stereoservo.kinematics.model import encode_model
 from stereoservo.messages.directories import (
     RUNTIME_VARIABLE,
     STATE_VARIABLE,
+    CellDirectories,
     cell_directories,
     create_directories,
 )
@@ -107,33 +108,43 @@ def _of_daemon(
 
 
 @contextmanager
-def moving_cell(folder: Path, rate_hz: int, priority: int, seed: int) -> Iterator[MovingCell]:
-    """The demonstration's cell as processes, whose arm goes to a goal in the images and away from it.
+def running_cell(folder: Path, text: str, seed: int, environ: dict[str, str]) -> Iterator[CellDirectories]:
+    """The daemon of a cell file like the demonstration's, with an exact model; ``environ``: for its processes.
 
-    Raises ExperimentError where the daemon does not come up.
+    Raises ExperimentError where it does not come up.
     """
-    path, log = folder / "loop.toml", folder / "daemon.log"
-    text = shipped_cell_path("demo").read_text(encoding="utf-8")
-    text = text.replace("rate_hz = 250.0", f"rate_hz = {rate_hz}.0\npriority = {priority}")
-    path.write_text(
-        text.replace("[joints.options]", f"[joints.options]\nrate_hz = {rate_hz}.0"), encoding="utf-8"
-    )
-    cycles = new_log(folder / "live.cycles")
+    path, log = folder / "cell.toml", folder / "daemon.log"
+    path.write_text(text, encoding="utf-8")
     variables = {RUNTIME_VARIABLE: str(folder / "r"), STATE_VARIABLE: str(folder / "s")}
     try:
-        with environment(variables), ExitStack() as ending:
+        with environment(variables):
             directories = cell_directories("demo")
             create_directories(directories)
             directories.models.mkdir(exist_ok=True)
             model = exact_simulated_model(demo_cell(), seed)
             (directories.models / f"model-{model.epoch:06d}.json").write_bytes(encode_model(model))
-            environ = {CYCLE_LOG_VARIABLE: str(cycles)}
-            ending.enter_context(DaemonProcess(path, log=log, environment=environ)).wait_ready()
-            servo = processes_of(directories.runtime)["servo"]
-            scheduler = "fifo" if os.sched_getscheduler(servo) & os.SCHED_FIFO else "ordinary"
-            yield MovingCell(cycles, scheduler, ending.enter_context(_moving()))
+            with DaemonProcess(path, log=log, environment=environ) as daemon:
+                daemon.wait_ready()
+                yield directories
     except (ClientError, DaemonError) as error:
-        raise ExperimentError("loop", f"{error}; {log.read_text()[-2000:]}") from error
+        raise ExperimentError("daemon", f"{error}; {log.read_text()[-2000:]}") from error
+
+
+@contextmanager
+def moving_cell(folder: Path, rate_hz: int, priority: int, seed: int) -> Iterator[MovingCell]:
+    """The demonstration's cell as processes, whose arm goes to a goal in the images and away from it.
+
+    Raises ExperimentError where the daemon does not come up.
+    """
+    text = shipped_cell_path("demo").read_text(encoding="utf-8")
+    text = text.replace("rate_hz = 250.0", f"rate_hz = {rate_hz}.0\npriority = {priority}")
+    text = text.replace("[joints.options]", f"[joints.options]\nrate_hz = {rate_hz}.0")
+    cycles = new_log(folder / "live.cycles")
+    with running_cell(folder, text, seed, {CYCLE_LOG_VARIABLE: str(cycles)}) as directories:
+        servo = processes_of(directories.runtime)["servo"]
+        scheduler = "fifo" if os.sched_getscheduler(servo) & os.SCHED_FIFO else "ordinary"
+        with _moving() as motion:
+            yield MovingCell(cycles, scheduler, motion)
 
 
 def _measured(folder: Path, live_log: Path, rate_hz: int, priority: int, repetitions: int) -> dict[str, Any]:
