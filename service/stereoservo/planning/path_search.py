@@ -8,8 +8,8 @@ towards them, to the right or left and down or up in the images.
 ``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: the arm along it. Where the arm
 cannot follow the path that was asked for, ``UNCONSTRAINED_IK`` follows it once more without limits, which gives the
 joints at the goal, and ``STRAIGHT_IN_JOINTS`` tries the straight line in joint space to these. When all else fails,
-``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these. Where the
-request names a ``posture``, this is the only seed, and the first thing that is tried.
+``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these; the
+``posture`` of a request is then the only seed.
 """
 
 from __future__ import annotations
@@ -80,7 +80,6 @@ GOAL_BEYOND = 90
 
 POSTURE = 0.35
 """Largest distance of a joint [rad or m] at the goal from the posture that was asked for."""
-
 THERE = 1e-6
 """Joints that are no farther from the goal's are there."""
 

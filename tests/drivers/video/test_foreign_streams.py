@@ -82,7 +82,9 @@ SERVERS = {
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("name", SERVERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in DIALECTS else ()) for name in SERVERS]
+)
 def test_every_picture_of_a_foreign_server_comes_and_those_it_left_out_are_counted(
     context, name, capsys, monkeypatch
 ):
