@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo.daemon.camera_setup import rounded
+from stereoservo.daemon.ipc_messages import rounded
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 from stereoservo.recording import step_layout

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
+from stereoservo.daemon.ipc_messages import rounded
 from stereoservo.messages.cell_file import CameraSection, CellFile, CellFileError
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
@@ -25,27 +25,6 @@ from stereoservo.ports.devices import (
     Frame,
 )
 from stereoservo.ports.image_files import ImageReader
-
-PIXEL_STEP = 2.0**-12
-"""Of detected pixels; it adds a noise of 0.00007 px."""
-
-
-def rounded(observation: CameraObservation) -> CameraObservation:
-    """The observation with no more digits than a detector knows: a hundredth of a pixel's noise takes half of a
-    number's bits, and every one of them is recorded.
-
-    Pixels in steps of ``PIXEL_STEP``. Variances upwards by a 32nd at most, correlations towards zero by a 16th at most,
-    so that a covariance stays one, and neither its variances nor its determinant are less. Along the long axis of a
-    slanted ellipse the variance may be less, by a 32nd at most.
-    """
-    covariances = observation.covariances.copy()
-    variances = covariances[:, (0, 1), (0, 1)]
-    mantissa, exponent = np.frexp(variances)
-    covariances[:, (0, 1), (0, 1)] = np.ldexp(np.ceil(64.0 * mantissa) / 64.0, exponent)
-    step = np.ldexp(1.0 / 64.0, exponent.sum(axis=1) // 2)[:, None]
-    covariances[:, (0, 1), (1, 0)] = np.trunc(covariances[:, (0, 1), (1, 0)] / step) * step
-    pixels = np.round(observation.pixels / PIXEL_STEP) * PIXEL_STEP
-    return msgspec.structs.replace(observation, pixels=pixels, covariances=covariances)
 
 
 def make_camera(section: CameraSection, context: DriverContext) -> tuple[CameraDriver, Detector | None]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereoservo.core.cycle import check_observation, encode
-from stereoservo.daemon.camera_setup import make_camera, rounded
+from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
@@ -29,6 +29,7 @@ from stereoservo.daemon.ipc_messages import (
     decode_prior,
     encode_observation,
     load_plan,
+    rounded,
 )
 from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
