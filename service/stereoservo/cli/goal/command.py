@@ -202,8 +202,7 @@ def goal(
     json: JsonOption = False,
 ) -> None:
     """Send a goal and wait for its end. Ctrl-C cancels it."""
-    if images is None and (at or frames != FRAMES):
-        raise CommandError("usage", "--at and --frames go with --images DIR")
+    _require_images(images, at, frames)
     stream: Stream | None = None
     found: tuple[SetPoints, ...] = ()
     target: dict[str, Any] = {}
@@ -220,15 +219,13 @@ def goal(
     elif file is None:
         files = {"points": points, "displacement": displacement, "incidence": incidence}
         target = target_tree(name, joint, set_points, files, relative_to, common)
-    ends_in: dict[str, float] | None = None
-    if posture is not None:
-        local = file is None and stream is None and endpoint is None
-        ends_in, law = _ends_in(cell, target if local else {}, posture, operator), law or PLANNED_LAW
+    local = target if file is None and stream is None and endpoint is None else {}
+    ends_in = None if posture is None else _ends_in(cell, local, posture, operator)
     if file is not None:
         requested = decode(read_file(file), Goal)
     else:
         requested = make_goal(
-            target, law=law, points=point_source, jacobian=jacobian,
+            target, law=law or (PLANNED_LAW if ends_in else None), points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
             cameras=camera or None, profile=profile, posture=ends_in,
             gain=_one_gain(gain, adaptive_gain),
@@ -243,6 +240,11 @@ def goal(
             _checked(client, requested, json)
         else:
             _run(client, requested, stream, wait, json)
+
+
+def _require_images(images: Path | None, at: float, frames: int) -> None:
+    if images is None and (at or frames != FRAMES):
+        raise CommandError("usage", "--at and --frames go with --images DIR")
 
 
 def _ends_in(cell: str, target: dict[str, Any], number: int, operator: str | None) -> dict[str, float]:
