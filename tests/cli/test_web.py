@@ -107,8 +107,9 @@ def test_over_tls_the_page_opens_for_its_own_origin_and_not_without_tls(certifie
     asyncio.run(visit())
 
 
-def test_a_server_on_any_address_has_one_name() -> None:
-    check_host("cell.example:8443", allowed_hosts("cell.example", 8443))
-    for host in ("localhost:8443", "0.0.0.0:8443", socket.gethostname() + ":8443"):
+def test_a_server_beyond_loopback_has_its_names_and_the_address_it_is_reached_at() -> None:
+    for host in ("cell.example:8443", socket.gethostname() + ":8443", "192.0.2.7:8443"):
+        check_host(host, allowed_hosts("cell.example", 8443), "192.0.2.7", 8443)
+    for host in ("localhost:8443", "0.0.0.0:8443", "192.0.2.8:8443", "cell.example:8444"):
         with pytest.raises(RightsError):
-            check_host(host, allowed_hosts("cell.example", 8443))
+            check_host(host, allowed_hosts("cell.example", 8443), "192.0.2.7", 8443)

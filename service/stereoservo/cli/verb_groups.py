@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "Set up": ("init", "doctor", "drivers", "print-plate", "learn-corners", "driver-check", "warmup"),
+    "Set up": (
+        "setup",
+        "init",
+        "doctor",
+        "drivers",
+        "print-plate",
+        "learn-corners",
+        "driver-check",
+        "warmup",
+    ),
     "Run": ("run", "status", "ls", "enable", "disable", "reset", "hold", "resume", "stop"),
-    "Move": ("calibrate", "teach", "goal", "acknowledge", "jog", "home", "auxiliary"),
+    "Move": ("calibrate", "teach", "goal", "ik", "acknowledge", "jog", "home", "auxiliary"),
     "Look": ("watch", "web", "record", "replay", "export"),
     "Simulate and measure": ("demo", "emulate", "simulate", "reproduce", "bench"),
 }
 """Headings and their commands, in the order in which they are needed; any other command stands below ``OTHERS``."""
 OTHERS = "Others"
 EXAMPLES: dict[str, str] = {
+    "setup": "setup mycell.toml",
     "init": "init mycell.toml",
     "doctor": "doctor mycell.toml",
     "drivers": "drivers",
@@ -31,6 +41,7 @@ EXAMPLES: dict[str, str] = {
     "calibrate": "calibrate mycell --check",
     "teach": "teach mycell dock",
     "goal": "goal mycell dock --check",
+    "ik": "ik mycell dock",
     "acknowledge": "acknowledge mycell ID",
     "jog": "jog mycell j1=0.05 --seconds 1",
     "home": "home mycell",

@@ -69,7 +69,8 @@ def test_a_triangle_has_its_area_and_its_centre(points):
     blend_polygon(image, corners, 1.0)
     assert image.sum() == pytest.approx(area, abs=0.15)
     if area > 20:
-        assert np.abs(centroid(image) - corners.mean(axis=0)).max() < 0.05
+        # What the pixels' undersampling adds to the moments counts the more, the smaller the shape.
+        assert np.abs(centroid(image) - corners.mean(axis=0)).max() < max(0.05, 1.5 / area)
 
 
 def test_what_lies_outside_the_image_is_cut_off():
