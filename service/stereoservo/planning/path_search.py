@@ -36,6 +36,7 @@ from stereoservo.planning.motion_frame import (
 )
 from stereoservo.planning.path_ik import (
     SEEDS,
+    TURN,
     Arm,
     PathRecord,
     check_path,
@@ -261,11 +262,13 @@ def _next_seed(p: Planning) -> None:
 
 
 def _from_posture(p: Planning, posture: FloatArray) -> None:
-    """Likewise from the ``posture`` (n,) alone; a failure says how far from the goal the markers are in it."""
+    """Likewise from the ``posture`` (n,) alone, with as many whole turns; a failure says how far from the goal the
+    markers are in it.
+    """
     p.seeds = SEEDS
     joints, arrived = _from_joints(p, posture)
-    apart = np.abs(joints - posture)
-    if arrived and float(np.where(p.turns > 0.0, _within_half_turn(apart), apart).max()) <= POSTURE:
+    joints -= TURN * np.round((joints - posture) / TURN) * p.turns
+    if arrived and float(np.abs(joints - posture).max()) <= POSTURE:
         table = empty_table()
         broken = int(check_joints(joints, 1.0, p.constraints, table))
         if broken < 0 and float(np.abs(joints - p.request.joints).max()) <= THERE:
@@ -280,10 +283,6 @@ def _from_posture(p: Planning, posture: FloatArray) -> None:
     room = TOLERANCE_PX - distance
     p.table[NOT_REACHABLE] = (room, room, distance, TOLERANCE_PX, -1.0, marker, 1.0)
     p.goal_failure = approach(p, NOT_REACHABLE)
-
-
-def _within_half_turn(angles: FloatArray) -> FloatArray:
-    return np.asarray(np.abs(np.mod(angles + math.pi, 2.0 * math.pi) - math.pi), dtype=np.float64)
 
 
 def stay(planning: Planning) -> None:

@@ -221,11 +221,12 @@ def goal(
         target = target_tree(name, joint, set_points, files, relative_to, common)
     local = target if file is None and stream is None and endpoint is None else {}
     ends_in = None if posture is None else _ends_in(cell, local, posture, operator)
+    law = PLANNED_LAW if law is None and ends_in is not None else law
     if file is not None:
         requested = decode(read_file(file), Goal)
     else:
         requested = make_goal(
-            target, law=law or (PLANNED_LAW if ends_in else None), points=point_source, jacobian=jacobian,
+            target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
             cameras=camera or None, profile=profile, posture=ends_in,
             gain=_one_gain(gain, adaptive_gain),
