@@ -24,18 +24,14 @@ Missing = Literal["watch"]
 POSITION_MODES = ("csp", "ip")
 
 
-class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One ``[[joints.options.joint]]``: a drive and its joint [rad, s; m for prismatic joints].
+class CanDrive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What joints and grippers tell of their drive [rad, s; m for prismatic joints].
 
     ``counts_per_rev``, ``velocity_units_per_rev_s``: of the motor (60: the drive speaks rpm; default: counts/s).
     ``gear_ratio``: motor turns per joint turn; of a prismatic joint, motor turns per metre. ``offset_rad``:
-    ``q = counts / k - offset``. ``max_*`` go to the drive and clamp commands; ``position_min``, ``position_max``: the
-    machine's limits. ``rated_torque`` [N m or N at the joint] of 1000 permille; without it, efforts are shares of it.
-    ``current_limit`` [A]: protocol ``odrive`` only; where given, it and ``max_velocity`` become the drive's limits.
-    ``vendor_id``, ``product_code``, ``revision``, ``serial_number``: checked against the drive's identity where given.
-    ``sdo``: further writes ``"index:subindex" = value``, verified by reading back. ``accept_missing``: names what the
-    drive may lack though the arm is less safe without it. Of position modes: ``position_lead`` [rad or m], how far an
-    order may be ahead of the joint; ``load_offset_max``, how far the drive may stand off its order under load.
+    ``q = counts / k - offset``. ``position_min``, ``position_max``: the machine's limits. ``vendor_id``,
+    ``product_code``, ``revision``, ``serial_number``: checked against the drive's identity where given. ``sdo``:
+    further writes ``"index:subindex" = value``, verified by reading back.
     """
 
     name: str
@@ -46,19 +42,31 @@ class CanJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     direction: Literal[1, -1] = 1
     offset_rad: float = 0.0
     velocity_units_per_rev_s: Positive | None = None
-    max_velocity: Positive
-    max_acceleration: Positive
     quick_stop_deceleration: Positive
     position_min: float
     position_max: float
-    multi_turn: bool = False
-    rated_torque: Positive | None = None
-    current_limit: Positive | None = None
     vendor_id: int | None = None
     product_code: int | None = None
     revision: int | None = None
     serial_number: int | None = None
     sdo: dict[str, int] = {}
+
+
+class CanJoint(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One ``[[joints.options.joint]]``: a joint and its drive, as of `CanDrive`.
+
+    ``max_*`` go to the drive and clamp commands. ``rated_torque`` [N m or N at the joint] of 1000 permille; without it,
+    efforts are shares of it. ``current_limit`` [A]: protocol ``odrive`` only; where given, it and ``max_velocity``
+    become the drive's limits. ``accept_missing``: names what the drive may lack though the arm is less safe without it.
+    Of position modes: ``position_lead`` [rad or m], how far an order may be ahead of the joint; ``load_offset_max``,
+    how far the drive may stand off its order under load.
+    """
+
+    max_velocity: Positive
+    max_acceleration: Positive
+    multi_turn: bool = False
+    rated_torque: Positive | None = None
+    current_limit: Positive | None = None
     accept_missing: tuple[Missing, ...] = ()
     position_lead: Positive | None = None
     load_offset_max: Annotated[float, Meta(ge=0)] | None = None
@@ -102,37 +110,22 @@ class CanOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return AuxiliarySpec(self.name, "digital")
 
 
-class CanGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One ``[[joints.options.gripper]]``: an auxiliary joint on a CiA 402 drive of its own [m, s; rad where revolute].
+class CanGripper(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One ``[[joints.options.gripper]]``: an auxiliary joint on a CiA 402 drive of its own, as of `CanDrive`.
 
     The drive goes to ordered positions by itself (profile position, mode 1) at ``velocity`` with ``acceleration``.
-    Scales and identity as of `CanJoint`. ``torque_limit``: permille of the motor's rated torque (0x6072), with which it
-    grips. ``quick_stop_option``, ``abort_option``: what it does where this computer stops it or is gone; as they are,
-    it brakes and keeps its torque, so that it holds its part. ``eds``: of its drive, beside the cell file. ``profile``:
-    a TOML file there with any of these keys, which those in the cell file override.
+    ``torque_limit``: permille of the motor's rated torque (0x6072), with which it grips. ``quick_stop_option``,
+    ``abort_option``: what it does where this computer stops it or is gone; as they are, it brakes and keeps its torque,
+    so that it holds its part. ``eds``: of its drive, beside the cell file. ``profile``: a TOML file there with any of
+    these keys, which those in the cell file override.
     """
 
-    name: str
-    node_id: NodeId
     kind: Literal["revolute", "prismatic"] = "prismatic"
-    counts_per_rev: Positive
-    gear_ratio: Positive = 1.0
-    direction: Literal[1, -1] = 1
-    offset_rad: float = 0.0
-    velocity_units_per_rev_s: Positive | None = None
     velocity: Positive
     acceleration: Positive
-    quick_stop_deceleration: Positive
-    position_min: float
-    position_max: float
     torque_limit: Annotated[int, Meta(ge=1, le=5000)] | None = None
     quick_stop_option: Literal[1, 2, 3, 4, 5, 6, 7, 8] = 6
     abort_option: Literal[1, 2, 3] = 3
-    vendor_id: int | None = None
-    product_code: int | None = None
-    revision: int | None = None
-    serial_number: int | None = None
-    sdo: dict[str, int] = {}
     eds: str = ""
     profile: str = ""
 
@@ -142,7 +135,7 @@ class CanGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     def joint(self) -> CanJoint:
         """Its drive, scales and limits in the form of a joint's."""
-        shared = {key: getattr(self, key) for key in CanJoint.__struct_fields__ if hasattr(self, key)}
+        shared = {key: getattr(self, key) for key in CanDrive.__struct_fields__}
         return CanJoint(**shared, max_velocity=self.velocity, max_acceleration=self.acceleration)
 
 

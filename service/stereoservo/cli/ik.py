@@ -63,6 +63,8 @@ def ik(
     arm = learnt_arm(cell, operator)
     found = postures_of(arm, target)
     rows = [_row(arm, found, number) for number in range(len(found.images.solutions))]
+    if not rows:
+        raise CommandError("no_posture", _why_none(arm, found))
     if arm.now is not None:
         with Client(arm.cell.cell.name, operator=operator) as client:
             for row in rows:
@@ -77,8 +79,6 @@ def ik(
         _text(arm, found, rows),
         json,
     )
-    if not rows:
-        raise CommandError("no_posture", _why_none(arm, found))
 
 
 def posture(cell: str, target: dict[str, Any], number: int, operator: str | None) -> dict[str, float]:
@@ -99,27 +99,27 @@ def posture(cell: str, target: dict[str, Any], number: int, operator: str | None
 def learnt_arm(cell: str, operator: str | None) -> LearntArm:
     """Cell file, model and present joints of a cell on this host.
 
-    Raises CommandError, NotRunningError, CellFileError, ModelFileError, ClientError.
+    Raises CommandError, NotRunningError, CellFileError, ClientError.
     """
-    from stereoservo.kinematics.model import load_model
+    from stereoservo.gateway.persistence import ModelStore
 
     live = not cell.endswith(".toml")
     described = load_cell_file(Path(find_daemon(cell).cell_path) if live else Path(cell))
-    models = cell_directories(described.cell.name).models
+    models = ModelStore(cell_directories(described.cell.name).models)
+    epochs, now = models.epochs(), None
     if live:
         with Client(cell, operator=operator) as client:
             status = client.status()
-        if not status.model_epoch:
-            raise CommandError(
-                "no_model", f"the cell {cell} has no model yet: `stereoservo calibrate {cell}` makes one"
-            )
-        return LearntArm(
-            described, load_model(models / f"model-{status.model_epoch:06d}.json"), dict(status.joints)
-        )
-    files = sorted(models.glob("model-??????.json"))
-    if not files:
-        raise CommandError("no_model", f"{models} holds no model: `stereoservo calibrate {cell}` makes one")
-    return LearntArm(described, load_model(files[-1]), None)
+        epochs, now = [status.model_epoch] * bool(status.model_epoch), dict(status.joints)
+    for epoch in reversed(epochs):
+        if (model := models.of_epoch(epoch)) is not None:
+            return LearntArm(described, model, now)
+    damaged = f"; damaged: {', '.join(str(models.path(epoch)) for epoch in epochs)}" if epochs else ""
+    raise CommandError(
+        "no_model",
+        f"the cell {described.cell.name} has no model{damaged}: "
+        f"`stereoservo calibrate {described.cell.name}` makes one",
+    )
 
 
 def postures_of(arm: LearntArm, target: dict[str, Any]) -> Postures:

@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from stereoservo.client.goal_handle import TERMINAL
 from stereoservo.core.cycle import Event, Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.ipc_messages import ServoState
@@ -194,7 +195,7 @@ class FlightReader:
                     del self._goals[id_]
             elif event.kind == "goal_started":
                 told = event.id
-            elif event.kind in ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted"):
+            elif event.kind in TERMINAL:
                 self._goals.pop(event.id, None)
         if outputs.status.goal == told and told in self._goals:
             self._tell("goal", inputs.now_ns, goal_message(*self._goals[told]))
