@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 
+from corrupted import corrupted_copies
 from oracles.former_recording import FormerRecorder
 from stereoservo.cli import main as cli
 from stereoservo.core.cycle import decode_array, encode
@@ -100,19 +101,8 @@ def test_a_record_of_another_kind_or_length_is_refused_or_changes_no_message(sma
 @pytest.mark.parametrize("count", FILES)
 def test_no_file_raises_anything_else(small: Path, count: int) -> None:
     whole = small.read_bytes()
-    rng = np.random.default_rng(count)
-    for k in range(count):
-        data = bytearray(whole)
-        for _ in range(int(rng.integers(1, 10))):
-            at, length = int(rng.integers(len(data))), int(rng.integers(1, 40))
-            match k % 3:
-                case 0:
-                    data[at : at + length] = rng.bytes(length)
-                case 1:
-                    del data[at : at + length]
-                case _:
-                    data[at:at] = data[int(rng.integers(len(data))) :][:length]
-        read(small, bytes(data))
+    for data in corrupted_copies(whole, count, 9):
+        read(small, data)
 
 
 @pytest.mark.parametrize("length", [2**40, 2**63, 2**64 - 1, 2**31])

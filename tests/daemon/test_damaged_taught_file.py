@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from corrupted import corrupted_copies
 from stereoservo.core.cycle import Event, Sample
 from stereoservo.daemon.kernel_compilation import example_model
 from stereoservo.daemon.taught_goals import (
@@ -71,19 +72,8 @@ def test_every_cut_is_noticed(tmp_path: Path, whole: bytes) -> None:
 @pytest.mark.parametrize("count", SLOW)
 def test_no_file_raises_anything_else(tmp_path: Path, whole: bytes, count: int) -> None:
     path = tmp_path / "taught.json"
-    rng = np.random.default_rng(count)
-    for k in range(count):
-        data = bytearray(whole)
-        for _ in range(int(rng.integers(1, 20))):
-            at, length = int(rng.integers(len(data))), int(rng.integers(1, 40))
-            match k % 3:
-                case 0:
-                    data[at : at + length] = rng.bytes(length)
-                case 1:
-                    del data[at : at + length]
-                case _:
-                    data[at:at] = data[int(rng.integers(len(data))) :][:length]
-        found = load(path, bytes(data))
+    for data in corrupted_copies(whole, count, 19):
+        found = load(path, data)
         assert isinstance(found, dict) or str(path) in str(found)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from corrupted import corrupted_copies
 from stereoservo.daemon.kernel_compilation import example_model
 from stereoservo.kinematics.model import CellModel, ModelFileError, decode_model, encode_model, load_model
 
@@ -50,19 +51,8 @@ def test_every_cut_is_noticed() -> None:
 
 @pytest.mark.parametrize("count", FILES)
 def test_no_file_raises_anything_else(count: int) -> None:
-    rng = np.random.default_rng(count)
-    for k in range(count):
-        data = bytearray(WHOLE)
-        for _ in range(int(rng.integers(1, 20))):
-            at, length = int(rng.integers(len(data))), int(rng.integers(1, 40))
-            match k % 3:
-                case 0:
-                    data[at : at + length] = rng.bytes(length)
-                case 1:
-                    del data[at : at + length]
-                case _:
-                    data[at:at] = data[int(rng.integers(len(data))) :][:length]
-        found = decoded(bytes(data))
+    for data in corrupted_copies(WHOLE, count, 19):
+        found = decoded(data)
         assert isinstance(found, CellModel) or str(found).startswith("model-000001.json: ")
 
 
