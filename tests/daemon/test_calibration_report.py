@@ -16,8 +16,9 @@ from stereoservo.calibration.trial_data import CalibrationError, TrialData, load
 from stereoservo.core.sources.trial_stops import combined_offsets
 from stereoservo.daemon.jobs.calibration_report import floors, residuals_of, write_report
 from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
+from stereoservo.kinematics.denavit_hartenberg import denavit_hartenberg, known_length_of
 from stereoservo.kinematics.model import CellModel, FitStatistics, JointStatistics, load_model
-from stereoservo_sim.world.synthetic import SyntheticCell, parallel, rx90
+from stereoservo_sim.world.synthetic import RX90_ROWS, SyntheticCell, parallel, rx90
 
 SIGMA = 0.05
 
@@ -51,6 +52,23 @@ def test_a_page_shows_tracks_histograms_floors_and_what_was_left_out(fitted: tup
         assert f"<td>{name}</td>" in page
     assert "<td>cam0</td><td>3</td><td>15</td>" in page  # the wrong match, by camera, stop and marker id
     assert "trials-000001.npz" in page
+
+
+def test_a_known_length_gives_the_arms_dimensions_in_metres(fitted: tuple, tmp_path: Path) -> None:
+    _folder, data, result, said = fitted
+    a_2, d_4 = RX90_ROWS[1][0], RX90_ROWS[3][2]
+    for known, words in {
+        f"a:j2={a_2}": [f">{1e3 * a_2:g}<", "metres of a slide"],
+        "markers:10,99=0.05": ["Not determined", "2 of 10, 11"],
+    }.items():
+        page = write_report(
+            tmp_path / "known", data, said, model=result.model, report=result.report, known_length=known
+        ).read_text()
+        for word in (f"Denavit-Hartenberg parameters, by {known}", *words):
+            assert word in page, word
+    elbow = denavit_hartenberg(result.model, known_length_of(f"a:j2={a_2}"))[3]
+    assert elbow.d_std is not None
+    assert abs(abs(elbow.d) - d_4) < 4.0 * elbow.d_std < 0.02, (elbow.d, elbow.d_std)
 
 
 def test_residuals_are_those_of_the_fit(fitted: tuple) -> None:

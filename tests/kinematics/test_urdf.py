@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from stereoservo.cli.main import invoke
-from stereoservo.kinematics.denavit_hartenberg import KnownLength, ReadOutError
+from stereoservo.kinematics.denavit_hartenberg import (
+    KnownLength,
+    ReadOutError,
+    denavit_hartenberg,
+    known_length_of,
+)
 from stereoservo.kinematics.model import save_model
 from stereoservo.kinematics.urdf import metric_arm, urdf_text
 from stereoservo.messages.cell_file import load_cell_file
@@ -121,5 +126,13 @@ def test_the_command_writes_it_with_the_limits_of_the_cell_and_asks_for_a_length
     assert msgspec.json.decode(capsys.readouterr().out)["joints"] == list(model.joint_names)
     limit = load_cell_file(shipped_cell_path("demo")).safety.limit[0]
     assert f'lower="{limit.min!r}" upper="{limit.max!r}"' in out.read_text()
+    stated = tmp_path / "cell.toml"
+    text = Path(cell).read_text(encoding="utf-8")
+    stated.write_text(text.replace("[calibration]\n", f'[calibration]\nknown_length = "{length}"\n', 1))
+    assert invoke(["export", str(tmp_path / "m.json"), "--dh", "--cell", str(stated), "--json"]) == 0
+    told = msgspec.json.decode(capsys.readouterr().out)
+    assert told["known"]["metres"] == 0.05
+    rows = denavit_hartenberg(model, known_length_of(length))
+    assert [row["a"] for row in told["denavit_hartenberg"]] == [row.a for row in rows]
     with pytest.raises(ReadOutError, match="99"):
         metric_arm(model, KnownLength("markers", (99, model.marker_ids[0]), 0.05))

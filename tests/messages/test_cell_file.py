@@ -155,6 +155,21 @@ CASES = {
         'spread = { joint = "j1", positions = 1 }',
         ["calibration.spread.positions", "2"],
     ),
+    "known length without metres": (
+        "range = { j1 = 0.3 }",
+        'known_length = "markers:10,11"',
+        ["calibration.known_length", "'markers:10,11'", "WHAT:OF=METRES", "markers:10,11=0.05"],
+    ),
+    "known length of no length": (
+        "range = { j1 = 0.3 }",
+        'known_length = "a:j2=-1e-3"',
+        ["calibration.known_length", "'a:j2=-1e-3'"],
+    ),
+    "known length between cameras that are not there": (
+        "range = { j1 = 0.3 }",
+        'known_length = "baseline:left,top=0.2"',
+        ["calibration.known_length", "two cameras of left"],
+    ),
     "unknown key of spread": (
         "range = { j1 = 0.3 }",
         'spread = { joint = "j1", count = 3 }',

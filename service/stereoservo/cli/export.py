@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit, note
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.denavit_hartenberg import KnownLength, ReadOutError
+from stereoservo.kinematics.denavit_hartenberg import (
+    DH_HEAD,
+    KnownLength,
+    ReadOutError,
+    denavit_hartenberg,
+    dh_cells,
+    known_length_of,
+)
 from stereoservo.kinematics.model import CellModel, load_model
 from stereoservo.kinematics.urdf import metric_arm, urdf_text
-from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.recording.flight_export import export_flight
 
 SAME = 1e-9
 """Relative error up to which a replay on another processor tells the same."""
-WHATS = ("markers", "baseline", "prismatic", "a", "d")
 
 
 def export(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="A flight recording (*.mcap), or a model (*.json) for --urdf."),
+        typer.Argument(metavar="FILE", help="A flight recording (*.mcap), or a model (*.json)."),
     ],
     output: Annotated[
         Path | None,
@@ -32,6 +39,9 @@ def export(
     urdf: Annotated[
         Path | None, typer.Option("--urdf", metavar="FILE", help="Of a metric model: the URDF file to write.")
     ] = None,
+    dh: Annotated[
+        bool, typer.Option("--dh", help="Of a metric model: print its Denavit-Hartenberg parameters.")
+    ] = False,
     length: Annotated[
         str,
         typer.Option(
@@ -39,27 +49,31 @@ def export(
             metavar="WHAT:OF=METRES",
             help="The known length: markers:10,11=0.05 (two ids), baseline:left,right=0.2 (two cameras), "
             "a:JOINT=METRES or d:JOINT=METRES (of its Denavit-Hartenberg row), "
-            "prismatic:JOINT=1 (the default where a joint slides).",
+            "prismatic:JOINT=1. Default: calibration.known_length of --cell, else the unit of a slide.",
         ),
     ] = "",
     cell: Annotated[
         Path | None,
         typer.Option(
-            "--cell", metavar="FILE", help="Cell file whose safety.limit are the joints' in the URDF."
+            "--cell",
+            metavar="FILE",
+            help="Cell file: calibration.known_length, and safety.limit for the URDF.",
         ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a recording for Foxglove and Rerun, which still replays bit for bit; or a fitted metric model as URDF.
+    """Write a recording for Foxglove and Rerun, which still replays bit for bit; or a model's dimensions, or its URDF.
 
     Pictures in NAME.images beside a recording go with it. A URDF has the joints, and markers and cameras as links.
     """
     if file.suffix == ".json":
-        if urdf is None:
-            raise CommandError("usage", f"{file} is a model: --urdf FILE says where to write it to")
-        _export_model(file, urdf, length, cell, json)
-    elif urdf is not None:
-        raise CommandError("usage", f"--urdf is for a model (*.json); {file} is none")
+        if urdf is None and not dh:
+            raise CommandError(
+                "usage", f"{file} is a model: --urdf FILE writes it, --dh prints its dimensions"
+            )
+        _export_model(file, urdf, dh, length, cell, json)
+    elif urdf is not None or dh:
+        raise CommandError("usage", f"--urdf and --dh are for a model (*.json); {file} is none")
     else:
         _export_flight(file, output if output is not None else file.with_suffix(".foxglove.mcap"), json)
 
@@ -96,46 +110,49 @@ def _export_flight(file: Path, target: Path, json: bool) -> None:
     emit(figures, "\n".join(lines), json)
 
 
-def _export_model(model: Path, urdf: Path, length: str, cell: Path | None, json: bool) -> None:
-    found = load_model(model)
-    limits = (
-        {}
-        if cell is None
-        else {
-            limit.joint: (limit.min, limit.max, limit.velocity) for limit in load_cell_file(cell).safety.limit
-        }
-    )
-    known = _known_length(length, found)
+def _export_model(
+    file: Path, urdf: Path | None, dh: bool, length: str, cell_path: Path | None, json: bool
+) -> None:
+    model = load_model(file)
+    cell = None if cell_path is None else load_cell_file(cell_path)
+    known = _known_length(length, model, cell)
+    told: dict[str, Any] = {"joints": list(model.joint_names), "known": known}
+    lines = [f"scaled by {known.what} of {', '.join(str(name) for name in known.of)}, {known.metres:g} m"]
     try:
-        arm = metric_arm(found, known)
+        if dh:
+            rows = denavit_hartenberg(model, known)
+            told["denavit_hartenberg"] = msgspec.to_builtins(rows)
+            lines += [" | ".join(cells) for cells in (DH_HEAD, *(dh_cells(row) for row in rows))]
+        if urdf is not None:
+            arm = metric_arm(model, known)
+            limits = () if cell is None else cell.safety.limit
+            bounds = {limit.joint: (limit.min, limit.max, limit.velocity) for limit in limits}
+            urdf.write_text(urdf_text(model, arm, urdf.stem, bounds))
+            told["urdf"] = str(urdf)
+            told["position_scales"] = dict(zip(model.joint_names, arm.scales.tolist(), strict=True))
+            counts = f"{len(model.joint_names)} joints, {len(model.marker_ids)} markers, {len(model.cameras)} cameras"
+            lines.append(f"{urdf}: {counts}")
     except (ReadOutError, GeometryError) as error:
         raise CommandError(error.code, str(error)) from error
-    urdf.write_text(urdf_text(found, arm, urdf.stem, limits))
-    scales = dict(zip(found.joint_names, arm.scales.tolist(), strict=True))
-    emit(
-        {"urdf": str(urdf), "joints": list(found.joint_names), "position_scales": scales, "known": known},
-        f"{urdf}: {len(found.joint_names)} joints, {len(found.marker_ids)} markers, {len(found.cameras)} cameras; "
-        f"scaled by {known.what} of {', '.join(str(name) for name in known.of)}, {known.metres:g} m",
-        json,
-    )
+    emit(told, "\n".join(lines), json)
 
 
-def _known_length(text: str, model: CellModel) -> KnownLength:
-    """The known length that ``text`` states; by default the unit of the first slide. Raises CommandError."""
+def _known_length(text: str, model: CellModel, cell: CellFile | None) -> KnownLength:
+    """The known length that ``text`` or else the cell file states; by default the unit of the first slide. Raises
+    CommandError.
+    """
+    if not text and cell is not None and cell.calibration is not None:
+        text = cell.calibration.known_length
     slides = [n for n, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "prismatic"]
     if not text and slides:
         return KnownLength("prismatic", (slides[0],), 1.0)
-    what, _, rest = text.partition(":")
-    of, _, metres = rest.rpartition("=")
-    names = tuple(of.split(","))
-    try:
-        if what not in WHATS:
-            raise ValueError(what)
-        return KnownLength(what, tuple(int(n) for n in names) if what == "markers" else names, float(metres))  # type: ignore[arg-type]
-    except ValueError as error:
+    if not text:
         raise CommandError(
             "length",
-            f"--length {text!r}: WHAT:OF=METRES is needed, one length of the model in metres, WHAT of "
-            f"{', '.join(WHATS)}, e.g. markers:10,11=0.05"
-            + ("" if text else "; turning joints alone leave the model's scale open"),
-        ) from error
+            "turning joints alone leave the model's scale open: --length WHAT:OF=METRES is needed, markers:10,11=0.05 "
+            "say, or calibration.known_length in the cell file and --cell FILE",
+        )
+    try:
+        return known_length_of(text)
+    except ReadOutError as error:
+        raise CommandError(error.code, str(error)) from error

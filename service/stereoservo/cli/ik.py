@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereoservo.cli.goal.target_options import PLANNED_LAW, make_goal, target_tree
+from stereoservo.cli.goal.target_options import make_goal, target_tree
 from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, emit
 from stereoservo.client import Client
 from stereoservo.client.errors import RefusedError
@@ -191,7 +191,7 @@ def _row(arm: LearntArm, found: Postures, number: int) -> dict[str, Any]:
 
 def _way(client: Client, target: dict[str, Any], joints: dict[str, float]) -> dict[str, Any]:
     """What a live cell answers to a plan that ends in the posture, without motion."""
-    goal = make_goal(target, law=PLANNED_LAW, posture=joints)
+    goal = make_goal(target, posture=joints)
     try:
         plan = client.check(goal).plan
     except RefusedError as refused:

@@ -28,13 +28,15 @@ class CalibrationJobs:
     """
 
     def __init__(
-        self, settings: CoreSettings, models: ModelStore, link: ServoConnection, log: EventLog, history: Path
-    ) -> None:
+        self, settings: CoreSettings, models: ModelStore, link: ServoConnection, log: EventLog, history: Path,
+        known_length: str = "",
+    ) -> None:  # fmt: skip
         self._settings = settings
         self._models = models
         self._link = link
         self._log = log
         self._history = history
+        self._known_length = known_length
         self._job = TrialCollector(settings)
         self._fit: FitJob | None = None
         self._fit_id = ""
@@ -93,7 +95,7 @@ class CalibrationJobs:
         self._fit_id, self._told = self._job.id, False
         try:
             epoch = self._models.next_epoch()
-            self._fit = FitJob(self._job.trials(), self._models.path(epoch), epoch)
+            self._fit = FitJob(self._job.trials(), self._models.path(epoch), epoch, self._known_length)
         except (CalibrationError, OSError) as error:
             self._failed(self._fit_id, str(error), getattr(error, "code", ""))
             return

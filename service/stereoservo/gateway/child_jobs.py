@@ -114,13 +114,18 @@ class ChildJob:
 class FitJob(ChildJob):
     """A running fit: yields a model or the cause of its failure, and later a report."""
 
-    def __init__(self, trials: TrialData, model_path: Path, epoch: int) -> None:
+    def __init__(self, trials: TrialData, model_path: Path, epoch: int, known_length: str = "") -> None:
         self.model_path = model_path
         self.trials_path = trials_file(model_path, epoch)
         self.report_path = report_folder(model_path) / "index.html"
         save_trials(trials, self.trials_path)
         super().__init__(
-            "stereoservo.daemon.jobs.fit_job", str(self.trials_path), str(model_path), "--epoch", str(epoch)
+            "stereoservo.daemon.jobs.fit_job",
+            str(self.trials_path),
+            str(model_path),
+            "--epoch",
+            str(epoch),
+            *(["--known-length", known_length] if known_length else []),
         )
         self._seconds: float | None = None
 

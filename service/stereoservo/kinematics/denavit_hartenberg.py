@@ -23,6 +23,7 @@ Conventions, where the classical ones leave a choice or fail:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
@@ -51,6 +52,9 @@ PARALLEL = np.radians(5.0)
 """Angle between axes [rad] below which a row has β in place of d."""
 MEETING = 0.01
 """Distance between axes, as a share of the arm's size, below which they count as meeting."""
+DH_HEAD = ("joint", "a [mm]", "α [°]", "β [°]", "d [mm]", "θ [°]", "metres of a slide's unit")
+ROUNDING = 1e-9
+"""Deviations of so small a share of their value are those of the known length itself: rounding."""
 COLUMNS = ("a", "alpha", "beta", "d", "theta")
 
 
@@ -79,6 +83,22 @@ class KnownLength(msgspec.Struct, frozen=True):
     what: Literal["a", "d", "prismatic", "markers", "baseline"]
     of: tuple[str | int, ...]
     metres: float
+
+
+def known_length_of(text: str) -> KnownLength:
+    """The known length that ``text`` states as ``WHAT:OF=METRES``. Raises ReadOutError (``length``)."""
+    what, _, rest = text.partition(":")
+    of, _, metres = rest.rpartition("=")
+    names = [int(name) if what == "markers" and name.isdecimal() else name for name in of.split(",")]
+    try:
+        return msgspec.convert({"what": what, "of": names, "metres": float(metres)}, KnownLength)
+    except (ValueError, msgspec.ValidationError) as error:
+        raise ReadOutError(
+            "length",
+            f"known length {text!r}: WHAT:OF=METRES is needed, one length of the model in metres, WHAT of markers, "
+            "baseline, prismatic, a, d: markers:10,11=0.05, baseline:left,right=0.2, a:j2=0.4",
+            text=text,
+        ) from error
 
 
 class DhRow(msgspec.Struct, frozen=True):
@@ -138,6 +158,30 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
         )
         for j, (name, kind) in enumerate(zip(model.joint_names, parts.kinds, strict=True))
     )
+
+
+def dh_cells(row: DhRow) -> tuple[str, ...]:
+    """A row as text below `DH_HEAD`: values with their standard deviations, those set by a convention in brackets."""
+    cells = [row.joint]
+    for column in COLUMNS:
+        factor = 1e3 if column in ("a", "d") else float(np.degrees(1.0))
+        value, std = factor * getattr(row, column), getattr(row, f"{column}_std")
+        if column in row.chosen:
+            cells.append(f"({value:.6g})")
+        else:
+            cells.append(_with_deviation(value, None if std is None else factor * std))
+    return (*cells, "" if row.scale is None else _with_deviation(row.scale, row.scale_std))
+
+
+def _with_deviation(value: float, std: float | None) -> str:
+    if std is None or std <= ROUNDING * abs(value):
+        return f"{value:.6g}"
+    return f"{value:.{decimals(std)}f} ± {std:.2g}"
+
+
+def decimals(std: float) -> int:
+    """Decimals that are significant for a standard deviation."""
+    return max(0, 1 - math.floor(math.log10(std)))
 
 
 def metres_per_length(model: CellModel, known: KnownLength) -> float:

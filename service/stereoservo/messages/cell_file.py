@@ -5,6 +5,7 @@ calibration, zenoh), strictly decoded and validated.
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -178,6 +179,9 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Stops, after those of single joints, at which all joints stand apart from the base by 0.4 to 0.8 of what each was
     driven; 0: none."""
     spread: SpreadSection | None = None
+    known_length: str = ""
+    """One length of arm, markers or cameras, as WHAT:OF=METRES (markers:10,11=0.05, baseline:left,right=0.2,
+    prismatic:j1=1, a:j2=0.4, d:j3=0.1): by it the report tells the arm's Denavit-Hartenberg parameters in metres."""
 
 
 class TlsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -290,7 +294,28 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
             "mounted alike: mount them so, or take those that stand and those on the arm as cells of their own",
         )
     check_limits(cell, path)
+    if cell.calibration is not None and cell.calibration.known_length:
+        _check_known_length(cell.calibration.known_length, names, path)
     return cell
+
+
+def _check_known_length(text: str, cameras: list[str], path: Path | str) -> None:
+    """Check the form of a known length, as far as a cell file tells; which markers there are, the model knows."""
+    found = re.fullmatch(r"(markers|baseline|prismatic|a|d):([^=]+)=([0-9.eE+-]+)", text)
+    what, of, number = found.groups() if found else ("", "", "")
+    names = of.split(",")
+    try:
+        valid = float(number) > 0.0 and len(set(names)) == (2 if what in ("markers", "baseline") else 1)
+        valid = valid and (what != "markers" or all(name.isdecimal() for name in names))
+    except ValueError:
+        valid = False
+    if not valid or (what == "baseline" and not set(names) <= set(cameras)):
+        raise CellFileError(
+            path,
+            "calibration.known_length",
+            f"is {text!r}; WHAT:OF=METRES is valid, markers:10,11=0.05 (two ids), prismatic:j1=1, a:j2=0.4, d:j3=0.1 "
+            f"(a joint) or baseline:A,B=0.2 (two cameras of {', '.join(cameras)})",
+        )
 
 
 def _check_numbers(value: Any, key: str, path: Path | str) -> None:

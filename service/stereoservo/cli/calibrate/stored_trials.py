@@ -75,6 +75,8 @@ def fit_stored_trials(
         output = store.path(epoch)
     else:
         epoch = 0
+    calibration = None if file is None else file.calibration
+    known = "" if calibration is None else calibration.known_length
     priors, used = (None, None) if lines is None else read_lines(lines, lines_sigma, data)
     started = time.monotonic()
     try:
@@ -87,7 +89,7 @@ def fit_stored_trials(
         ) from error
     seconds = time.monotonic() - started
     try:
-        page: Path | None = report_fit(data, path, output, result, assessment)
+        page: Path | None = report_fit(data, path, output, result, assessment, known)
     except OSError as error:
         note(f"no report could be written into {report_folder(output)}: {error}")
         page = None

@@ -16,7 +16,6 @@ import typer
 from stereoservo.cli import interruption
 from stereoservo.cli.goal.image_set_points import FRAMES, feature_tree, read_images, require_cameras
 from stereoservo.cli.goal.target_options import (
-    PLANNED_LAW,
     adaptive,
     make_goal,
     stream_lines,
@@ -221,7 +220,6 @@ def goal(
         target = target_tree(name, joint, set_points, files, relative_to, common)
     local = target if file is None and stream is None and endpoint is None else {}
     ends_in = None if posture is None else _ends_in(cell, local, posture, operator)
-    law = PLANNED_LAW if law is None and ends_in is not None else law
     if file is not None:
         requested = decode(read_file(file), Goal)
     else:

@@ -100,9 +100,11 @@ def adaptive(text: str) -> dict[str, float]:
 
 
 def make_goal(target: dict[str, Any], **options: Any) -> Goal:
-    """A goal with an id of its own; options that are None take the cell's defaults."""
+    """A goal with an id of its own; options that are None take the cell's defaults, with a posture the law that plans."""
     tree = {"id": str(uuid.uuid4()), "target": target, **options}
     given = {key: value for key, value in tree.items() if value is not None}
+    if "posture" in given:
+        given.setdefault("law", PLANNED_LAW)
     return decode(encode(given), Goal)  # NaN is refused, not dropped
 
 

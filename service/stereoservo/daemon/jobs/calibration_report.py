@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import html
 import io
-import math
 import os
 import shutil
 import tempfile
@@ -34,6 +33,14 @@ from stereoservo.calibration.joint_errors.joint_noise import estimated_errors
 from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
 from stereoservo.calibration.rig_model import Measurements, acting_order, acting_rig, full_charts, predicted
 from stereoservo.calibration.trial_data import TrialData
+from stereoservo.kinematics.denavit_hartenberg import (
+    DH_HEAD,
+    ReadOutError,
+    decimals,
+    denavit_hartenberg,
+    dh_cells,
+    known_length_of,
+)
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo.kinematics.model import CellModel
 
@@ -98,13 +105,14 @@ def write_report(
     model: CellModel | None = None,
     report: CalibrationReport | None = None,
     trials_path: Path | None = None,
+    known_length: str = "",
 ) -> Path:
     """Write ``folder/index.html``, replacing an older one; returns its path. Without a model: the report of a
-    failure.
+    failure. ``known_length``: WHAT:OF=METRES, for the arm's dimensions in metres.
 
     Raises OSError.
     """
-    page = _page(trials, verdict, model, report, trials_path).encode()
+    page = _page(trials, verdict, model, report, trials_path, known_length).encode()
     scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         with (scratch / "index.html").open("wb") as file:
@@ -133,6 +141,7 @@ def _page(
     model: CellModel | None,
     report: CalibrationReport | None,
     trials_path: Path | None,
+    known_length: str,
 ) -> str:
     heading = "Calibration failed" if model is None else f"Calibration: model epoch {model.epoch}"
     parts = [
@@ -159,6 +168,7 @@ def _page(
             "<h2>What is known, and how well</h2>",
             _cameras(report),
             _quantities(model),
+            *_dimensions(model, known_length),
             "<h2>Left out</h2>",
             _outliers(report),
         ]
@@ -289,11 +299,28 @@ def _quantities(model: CellModel) -> str:
     return f"{page}<details><summary>As seen in the images</summary>{_table(head, seen)}</details>"
 
 
+def _dimensions(model: CellModel, text: str) -> list[str]:
+    """Section of the arm's Denavit-Hartenberg parameters by the known length that ``text`` states; empty without."""
+    if not text:
+        return []
+    heading = f"<h2>Denavit-Hartenberg parameters, by {_e(text)}</h2>"
+    try:
+        rows = denavit_hartenberg(model, known_length_of(text))
+    except ReadOutError as error:
+        return [heading, f"<p>Not determined: {_e(error)}.</p>"]
+    return [
+        heading,
+        "<p>Row of a joint: what it does and the link behind it, Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β); θ of a turning "
+        "joint and d of a sliding one are offsets at position 0. Values in brackets are set by the convention.</p>",
+        _table(DH_HEAD, [dh_cells(row) for row in rows]),
+    ]
+
+
 def _to_deviation(value: float, std: float | None) -> str:
     """``value`` rounded to the digits that are significant for its deviation."""
     if not std:
         return f"{value:.6g}"
-    return f"{value:.{max(0, 1 - math.floor(math.log10(std)))}f}"
+    return f"{value:.{decimals(std)}f}"
 
 
 def _cameras(report: CalibrationReport) -> str:

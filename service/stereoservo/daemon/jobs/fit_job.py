@@ -91,6 +91,7 @@ def report_fit(
     model_path: Path,
     result: CalibrationFit | None,
     assessment: Acceptance,
+    known_length: str = "",
 ) -> Path:
     """Write the report of a fit, or of a failure (``result`` None), beside the model. Raises OSError."""
     # matplotlib is slow to import; the model must not wait for it.
@@ -99,6 +100,7 @@ def report_fit(
     return write_report(
         report_folder(model_path), trials, assessment, trials_path=trials_path,
         model=None if result is None else result.model, report=None if result is None else result.report,
+        known_length=known_length,
     )  # fmt: skip
 
 
@@ -108,6 +110,7 @@ def main() -> int:
     parser.add_argument("trials", type=Path)
     parser.add_argument("model", type=Path)
     parser.add_argument("--epoch", type=int, required=True)
+    parser.add_argument("--known-length", default="", help="WHAT:OF=METRES, for the report")
     parser.add_argument("--parent", type=int, default=0, help="end with this process")
     arguments = parser.parse_args()
     become_child(arguments.parent)
@@ -133,7 +136,10 @@ def main() -> int:
         print_line(error_line(error))
         return 1
     try:
-        print_line({"report": str(report_fit(trials, arguments.trials, arguments.model, result, assessment))})
+        page = report_fit(
+            trials, arguments.trials, arguments.model, result, assessment, arguments.known_length
+        )
+        print_line({"report": str(page)})
     except OSError as error:
         print_line({"report_error": str(error)})
     return 0 if result is not None else 1
