@@ -100,7 +100,9 @@ def adaptive(text: str) -> dict[str, float]:
 
 
 def make_goal(target: dict[str, Any], **options: Any) -> Goal:
-    """A goal with an id of its own; options that are None take the cell's defaults, with a posture the law that plans."""
+    """A goal with an id of its own; options that are None take the cell's defaults, those with a posture the law that
+    plans.
+    """
     tree = {"id": str(uuid.uuid4()), "target": target, **options}
     given = {key: value for key, value in tree.items() if value is not None}
     if "posture" in given:
