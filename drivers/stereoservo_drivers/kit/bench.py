@@ -25,8 +25,8 @@ STAMP_REMEDY = (
     "kit.device_clock"
 )
 RUNAWAY_REMEDY = (
-    "units [rad, m] and gear of commands and positions; where it is one sample only, an answer was taken that is torn "
-    "or has a wrong checksum"
+    "units [rad, m] and gear of commands and positions; of a Cartesian arm, units and axes of its pose and its twists; "
+    "where it is one sample only, an answer was taken that is torn or has a wrong checksum"
 )
 RAISED = {
     "describe": "describe() tells the joints before anything connects",

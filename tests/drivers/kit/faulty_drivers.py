@@ -343,14 +343,8 @@ class SignFlipped(Driver):
         return velocities * [1.0, -1.0]
 
 
-class AgreesWithItselfOnly(Driver):
+class AgreesWithItselfOnly(SignFlipped):
     """A joint counts the other way in commands and positions alike."""
-
-    def told(self, positions: Any) -> Any:
-        return positions * [1.0, -1.0]
-
-    def told_speeds(self, velocities: Any) -> Any:
-        return velocities * [1.0, -1.0]
 
     def sent(self, velocities: Any) -> Any:
         return velocities * [1.0, -1.0]
@@ -394,13 +388,10 @@ class NeverMended(Driver):
     failed = False
 
     def look(self) -> None:
-        try:
-            super().look()
-        except DriverError:
-            self.failed = True
-            raise
+        assert self.device is not None
+        self.failed = self.failed or self.device.broken
         if self.failed:
-            raise DriverError("protective_stop", "still")
+            raise DriverError("protective_stop", "the device stands in a protective stop; release it")
 
 
 class VelocityOfTheMotor(Driver):
@@ -604,8 +595,6 @@ class SmallSetup(JointDriverSetup):
         return driver.device.writes
 
     def true_positions(self, driver: Any) -> Any:
-        device = driver.device
-        if device.gone:
-            return device.positions
-        device.exchange()
-        return device.positions.copy()
+        if not driver.device.gone:
+            driver.device.exchange()
+        return driver.device.positions.copy()
