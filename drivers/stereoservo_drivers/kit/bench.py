@@ -20,6 +20,14 @@ FUTURE_NS = 1_000_000
 """Several reads at one time of a virtual clock may carry growing stamps."""
 FRESH_SHARE = 0.5
 """Of ``safety.joint_timeout_s``: the age at which samples may be read; the rest is for a cycle and for stalls."""
+STAMP_REMEDY = (
+    "stamps are times of context.clock, never later than now, and rise; a device's own clock is brought to it by "
+    "kit.device_clock"
+)
+RUNAWAY_REMEDY = (
+    "units [rad, m] and gear of commands and positions; of a Cartesian arm, units and axes of its pose and its twists; "
+    "where it is one sample only, an answer was taken that is torn or has a wrong checksum"
+)
 RAISED = {
     "describe": "describe() tells the joints before anything connects",
     "configure": "mend what it tells of the device: power, cable, ids, modes, options",
@@ -104,12 +112,21 @@ class JointDriverSetup(Paced):
     def plug_in(self, driver: JointDriver) -> None:
         """Undo :meth:`unplug`, once the driver is closed."""
 
+    def break_down(self, driver: JointDriver) -> bool:
+        """Make the device fail by its own word (protective stop, hardware error); returns whether that was done."""
+        return False
+
+    def mend(self, driver: JointDriver) -> None:
+        """Undo :meth:`break_down`, as a person at the device does, once the driver is deactivated."""
+
     def device_writes(self, driver: JointDriver) -> int | None:
         """How many writes the device has received so far; None where nobody counts them."""
         return None
 
     def true_positions(self, driver: JointDriver) -> FloatArray | None:
-        """Where the joints are now (n,), not by the driver's word; None where nobody else measures them."""
+        """Where the joints are now (n,), in the driver's joint coordinates, but not by its word, and once it is closed,
+        too; None where nobody else measures them.
+        """
         return None
 
 
@@ -187,11 +204,15 @@ class JointBench:
         count = len(driver.describe().joints)
         self._verify_arrays(state, count)
         ahead_ns = state.t_ns - self.now_ns()
-        require(ahead_ns <= FUTURE_NS, f"a sample is stamped {ahead_ns} ns in the future")
+        require(
+            ahead_ns <= FUTURE_NS, f"a sample is stamped {ahead_ns * 1e-6:.3g} ms in the future", STAMP_REMEDY
+        )
         before = self._last.get(id(driver))
         if before is not None:
             require(
-                state.t_ns >= before.t_ns, f"stamps go back by {before.t_ns - state.t_ns} ns between samples"
+                state.t_ns >= before.t_ns,
+                f"stamps go back by {(before.t_ns - state.t_ns) * 1e-6:.3g} ms between samples",
+                STAMP_REMEDY,
             )
             require(state.seq >= before.seq, f"sequence numbers go back from {before.seq} to {state.seq}")
         self._last[id(driver)] = state
@@ -243,8 +264,11 @@ class JointBench:
             travel = np.abs(states[-1].positions - states[0].positions)
             if (travel > RUNAWAY_TIMES * asked + RUNAWAY).any():
                 driver.stop()
+                k = int(np.argmax(travel - RUNAWAY_TIMES * asked))
                 raise CheckFailedError(
-                    f"the arm runs away, and was stopped: {travel.tolist()} rad or m for {asked.tolist()} commanded"
+                    f"the arm runs away, and was stopped: joint {k} by {travel[k]:.3g} rad or m, {asked[k]:.3g} was "
+                    "commanded",
+                    RUNAWAY_REMEDY,
                 )
             self.write(driver, velocity)
             self.wait(period)

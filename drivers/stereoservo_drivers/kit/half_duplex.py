@@ -52,7 +52,8 @@ class HalfDuplexBus:
     """A bus on ``stream``; ``split`` finds one packet in what has arrived.
 
     ``split(data)`` returns the first whole packet and how many bytes to drop, with the packet or before it; None where
-    there is none yet. Adapters that echo what is sent are served, too. ``answer_s``: how long a servo may take.
+    there is none yet. Adapters that echo what is sent are served, too. ``answer_s``: how long each servo may take: from
+    the question to the first answer, and from each answer to the next.
     ``lost_after``: so many questions in a row without all answers, and the connection is taken for lost.
     """
 
@@ -98,6 +99,7 @@ class HalfDuplexBus:
                 data = data[used:]
                 if answer is not None and answer != packet:  # else the adapter's echo
                     found.append(answer)
+                    end = time.monotonic() + self._answer_s
             if not arrived:
                 if time.monotonic() > end:
                     break

@@ -112,6 +112,11 @@ JOINT_CHECKS = (
         "the device's own watchdog, or positions within a lead of the joint (PositionOutput)",
     ),
     JointCheck(
+        "stands once closed",
+        motion.stands_once_closed,
+        "close() begins with stop(), and leaves the device's time-out armed until the arm stands",
+    ),
+    JointCheck(
         "refuses bad commands",
         motion.refuses_bad_commands,
         "check shape and np.isfinite before anything is sent",
@@ -152,6 +157,12 @@ JOINT_CHECKS = (
     ),
     JointCheck(
         "keeps position limits", motion.keeps_position_limits, "at a limit, send velocities inward only"
+    ),
+    JointCheck(
+        "tells faults of the device",
+        motion.tells_faults_of_the_device,
+        "read_state() looks at the device's error and safety bits, and raises DriverError; configure() clears what "
+        "can be cleared",
     ),
     JointCheck(
         "reports a lost device",

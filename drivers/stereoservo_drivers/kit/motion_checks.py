@@ -26,6 +26,8 @@ MOVED_SHARE = (0.3, 1.5)
 """Of the commanded travel: what a joint must move at least, and at most."""
 SLACK = 1e-3
 """[rad or m] Beside what a bound is derived from."""
+APART = 0.02
+"""[rad or m] Between a joint's true position and that which is told, beside its steps: play, sag, noise."""
 LONGEST_DRIVE_S = 12.0
 REACT_S = 0.02
 """How much later than stop() a call may take effect."""
@@ -33,6 +35,10 @@ SILENCE_S, LONGER_S = 0.2, 0.6
 """How much longer than it may move the arm is left alone, at least, and added to it at most for joints that are slow.
 """
 CALLS = 50
+TRUTH_REMEDY = (
+    "sign, zero, unit or order of the joints is wrong in commands and positions alike: the driver agrees with itself, "
+    "not with true_positions()"
+)
 
 
 def stands_when_activated(bench: JointBench) -> str:
@@ -59,25 +65,52 @@ def stands_when_activated(bench: JointBench) -> str:
 
 
 def moves_as_told(bench: JointBench) -> str:
-    """Each joint moves in the commanded direction, about as far as it is commanded."""
+    """Each joint moves in the commanded direction, about as far as it is commanded, and as far as the driver tells."""
     driver = bench.active()
     velocity = bench.slow(driver)
     start_ns, before = bench.now_ns(), bench.read(driver).positions
+    start = _true_start(bench, driver, before)
     seconds = 0.3
     states = bench.drive(driver, velocity, seconds)
     moved = (bench.read(driver).positions - before) * np.sign(velocity)
+    truth = bench.setup.true_positions(driver)
     elapsed = (bench.now_ns() - start_ns) * 1e-9  # more than asked for on a machine that stalls
     steps = resolutions(driver)
-    least = MOVED_SHARE[0] * seconds * np.abs(velocity) - 2.0 * steps
+    least = np.maximum(MOVED_SHARE[0] * seconds * np.abs(velocity) - 2.0 * steps, 1e-9)
     most = MOVED_SHARE[1] * elapsed * np.abs(velocity) + 2.0 * steps + SLACK
-    for k, (travel, low, high) in enumerate(zip(moved, np.maximum(least, 1e-9), most, strict=True)):
-        require(
-            low <= travel <= high,
-            f"joint {k} moved {travel:+.4g} rad or m in the commanded direction; {low:.4g} to {high:.4g} is required",
-        )
+    _require_travel(moved, least, most, "moved", "")
+    if start is not None and truth is not None:
+        _require_travel((truth - start) * np.sign(velocity), least, most, "truly moved", TRUTH_REMEDY)
     shares = moved / (elapsed * np.abs(velocity))
     late = _lateness(bench, driver, velocity)
     return f"{shares.min():.0%} to {shares.max():.0%} of the commanded travel, from {_reaction(states):.0f} ms on{late}"
+
+
+def _true_start(bench: JointBench, driver: JointDriver, told: FloatArray) -> FloatArray | None:
+    """True positions (n,) of the arm, which stands; None where nobody measures them.
+
+    Raises CheckFailedError where they are not those that are ``told`` (n,).
+    """
+    truth = bench.setup.true_positions(driver)
+    if truth is not None:
+        apart = np.abs(truth - told) - resolutions(driver)
+        k = int(np.argmax(apart))
+        require(
+            bool(apart[k] <= APART),
+            f"joint {k} stands at {truth[k]:+.4g} by true_positions(), the driver tells {told[k]:+.4g} rad or m",
+            TRUTH_REMEDY,
+        )
+    return truth
+
+
+def _require_travel(travel: FloatArray, least: FloatArray, most: FloatArray, verb: str, remedy: str) -> None:
+    """Raise CheckFailedError unless every joint's travel in the commanded direction (n,) is within its bounds (n,)."""
+    for k, (moved, low, high) in enumerate(zip(travel, least, most, strict=True)):
+        require(
+            low <= moved <= high,
+            f"joint {k} {verb} {moved:+.4g} rad or m in the commanded direction; {low:.4g} to {high:.4g} is required",
+            remedy,
+        )
 
 
 def _reaction(states: list[JointState]) -> float:
@@ -209,21 +242,16 @@ def _travel_in_silence(
 
     Raises CheckFailedError where that is farther than the time-out and braking explain.
     """
-    timeout, brake = driver.describe().command_timeout_s, bench.setup.brake_s
-    speed, slack = np.abs(velocity), resolutions(driver) + SLACK
     bench.drive(driver, velocity, 0.2)
     before, start = bench.read(driver), bench.setup.true_positions(driver)
     bench.write(driver, velocity)
-    elapsed = (bench.now_ns() - before.t_ns) * 1e-9
-    slowest = min(2.0 * float((slack / speed).max()), LONGER_S)
-    silence = 2.0 * timeout + brake + SILENCE_S + slowest
+    allowed, silence = _silence(bench, driver, velocity, before)
     bench.wait(silence)
     truth = bench.setup.true_positions(driver)
     after = _settled(bench, driver)
     travel = np.abs(after - before.positions)
     if start is not None and truth is not None:
         travel = np.maximum(travel, np.abs(truth - start))
-    allowed = speed * (elapsed + 1.5 * timeout + 0.5 * brake) + slack
     worst = int(np.argmax(travel / allowed))
     require(
         bool(travel[worst] <= allowed[worst]),
@@ -233,6 +261,45 @@ def _travel_in_silence(
         "the joint (PositionOutput)",
     )
     return float(travel.max()), after
+
+
+def _silence(
+    bench: JointBench, driver: JointDriver, velocity: FloatArray, before: JointState
+) -> tuple[FloatArray, float]:
+    """How far (n,) joints may go from ``before``, with the last command now, and how long [s] is waited to see it."""
+    timeout, brake = driver.describe().command_timeout_s, bench.setup.brake_s
+    speed, slack = np.abs(velocity), resolutions(driver) + SLACK
+    elapsed = (bench.now_ns() - before.t_ns) * 1e-9
+    slowest = min(2.0 * float((slack / speed).max()), LONGER_S)
+    allowed = speed * (elapsed + 1.5 * timeout + 0.5 * brake) + slack
+    return allowed, 2.0 * timeout + brake + SILENCE_S + slowest
+
+
+def stands_once_closed(bench: JointBench) -> str:
+    """close() of a moving arm leaves it at rest: the driver stops it, or at the latest the device's time-out does."""
+    driver = bench.active()
+    velocity = bench.slow(driver)
+    bench.drive(driver, velocity, 0.2)
+    before, start = bench.read(driver), bench.setup.true_positions(driver)
+    if start is None and not bench.setup.real_time:
+        driver.stop()
+        raise CheckNotRunError("nobody tells where the arm is once the driver is closed: true_positions()")
+    bench.write(driver, velocity)
+    allowed, silence = _silence(bench, driver, velocity, before)
+    driver.close()
+    bench.wait(silence)
+    truth = bench.setup.true_positions(driver)
+    again = bench.configured()
+    after = _settled(bench, again).copy()
+    call_stop(again, "of another driver of the same arm")
+    travel = np.abs(after - before.positions) if start is None or truth is None else np.abs(truth - start)
+    worst = int(np.argmax(travel / allowed))
+    require(
+        bool(travel[worst] <= allowed[worst]),
+        f"joint {worst} goes on by {travel[worst]:.3g} rad or m in {silence:.2g} s after close(); "
+        f"{allowed[worst]:.3g} is allowed (time-out and braking)",
+    )
+    return f"travelled {float(travel.max()):.2g} rad or m after close()"
 
 
 def _settled(bench: JointBench, driver: JointDriver) -> FloatArray:
@@ -259,7 +326,8 @@ def _recovery(bench: JointBench, driver: JointDriver, velocity: FloatArray, posi
         return f"is refused ({error.code})"
     require(
         bool(np.all(moved > 0.0)),
-        f"after a time-out new commands neither move the arm nor raise DriverError: {moved.tolist()} rad or m",
+        "after a time-out new commands neither move every joint as commanded nor raise DriverError: "
+        f"{', '.join(f'{travel:+.3g}' for travel in moved)} rad or m",
         "clear the device's watchdog before the next command, or raise DriverError in write_velocity()",
     )
     return "moves it again"
@@ -377,6 +445,27 @@ def answers_in_time(bench: JointBench) -> str:
     return f"{', '.join(texts)}; budget of each {budget:.0f} us, cycle {1e6 * period:.0f} us"
 
 
+def tells_faults_of_the_device(bench: JointBench) -> str:
+    """A fault of the device is told by DriverError; once it is mended, the driver is configured and activated again."""
+    driver = bench.active()
+    velocity, period = bench.slow(driver), 1.0 / driver.describe().rate_hz
+    bench.drive(driver, velocity, 0.1)
+    if not bench.setup.break_down(driver):
+        raise CheckNotRunError("nobody makes the device fail (protective stop, hardware error): break_down()")
+    start_ns = bench.now_ns()
+    try:
+        code = _await_fault(bench, driver, velocity, period, "the device has a fault")
+        waited = (bench.now_ns() - start_ns) * 1e-9
+        call_stop(driver, "with a fault of the device")
+        driver.deactivate()
+    finally:
+        bench.setup.mend(driver)
+    bench.setup.configure(driver)  # as the command `reset` does
+    driver.activate()
+    bench.drive(driver, zero(driver), 0.05)
+    return f"{code} after {waited:.2f} s; mended, it is configured and activated again"
+
+
 def reports_a_lost_device(bench: JointBench) -> str:
     """A device that has gone is told by DriverError, and stop() and close() raise nothing then."""
     driver = bench.active()
@@ -386,7 +475,7 @@ def reports_a_lost_device(bench: JointBench) -> str:
         raise CheckNotRunError("nobody pulls the cable: override unplug(), or `--pull`")
     start_ns = bench.now_ns()
     try:
-        code = _await_fault(bench, driver, velocity, period)
+        code = _await_fault(bench, driver, velocity, period, "the device has gone")
         waited = (bench.now_ns() - start_ns) * 1e-9
         call_stop(driver, "with the device gone")
         call_stop(driver, "with the device gone, a second time")
@@ -396,7 +485,7 @@ def reports_a_lost_device(bench: JointBench) -> str:
     return f"{code} after {waited:.2f} s; stop() and close() raise nothing"
 
 
-def _await_fault(bench: JointBench, driver: JointDriver, velocity: Any, period: float) -> str:
+def _await_fault(bench: JointBench, driver: JointDriver, velocity: Any, period: float, since: str) -> str:
     for _ in range(max(round(bench.setup.fault_s / period), 1)):
         try:
             driver.read_state()
@@ -404,9 +493,7 @@ def _await_fault(bench: JointBench, driver: JointDriver, velocity: Any, period: 
         except DriverError as error:
             return error.code
         except Exception as error:
-            text = f"with the device gone, {type(error).__name__} is raised, not DriverError: {error}"
+            text = f"{since}, and {type(error).__name__} is raised, not DriverError: {error}"
             raise CheckFailedError(text) from error
         bench.wait(period)
-    raise CheckFailedError(
-        f"{bench.setup.fault_s:g} s after the device has gone, no call has raised DriverError"
-    )
+    raise CheckFailedError(f"{since} since {bench.setup.fault_s:g} s, and no call has raised DriverError")

@@ -48,7 +48,7 @@ class JointSpec(msgspec.Struct, frozen=True):
     """A joint's name, kind and the machine's limits; the cell's own can only be tighter.
 
     ``resolution``: step of its encoder at the joint [rad or m], 0 where it is finer than anything that matters here.
-    Raises ValueError where that is negative or not finite.
+    Numbers of arrays are taken as plain floats. Raises ValueError where the resolution is negative or not finite.
     """
 
     name: str
@@ -60,6 +60,8 @@ class JointSpec(msgspec.Struct, frozen=True):
     resolution: float = 0.0
 
     def __post_init__(self) -> None:
+        for name in ("position_min", "position_max", "velocity_max", "acceleration_max", "resolution"):
+            msgspec.structs.force_setattr(self, name, float(getattr(self, name)))
         if not 0.0 <= self.resolution < math.inf:
             raise ValueError(
                 f"joint {self.name!r}: encoder resolution {self.resolution:g}; at least 0 is needed"

@@ -35,7 +35,7 @@ class Device:
         self.positions, self.velocities = np.zeros(2), np.zeros(2)
         self.now_ns = self.until_ns = clock.now_ns()
         self.writes = 0
-        self.gone = False
+        self.gone = self.broken = False
 
     def exchange(self, velocities: Any = None) -> None:
         if self.gone:
@@ -133,6 +133,12 @@ class Driver:
             self.device.exchange(velocities)
         except OSError as error:
             raise DriverError("connection_lost", str(error)) from error
+        self.look()
+
+    def look(self) -> None:
+        assert self.device is not None
+        if self.device.broken:
+            raise DriverError("protective_stop", "the device stands in a protective stop; release it")
 
     def number(self) -> int:
         return self.reads
@@ -337,6 +343,57 @@ class SignFlipped(Driver):
         return velocities * [1.0, -1.0]
 
 
+class AgreesWithItselfOnly(SignFlipped):
+    """A joint counts the other way in commands and positions alike."""
+
+    def sent(self, velocities: Any) -> Any:
+        return velocities * [1.0, -1.0]
+
+
+class JointsSwapped(Driver):
+    """In commands and positions alike; the joints stand at different places."""
+
+    def configure(self) -> None:
+        super().configure()
+        assert self.device is not None
+        self.device.positions = np.array([0.1, -0.1])
+
+    def told(self, positions: Any) -> Any:
+        return positions[::-1].copy()
+
+    def told_speeds(self, velocities: Any) -> Any:
+        return velocities[::-1].copy()
+
+    def sent(self, velocities: Any) -> Any:
+        return velocities[::-1].copy()
+
+
+class LeftRunning(Driver):
+    """close() switches the device's time-out off and does not stop."""
+
+    def close(self) -> None:
+        if self.device is not None:
+            self.device.forever = True
+        self.life.state = CLOSED
+
+
+class FaultUnnoticed(Driver):
+    def look(self) -> None:
+        return
+
+
+class NeverMended(Driver):
+    """A fault that was told once is told for ever."""
+
+    failed = False
+
+    def look(self) -> None:
+        assert self.device is not None
+        self.failed = self.failed or self.device.broken
+        if self.failed:
+            raise DriverError("protective_stop", "the device stands in a protective stop; release it")
+
+
 class VelocityOfTheMotor(Driver):
     def told_speeds(self, velocities: Any) -> Any:
         return 100.0 * velocities
@@ -489,6 +546,11 @@ FAULTY = {
     Degrees: "moves as told",
     DegreesCommanded: "moves as told",
     SignFlipped: "moves as told",
+    AgreesWithItselfOnly: "moves as told",
+    JointsSwapped: "moves as told",
+    LeftRunning: "stands once closed",
+    FaultUnnoticed: "tells faults of the device",
+    NeverMended: "tells faults of the device",
     VelocityOfTheMotor: "agrees with its velocities",
     WritesAfterClose: "is silent once closed",
     LeakedThread: "leaves nothing behind",
@@ -521,12 +583,18 @@ class SmallSetup(JointDriverSetup):
         driver.device.gone = True
         return True
 
+    def break_down(self, driver: Any) -> bool:
+        driver.device.broken = True
+        driver.device.velocities = np.zeros(2)
+        return True
+
+    def mend(self, driver: Any) -> None:
+        driver.device.broken = False
+
     def device_writes(self, driver: Any) -> int:
         return driver.device.writes
 
     def true_positions(self, driver: Any) -> Any:
-        device = driver.device
-        if device.gone:
-            return device.positions
-        device.exchange()
-        return device.positions.copy()
+        if not driver.device.gone:
+            driver.device.exchange()
+        return driver.device.positions.copy()
