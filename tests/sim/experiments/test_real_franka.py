@@ -16,14 +16,6 @@ from typer.testing import CliRunner
 
 from stereoservo_sim.commands.reproduce import reproduce
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.real.driven_cameras import (
-    TagViews,
-    distort,
-    fit_driven_cameras,
-    predict,
-    refit,
-    undistort,
-)
 from stereoservo_sim.experiments.real.tags import (
     find_tags,
     register_tag,
@@ -160,29 +152,6 @@ def test_registration_is_exact_where_subpixel_corners_are_not(truth):
         opencv.append(start - exact)
     assert np.sqrt(np.mean(np.square(errors))) < 0.06
     assert np.sqrt(np.mean(np.square(errors))) < 0.4 * np.sqrt(np.mean(np.square(opencv)))
-
-
-@pytest.mark.parametrize("kappa", [0.03, -0.08])
-def test_fit_recovers_radial_terms_and_sees_through_wrong_views(truth, kappa):
-    poses, corners, _ = truth
-    sizes = np.tile([WIDTH, HEIGHT], (2, 1))
-    pairs = [(c, p) for c in range(2) for p in range(len(poses))]
-    camera, pose = (np.array(a) for a in zip(*pairs, strict=True))
-    straight = np.stack([pixels_of(truth, p, c) for c, p in pairs])
-    pixels = distort(straight, np.full((len(pairs), 1), kappa), sizes[camera][:, None])
-    np.testing.assert_allclose(
-        undistort(pixels, np.full((len(pairs), 1), kappa), sizes[camera][:, None]), straight, atol=1e-9
-    )
-    pixels[5] += 40.0  # a tag taken for another
-    views = TagViews(camera, pose, pixels)
-    model = refit(
-        fit_driven_cameras(poses, views, sizes, np.random.default_rng(0)), poses, views, radial=True
-    )
-    assert np.flatnonzero(~model.inliers).tolist() == [5]
-    assert model.radial == pytest.approx([kappa] * 2, abs=1e-5)
-    np.testing.assert_allclose(model.corners, corners, atol=1e-6)
-    good = model.inliers
-    np.testing.assert_allclose(predict(model, poses, camera[good], pose[good]), pixels[good], atol=1e-4)
 
 
 def copy_set(source, target, images=True):
