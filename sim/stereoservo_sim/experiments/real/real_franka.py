@@ -34,6 +34,7 @@ from stereoservo.calibration.trial_data import (
 )
 from stereoservo.geometry.cameras import triangulate
 from stereoservo.geometry.distortion import undistort
+from stereoservo.geometry.homogeneous import from_homogeneous
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -58,7 +59,7 @@ GreyImage = npt.NDArray[np.uint8]
 FOLDS = 5
 TABLE_TAGS = (0, 2, 3)
 FEW_POSES, SUBSETS = 12, 10
-"""Poses of a small training set, and how many such sets are drawn."""
+"""Poses of a small training set, and how many such sets are drawn by default."""
 INSIDE = 0.95
 """Probability of the ellipses that held-out corners are counted in."""
 FAR = 4.0
@@ -262,11 +263,12 @@ def run_real_franka(
     *,
     hand_tag: int = 9,
     table_tags: tuple[int, ...] = TABLE_TAGS,
+    few_sets: int = SUBSETS,
     seed: int = 0,
     progress: ProgressCall | None = None,
 ) -> RealFrankaResult:
     """Detect, fit, predict. ``progress`` is called with (stage, done, total). ``seed`` is the first of those that draw
-    small training sets.
+    ``few_sets`` small training sets.
 
     Raises ExperimentError: what :func:`load_hand_eye_set` raises, the codes of the fit, ``tag_id``, ``image``,
     ``image_size``, ``tag_not_seen``, ``tag_stands_still``, ``too_few_poses``.
@@ -296,7 +298,7 @@ def run_real_franka(
         tell("fit", 2, 4)
         variants = _variants(views, pose_views(displacements, indices, seen, seen.start, None), fold)
         tell("fit", 3, 4)
-        few = tuple(_from_few_poses(views, indices, one) for one in range(seed, seed + SUBSETS))
+        few = tuple(_from_few_poses(views, indices, one) for one in range(seed, seed + few_sets))
         tell("fit", 4, 4)
     except CalibrationError as error:
         raise ExperimentError(error.code, str(error), **error.data) from error
@@ -521,7 +523,7 @@ def triangulation_errors(
     folds: tuple[tuple[int, PoseFit], ...], views: PoseViews, fold: IntArray
 ) -> list[Triangulated]:
     """Each set of two or more of the cameras that every fold fitted, the largest set last; corners of held-out poses in
-    which all these cameras saw the tag.
+    which all these cameras saw the tag, weighted by what each is predicted to err.
     """
     if not folds:
         return []
@@ -532,8 +534,10 @@ def triangulation_errors(
     for number, fitted in folds:
         model, to_base = fitted.fit.model, fitted.to_base
         chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
+        deviations = np.sqrt(np.trace(fitted.predict()[1], axis1=-2, axis2=-1) / 2.0)
         for stop in np.flatnonzero((fold == number) & shown[common].all(axis=0)):
-            truth = _euclidean(model.marker_points @ chain.displacement(views.positions[stop]).T @ to_base.T)
+            moved = chain.displacement(views.positions[stop])
+            truth = from_homogeneous(model.marker_points @ moved.T @ to_base.T)
             for subset in subsets:
                 rows = [int(np.flatnonzero(fitted.kept == c)[0]) for c in subset]
                 ideal = np.array(
@@ -542,10 +546,7 @@ def triangulation_errors(
                         for c, row in zip(subset, rows, strict=True)
                     ]
                 )
-                points = triangulate(np.array([model.cameras[row].matrix for row in rows]), ideal)
-                errors[subset].append(np.linalg.norm(_euclidean(points @ to_base.T) - truth, axis=1))
+                matrices = np.array([model.cameras[row].matrix for row in rows])
+                points = triangulate(matrices, ideal, deviations[list(subset), stop])
+                errors[subset].append(np.linalg.norm(from_homogeneous(points @ to_base.T) - truth, axis=1))
     return [Triangulated(s, np.concatenate(found)) for s, found in errors.items() if found]
-
-
-def _euclidean(points: FloatArray) -> FloatArray:
-    return np.asarray(points[:, :3] / points[:, 3:])
