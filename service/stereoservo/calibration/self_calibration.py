@@ -43,7 +43,7 @@ from stereoservo.calibration.joint_errors.variance_components import (
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.known_arm import fit_with_known_arm
+from stereoservo.calibration.known_arm.known_arm_fit import fit_with_known_arm
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     implausible_lens,

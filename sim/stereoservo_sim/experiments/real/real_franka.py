@@ -2,7 +2,7 @@
 alone.
 
 A tag on the hand is found in the images; the product's fit takes the arm's poses as those of a free arm
-(`calibration.free_arm`), and its model predicts poses that it has not seen, with the covariance of what it predicts.
+(`calibration.known_arm`), and its model predicts poses that it has not seen, with the covariance of what it predicts.
 Folds are fixed: pose index modulo FOLDS is held out. The error is the distance of a predicted corner from the measured
 one [px], over *all* held-out corners.
 """
@@ -22,8 +22,8 @@ from scipy.stats import binom
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.free_arm import free_arm, trials_of_poses
-from stereoservo.calibration.known_arm import LEAST_VIEWS, frame_of_known_arm
+from stereoservo.calibration.known_arm.free_arm import free_arm, trials_of_poses
+from stereoservo.calibration.known_arm.known_arm_fit import LEAST_VIEWS, frame_of_known_arm
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import (
