@@ -62,7 +62,7 @@ ROUNDS = 5
 """Times that the errors of the displacements, and with them the lens model, are estimated again."""
 
 
-class _Whitened(NamedTuple):
+class _ErrorsSeen(NamedTuple):
     """A bundle, all its measurements, which of them are ``inliers`` (k,), and the errors of the displacements that
     whiten it, None where there are none to see.
     """
@@ -125,12 +125,10 @@ def _notes(factor: float) -> tuple[str, ...]:
     )
 
 
-def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEstimate]) -> _Whitened:
+def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEstimate]) -> _ErrorsSeen:
     """The metric bundle in the generators' frame. Raises CalibrationError."""
     _check_views(trials)
-    every = replace(
-        measurements(trials, trials.visible, trials.positions), lens_priors=prior_of_lenses(trials, priors)
-    )
+    every = measurements(trials, trials.visible, trials.positions)
     at = readings(trials.positions)
     # No two poses are one place of a gear.
     at = Readings(
@@ -139,12 +137,14 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
     rig = _start(trials, every)
     lenses: LensModel = "none" if options.lens == "auto" else options.lens
     if priors:
+        # Without: known displacements tell lenses from cameras, and no centre has to be assumed.
+        every = replace(every, lens_priors=prior_of_lenses(trials, priors))
         bent, lenses = starting_lenses(trials, options.lens, priors)
         rig = replace(rig, lenses=np.pad(bent, ((0, 0), (0, 7 - bent.shape[1]))))
     try:
         robust = solve(rig, every, "metric", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-6)
         solution, inliers = refine_to_convergence(robust.rig, every, "metric", options, lenses, ROUGHLY)
-        found = _with_errors(_Whitened(solution, every, inliers, None), at, options)
+        found = _with_errors(_ErrorsSeen(solution, every, inliers, None), at, options)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(
             "no_convergence",
@@ -154,7 +154,7 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
     return found if found.components is None else found._replace(solution=_with_errors_stated(found, at))
 
 
-def _with_errors_stated(found: _Whitened, at: Readings) -> Solution:
+def _with_errors_stated(found: _ErrorsSeen, at: Readings) -> Solution:
     """The solution with the covariance that its parameters have where the displacements have the errors that are
     stated: larger than the estimated ones by what few displacements leave open of them.
     """
@@ -166,7 +166,7 @@ def _with_errors_stated(found: _Whitened, at: Readings) -> Solution:
     return replace(solution, stated_factor=factor) if isinstance(factor, StopFactor) else solution
 
 
-def _with_errors(found: _Whitened, at: Readings, options: FitOptions) -> _Whitened:
+def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _ErrorsSeen:
     """The bundle whitened by the errors of the displacements that it shows, with the lenses that it then asks for,
     until both stay the same.
     """
@@ -191,7 +191,7 @@ def _with_errors(found: _Whitened, at: Readings, options: FitOptions) -> _Whiten
         elif components is None or (before is not None and components.like(before)):
             break
     solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, solution.lenses)
-    return _Whitened(solution, every, inliers, components)
+    return _ErrorsSeen(solution, every, inliers, components)
 
 
 def in_first_camera(solution: Solution) -> Solution:

@@ -523,7 +523,7 @@ def triangulation_errors(
     folds: tuple[tuple[int, PoseFit], ...], views: PoseViews, fold: IntArray
 ) -> list[Triangulated]:
     """Each set of two or more of the cameras that every fold fitted, the largest set last; corners of held-out poses in
-    which all these cameras saw the tag, weighted by what each is predicted to err.
+    which all these cameras saw the tag.
     """
     if not folds:
         return []
@@ -534,7 +534,6 @@ def triangulation_errors(
     for number, fitted in folds:
         model, to_base = fitted.fit.model, fitted.to_base
         chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
-        deviations = np.sqrt(np.trace(fitted.predict()[1], axis1=-2, axis2=-1) / 2.0)
         for stop in np.flatnonzero((fold == number) & shown[common].all(axis=0)):
             moved = chain.displacement(views.positions[stop])
             truth = from_homogeneous(model.marker_points @ moved.T @ to_base.T)
@@ -547,6 +546,6 @@ def triangulation_errors(
                     ]
                 )
                 matrices = np.array([model.cameras[row].matrix for row in rows])
-                points = triangulate(matrices, ideal, deviations[list(subset), stop])
+                points = triangulate(matrices, ideal)
                 errors[subset].append(np.linalg.norm(from_homogeneous(points @ to_base.T) - truth, axis=1))
     return [Triangulated(s, np.concatenate(found)) for s, found in errors.items() if found]
