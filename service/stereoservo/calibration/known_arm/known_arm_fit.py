@@ -256,9 +256,8 @@ def _check_views(trials: TrialData) -> None:
             views=stops.tolist(),
             minimum=LEAST_VIEWS,
         )
-    unseen = [
-        i for i, seen in zip(trials.marker_ids, trials.visible.any(axis=(0, 1)), strict=True) if not seen
-    ]
+    shown = np.atleast_1d(trials.visible.any(axis=(0, 1)))
+    unseen = [i for i, seen in zip(trials.marker_ids, shown, strict=True) if not seen]
     if unseen:
         raise CalibrationError("too_few_markers", f"markers {unseen} are seen by no camera", markers=unseen)
 

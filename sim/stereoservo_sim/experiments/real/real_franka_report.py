@@ -135,17 +135,14 @@ def _uncertainty(held: HeldOut) -> dict[str, Any]:
 
 def _few_poses(result: RealFrankaResult) -> dict[str, Any]:
     """How training sets of few poses predict the rest."""
-    rows = [
-        {"seed": one.seed, "poses": list(one.poses), "refused": one.refused}
-        if one.held_out is None
-        else {
-            "seed": one.seed,
-            "poses": list(one.poses),
-            **_figures(one.held_out, result),
-            **_uncertainty(one.held_out),
-        }
-        for one in result.few
-    ]
+    rows: list[dict[str, Any]] = []
+    for one in result.few:
+        rows.append({"seed": one.seed, "poses": list(one.poses)})
+        if one.held_out is None:
+            rows[-1]["refused"] = one.refused
+            continue
+        rows[-1].update(_figures(one.held_out, result), **_uncertainty(one.held_out))
+        del rows[-1]["not_predicted"]  # the poses learnt from are among them
     told = [one for one in rows if "corners" in one]
     return {
         "poses": FEW_POSES,
