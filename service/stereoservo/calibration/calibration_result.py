@@ -25,6 +25,8 @@ from stereoservo.calibration.bundle_statistics import (
 from stereoservo.calibration.joint_errors.variance_components import VarianceComponents, readings
 from stereoservo.calibration.lens_significance import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
+from stereoservo.calibration.shutter_offset import with_shutter_offsets
+from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics
@@ -285,6 +287,14 @@ def _camera_report(
         terms,
         terms_std,
     )
+
+
+def completed(result: CalibrationFit, trials: TrialData) -> CalibrationFit:
+    """The fit with static points, loads and shutter offsets of the trials."""
+    model, of_scene = with_static_points(result.model, trials.static)
+    report = msgspec.structs.replace(result.report, notes=(*result.report.notes, *of_scene))
+    model = msgspec.structs.replace(model, loads=trials.loads)
+    return CalibrationFit(with_shutter_offsets(model, trials.way), report)
 
 
 def build_model(

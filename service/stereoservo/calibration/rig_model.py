@@ -42,6 +42,8 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 class RigModel:
     """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4) to ideal pixels, ``points`` (m, 4)
     at joint offset 0, ``lenses`` (c, 7) from ideal to raw pixels; given as (c, 4) without terms, empty for pinholes.
+
+    ``known``: whether the generators are known twists, in the frame that they fix; else the first camera fixes it.
     """
 
     kinds: tuple[Kind, ...]
@@ -49,6 +51,7 @@ class RigModel:
     cameras: FloatArray
     points: FloatArray
     lenses: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    known: bool = False
 
     def __post_init__(self) -> None:
         if not len(self.lenses):
@@ -223,11 +226,13 @@ def full_charts(
     """Minimal charts around ``rig``; cameras or points may be kept fixed, ``lenses`` selects their free parameters.
 
     With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
-    loses the remaining gauge, further ones are free.
+    loses the remaining gauge, further ones are free. Known generators are kept fixed, and leave no gauge.
     """
     none = np.zeros((0, 3, 4))
     matrices: tuple[FloatArray, ...] = tuple(none for _ in rig.cameras)
-    if cameras:
+    if cameras and rig.known:
+        matrices = tuple(camera_basis(matrix, "other", stratum) for matrix in rig.cameras)
+    elif cameras:
         left = camera_basis(rig.cameras[0], "left_metric", stratum) if stratum == "metric" else none
         matrices = (
             left,
@@ -237,7 +242,10 @@ def full_charts(
             ),
         )
     return Charts(
-        tuple(generator_basis(h, kind, stratum) for h, kind in zip(rig.generators, rig.kinds, strict=True)),
+        tuple(
+            np.zeros((0, 4, 4)) if rig.known else generator_basis(h, kind, stratum)
+            for h, kind in zip(rig.generators, rig.kinds, strict=True)
+        ),
         matrices,
         tuple(lens_basis(lenses) for _ in rig.lenses),
         tuple(point_bases(rig.points, stratum) if points else np.zeros((len(rig.points), 0, 4))),
@@ -265,7 +273,7 @@ def rig_at(rig: RigModel, charts: Charts, x: FloatArray) -> RigModel:
                 at += len(basis)
         linear.append(values)
     cameras, lenses, points = linear
-    return RigModel(rig.kinds, np.array(generators), cameras, points, lenses)
+    return RigModel(rig.kinds, np.array(generators), cameras, points, lenses, rig.known)
 
 
 def partial_products(rig: RigModel, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:

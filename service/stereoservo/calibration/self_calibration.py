@@ -20,7 +20,7 @@ from stereoservo.calibration.bundle_inliers import (
     with_whole_stops,
 )
 from stereoservo.calibration.bundle_statistics import chi2_within, degrees_of_freedom
-from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
+from stereoservo.calibration.calibration_result import CalibrationFit, build_fit, completed
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
 from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
 from stereoservo.calibration.diagnosis.input_corrections import Refit
@@ -43,6 +43,7 @@ from stereoservo.calibration.joint_errors.variance_components import (
     readings,
     reduced_rows,
 )
+from stereoservo.calibration.known_arm.known_arm_fit import fit_with_known_arm
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     implausible_lens,
@@ -59,14 +60,12 @@ from stereoservo.calibration.rig_model import (
     reversed_trials,
     with_joints_reversed,
 )
-from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.single_joint_fit import (
     fit_single_joint,
     link_joints,
     measurements,
     without_rare_markers,
 )
-from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
 from stereoservo.geometry.cameras import pixel_normaliser
@@ -100,8 +99,9 @@ def fit_model(
     """Model of a cell fitted to its trial motions, with a report of the fit.
 
     Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
-    joints from the base in both cases. Static markers become the model's static points. ``lens_priors``: by
-    camera name, an estimate of its lens from straight lines (`geometry.distortion.lens_from_lines`).
+    joints from the base in both cases. Static markers become the model's static points. Trials whose generators are
+    known (`trials_of_poses`: poses in place of joints) may be of any motion. ``lens_priors``: by camera name, an
+    estimate of its lens from straight lines (`geometry.distortion.lens_from_lines`).
 
     ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
     the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
@@ -109,8 +109,11 @@ def fit_model(
     """
     check_trials(trials)
     mount = common_mount(trials)
-    chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
     priors = lens_priors or {}
+    if trials.generators is not None:
+        known = fit_with_known_arm(trials, options, priors, epoch=epoch, created=created)
+        return completed(known, trials)
+    chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
 
     def fit(data: TrialData, chosen: FitOptions, joint_errors: JointErrorsTaken = "none") -> _Fitted:
         return _fit(data, epoch, created, progress or _silent, chosen, priors, None, joint_errors)
@@ -132,14 +135,10 @@ def fit_model(
             raise
         result, notes = absorbed, (note, *review_notes(chain, absorbed, refit, options))
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
-    model, of_scene = with_static_points(model, trials.static)
     report = msgspec.structs.replace(
-        result.report,
-        notes=(*result.report.notes, *notes, *of_scene),
-        untested=untested(chain),
+        result.report, notes=(*result.report.notes, *notes), untested=untested(chain)
     )
-    model = msgspec.structs.replace(model, loads=trials.loads)
-    return CalibrationFit(with_shutter_offsets(model, trials.way), report)
+    return completed(CalibrationFit(model, report), trials)
 
 
 def _chosen_fit(

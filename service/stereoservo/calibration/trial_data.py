@@ -25,6 +25,7 @@ MAX_TRIALS_BYTES = 1 << 30
 LOADS = "loads_"
 STATIC = "static_"
 WAY = "way_"
+GENERATORS = "generators"
 MAX_POSITION = 1e6
 """Largest joint position [rad or m] that is taken for one."""
 MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
@@ -108,7 +109,8 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
     one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: the loads
     that the drives reported meanwhile, if any; copied into the model. ``static``: markers that do not move. ``way``:
-    what was seen between the stops.
+    what was seen between the stops. ``generators`` (n, 4, 4): Euclidean twists of the joints at positions 0, in a frame
+    that stands [m], where they are known (`free_arm`); then any motion will do.
     """
 
     joint_names: tuple[str, ...]
@@ -123,6 +125,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     loads: JointLoads | None = None
     static: StaticObservations | None = None
     way: WayObservations | None = None
+    generators: FloatArray | None = None
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
@@ -184,6 +187,8 @@ def check_trials(trials: TrialData) -> None:
     for key, array, shape in expected:
         if array.shape != shape:
             raise CalibrationError("bad_data", f"{key} has shape {array.shape}; {shape} is needed", key=key)
+    if trials.generators is not None:
+        _check_generators(trials.generators, n)
     if trials.static is not None:
         _check_static(trials, trials.static)
     if trials.way is not None:
@@ -232,6 +237,15 @@ def _check_counts(trials: TrialData) -> None:
                 key=f"{what}s",
                 maximum=most,
             )
+
+
+def _check_generators(generators: FloatArray, n: int) -> None:
+    if generators.shape != (n, 4, 4) or not np.isfinite(generators).all():
+        raise CalibrationError(
+            "bad_data",
+            f"generators of shape {generators.shape}; finite ones of shape {(n, 4, 4)} are needed",
+            key="generators",
+        )
 
 
 def _check_static(trials: TrialData, static: StaticObservations) -> None:
@@ -356,6 +370,7 @@ def encode_trials(trials: TrialData) -> bytes:
         trials=np.asarray(trials.trials, dtype=np.int64),
         pixels=np.asarray(trials.pixels, dtype=np.float64),
         sigmas=np.asarray(trials.sigmas, dtype=np.float64),
+        **({} if trials.generators is None else {GENERATORS: trials.generators}),  # type: ignore[arg-type]
         **_load_arrays(trials.loads),  # type: ignore[arg-type]
         **_static_arrays(trials.static),  # type: ignore[arg-type]
         **_way_arrays(trials.way),  # type: ignore[arg-type]
@@ -444,6 +459,9 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             loads=_loads(arrays),
             static=_static(arrays),
             way=_way(arrays),
+            generators=arrays[GENERATORS].astype(np.float64, casting="same_kind")
+            if GENERATORS in arrays
+            else None,
         )
         try:
             check_trials(trials)

@@ -22,6 +22,7 @@ REAL_FRANKA_OPTIONS = (
     ),
     Option("hand_tag", int, "id of the tag on the hand [default: 9]"),
     Option("table_tags", str, "ids of tags lying on the table, by commas [default: 0,2,3]", parse=parse_tags),
+    Option("few_sets", int, "how many training sets of 12 poses predict the rest [default: 10]"),
 )  # fmt: skip
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -449,8 +449,13 @@ def estimate_components(
     if near is not None:
         first = np.concatenate([[near.pixels], near.random, near.repeatable, near.posture])
     best, information = _maximised(reduced, X, first)
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-8) / np.outer(size, size)
+    # Of a component that no stop shows nothing is known, and none is seen.
+    shown = np.flatnonzero(np.diag(information) > 0.0)
+    size = np.sqrt(np.diag(information)[shown])
+    covariance = np.zeros_like(information)
+    covariance[np.ix_(shown, shown)] = np.linalg.pinv(
+        information[np.ix_(shown, shown)] / np.outer(size, size), rcond=1e-8
+    ) / np.outer(size, size)
     logs, deviations = _scale_estimates(best, reduced) if scales else (np.zeros(0), np.zeros(0))
     return VarianceComponents(
         float(best.variances[0]),

@@ -11,8 +11,15 @@ from rich.table import Table
 
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.geometry.homogeneous import from_homogeneous
-from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.experiments.real.real_franka import FOLDS, HeldOut, RealFrankaResult
+from stereoservo_sim.experiments.real.real_franka import (
+    FAR,
+    FEW_POSES,
+    FOLDS,
+    INSIDE,
+    HeldOut,
+    RealFrankaResult,
+    coverage,
+)
 from stereoservo_sim.experiments.real.tags import DICTIONARY_NAME
 
 REFERENCE = {
@@ -38,15 +45,15 @@ STATE = "distance of a predicted tag corner from the measured one [px], over all
 
 def report_real_franka(result: RealFrankaResult) -> dict[str, Any]:
     """JSON object of ``reproduce real-franka``."""
-    seen, model = result.observations, result.fits.better
-    sides = 1e3 * np.linalg.norm(model.corners - np.roll(model.corners, -1, axis=0), axis=1)
-    fit = result.fits.errors(model, result.displacements, result.views)
-    held = result.held_out
-    kept = result.fits.kept.tolist()
-    table = result.table
+    seen, whole, table = result.observations, result.whole, result.table
+    corners, report = whole.corners, whole.fit.report
+    sides = 1e3 * np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+    kept = whole.kept.tolist()
     return {
         "experiment": "real-franka",
-        **_figures(held.chosen),
+        **_figures(result.held_out, result),
+        "uncertainty": _uncertainty(result.held_out),
+        "few_poses": _few_poses(result),
         "tag_side_mm": float(sides.mean()),
         "tag_sides_mm": sides.tolist(),
         "table_flatness_mm": table.rms_mm,
@@ -59,22 +66,26 @@ def report_real_franka(result: RealFrankaResult) -> dict[str, Any]:
         "folds": f"pose index modulo {FOLDS}",
         "rows": _rows(result),
         "variants": {
-            "radial chosen on training poses": {
-                **_figures(held.chosen),
-                "radial_folds": list(held.radial_folds),
+            "lens chosen on training poses": {
+                **_figures(result.held_out, result),
+                "lenses": {str(fold): fitted.fit.report.lens.model for fold, fitted in result.held_out.fits},
             },
-            "no radial term": _figures(held.pinhole),
-            "one radial term a camera": _figures(held.radial),
-            "cv2 subpixel corners": _figures(result.held_out_opencv.chosen),
-            "cv2 subpixel corners, no radial term": _figures(result.held_out_opencv.pinhole),
+            **{name: _figures(held, result) for name, held in result.variants.items()},
         },
         "fit": {
-            **_figures(fit),
-            "radial": result.fits.radial_better,
-            "radial_terms": dict(zip(_names(result, kept), model.radial.tolist(), strict=True)),
-            "views_left_out": int((~model.inliers).sum()),
-            "tag_offset_m": model.corners.mean(axis=0).tolist(),
-            "robust_costs_of_starts": list(model.costs),
+            "rms_px": report.rms_px,
+            "lens": report.lens.model,
+            "sigma_factor": report.sigma_factor,
+            "chi2": report.chi2,
+            "degrees_of_freedom": report.degrees_of_freedom,
+            "outliers": len(report.outliers),
+            "tag_offset_m": corners.mean(axis=0).tolist(),
+            "cameras": {one.name: one.intrinsics for one in report.cameras},
+            "pose_errors": [
+                {"axis": one.name, "random": one.random, "by_posture": one.posture, "rms_px": one.pixels}
+                for one in report.joints
+            ],
+            "notes": list(report.notes),
         },
         "triangulation": [
             {
@@ -107,48 +118,91 @@ def report_real_franka(result: RealFrankaResult) -> dict[str, Any]:
     }
 
 
+def _uncertainty(held: HeldOut) -> dict[str, Any]:
+    """The predicted deviations of held-out corners, and how they hold."""
+    found = coverage(held)
+    return {
+        "median_px": float(np.nanmedian(held.deviations)),
+        "inside": found.inside,
+        "inside_is": f"share of {found.corners} corners in their {INSIDE:.0%} ellipses",
+        "interval": list(found.interval),
+        "interval_is": f"99 % of the share in {found.views} views, whose corners err together",
+        "holds": found.interval[0] <= found.inside <= found.interval[1],
+        "largest_sigmas": found.largest,
+        f"beyond_{FAR:.0f}_sigmas": found.beyond,
+    }
+
+
+def _few_poses(result: RealFrankaResult) -> dict[str, Any]:
+    """How training sets of few poses predict the rest."""
+    rows: list[dict[str, Any]] = []
+    for one in result.few:
+        rows.append({"seed": one.seed, "poses": list(one.poses)})
+        if one.held_out is None:
+            rows[-1]["refused"] = one.refused
+            continue
+        rows[-1].update(_figures(one.held_out, result), **_uncertainty(one.held_out))
+        del rows[-1]["not_predicted"]  # the poses learnt from are among them
+    told = [one for one in rows if "corners" in one]
+    return {
+        "poses": FEW_POSES,
+        "sets": len(rows),
+        "refused": len(rows) - len(told),
+        "corners": sum(one["corners"] for one in told),
+        "max_px": max((one["max_px"] for one in told), default=None),
+        "largest_sigmas": max((one["largest_sigmas"] for one in told), default=None),
+        f"beyond_{FAR:.0f}_sigmas": sum(one[f"beyond_{FAR:.0f}_sigmas"] for one in told),
+        "rows": rows,
+    }
+
+
 def _names(result: RealFrankaResult, cameras: list[int]) -> list[str]:
     return [f"cam{result.observations.cameras[i]}" for i in cameras]
 
 
-def _figures(errors: FloatArray) -> dict[str, Any]:
-    """Median, rms and largest distance [px], and per axis, of errors ``(v, k, 2)``; NaN rows are not
-    predicted."""
-    known = errors[np.isfinite(errors).all(axis=(1, 2))]
-    distance = np.linalg.norm(known, axis=2)
+def _figures(held: HeldOut, result: RealFrankaResult) -> dict[str, Any]:
+    """Median, rms and largest distance [px], and per axis, of the corners that were predicted."""
+    known = held.errors[np.isfinite(held.squares)]
+    distance = np.linalg.norm(known, axis=1)
+    measured = int(np.isfinite(result.views.pixels).all(axis=3).sum())
     return {
         "median_px": float(np.median(distance)),
         "rms_px": float(np.sqrt((distance**2).mean())),
         "max_px": float(distance.max()),
         "per_axis": {
-            "median_abs_px": np.median(np.abs(known), axis=(0, 1)).tolist(),
-            "rms_px": np.sqrt((known**2).mean(axis=(0, 1))).tolist(),
+            "median_abs_px": np.median(np.abs(known), axis=0).tolist(),
+            "rms_px": np.sqrt((known**2).mean(axis=0)).tolist(),
         },
-        "corners": int(distance.size),
-        "not_predicted": 4 * (len(errors) - len(known)),
+        "corners": len(known),
+        "not_predicted": measured - len(known),
     }
 
 
 def _rows(result: RealFrankaResult) -> list[dict[str, Any]]:
-    seen, errors = result.observations, result.held_out.chosen
+    seen, held = result.observations, result.held_out
+    indices = np.unique(seen.pose)
+    stops = {int(pose): stop for stop, pose in enumerate(result.indices)}
+    lenses = {fold: fitted.fit.report.lens.model for fold, fitted in held.fits}
     rows = []
     for fold in range(FOLDS):
-        for index, name in enumerate(_names(result, list(range(len(seen.cameras))))):
-            inside = (seen.pose % FOLDS == fold) & (seen.camera == index)
-            if not inside.any():
+        for c, name in enumerate(_names(result, list(range(len(seen.cameras))))):
+            poses = [int(i) for i in indices if i % FOLDS == fold and i in seen.pose[seen.camera == c]]
+            if not poses:
                 continue
-            distance = np.linalg.norm(errors[inside], axis=2)
-            predicted = np.isfinite(distance).all(axis=1)
+            squares = held.squares[c, [stops[pose] for pose in poses]]
+            distance = np.linalg.norm(held.errors[c, [stops[pose] for pose in poses]], axis=2)
+            predicted = np.isfinite(squares).all(axis=1)
             known = distance[predicted]
             rows.append(
                 {
                     "fold": fold,
                     "camera": name,
-                    "poses": seen.pose[inside].tolist(),
+                    "poses": poses,
                     "predicted": int(predicted.sum()),
                     "median_px": float(np.median(known)) if known.size else None,
                     "rms_px": float(np.sqrt((known**2).mean())) if known.size else None,
-                    "radial": fold in result.held_out.radial_folds,
+                    "largest_sigmas": float(np.sqrt(squares[predicted].max())) if known.size else None,
+                    "lens": lenses.get(fold),
                 }
             )
     return rows
@@ -180,15 +234,18 @@ def _draw_residuals(result: RealFrankaResult, figure: Any) -> None:
     figure.set_size_inches(10, 4.5)
     cloud, bars = figure.subplots(1, 2)
     for index, name in enumerate(_names(result, list(range(len(seen.cameras))))):
-        errors = result.held_out.chosen[seen.camera == index].reshape(-1, 2)
+        errors = result.held_out.errors[index].reshape(-1, 2)
         cloud.plot(errors[:, 0], errors[:, 1], ".", markersize=4, label=name)
     cloud.set(
         xlabel="u, predicted − measured [px]", ylabel="v [px]", title="held-out corners", aspect="equal"
     )
     cloud.grid(alpha=0.3)
     cloud.legend()
-    both = {"registered corners": result.held_out, "cv2 subpixel corners": result.held_out_opencv}
-    finite = {label: _finite_distances(held) for label, held in both.items()}
+    both = {
+        "registered corners": result.held_out,
+        "cv2 subpixel corners": result.variants["cv2 subpixel corners"],
+    }
+    finite = {label: held.distances for label, held in both.items()}
     edges = np.linspace(0, max(float(np.percentile(d, 99.5)) for d in finite.values()), 40)
     for label, distance in finite.items():
         bars.hist(
@@ -196,12 +253,6 @@ def _draw_residuals(result: RealFrankaResult, figure: Any) -> None:
         )
     bars.set(xlabel="distance [px]", ylabel="corners", title="held-out distance")
     bars.legend()
-
-
-def _finite_distances(held: HeldOut) -> FloatArray:
-    distance = np.linalg.norm(held.chosen, axis=2).ravel()
-    finite: FloatArray = distance[np.isfinite(distance)]
-    return finite
 
 
 def _draw_overlay(result: RealFrankaResult, figure: Any) -> None:
@@ -212,20 +263,17 @@ def _draw_overlay(result: RealFrankaResult, figure: Any) -> None:
     closed = [0, 1, 2, 3, 0]
     for index, (axis, name) in enumerate(zip(axes, _names(result, list(range(count))), strict=True)):
         axis.imshow(seen.backgrounds[index], cmap="gray", alpha=0.6)
-        inside = seen.camera == index
-        for i, (measured, error) in enumerate(
-            zip(seen.pixels[inside], result.held_out.chosen[inside], strict=True)
-        ):
+        inside = np.isfinite(result.held_out.squares[index]).all(axis=1)
+        pixels, errors = result.views.pixels[index, inside], result.held_out.errors[index, inside]
+        for i, (measured, error) in enumerate(zip(pixels, errors, strict=True)):
             predicted = measured + error
             labels = ("measured", "predicted, held out") if i == 0 else (None, None)
             axis.plot(*measured[closed].T, "-", color="tab:green", linewidth=1.6, label=labels[0])
             axis.plot(*predicted[closed].T, "--", color="tab:red", linewidth=0.8, label=labels[1])
-            axis.annotate(str(seen.pose[inside][i]), measured.max(axis=0), fontsize=6, color="tab:blue")
-        corners, errors = (
-            a[inside].reshape(-1, 2) for a in (seen.pixels, MAGNIFIED * result.held_out.chosen)
-        )
+            axis.annotate(str(result.indices[inside][i]), measured.max(axis=0), fontsize=6, color="tab:blue")
+        corners, arrows = pixels.reshape(-1, 2), MAGNIFIED * errors.reshape(-1, 2)
         axis.quiver(
-            *corners.T, *errors.T, angles="xy", scale_units="xy", scale=1, width=0.002, color="tab:purple"
+            *corners.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.002, color="tab:purple"
         )
         axis.set(title=f"{name}, errors x{MAGNIFIED}", xticks=[], yticks=[])
         if inside.any():
@@ -235,17 +283,19 @@ def _draw_overlay(result: RealFrankaResult, figure: Any) -> None:
 def _draw_cameras(result: RealFrankaResult, figure: Any) -> None:
     figure.set_size_inches(8, 7)
     axis = figure.add_subplot(projection="3d")
-    model, views = result.fits.better, result.views
-    hand = result.displacements[np.unique(views.pose)] @ np.append(model.corners.mean(axis=0), 1.0)
+    whole = result.whole
+    hand = result.views.displacements @ np.append(whole.corners.mean(axis=0), 1.0)
     axis.scatter(*hand[:, :3].T, color="0.4", s=12, label="tag on the hand")
     if len(result.table.points):
-        axis.scatter(*result.table.points.T, color="0.7", marker="s", s=12, label="table tags")
-    for P, name in zip(model.Ps, _names(result, result.fits.kept.tolist()), strict=True):
+        base = result.table.points @ whole.camera_to_base[:3, :3].T + whole.camera_to_base[:3, 3]
+        axis.scatter(*base.T, color="0.7", marker="s", s=12, label="table tags")
+    for P, name in zip(whole.matrices, _names(result, whole.kept.tolist()), strict=True):
         centre = from_homogeneous(camera_centre(P)[None])[0]
         seen = hand[:, :3].mean(axis=0)
         depth = float(np.linalg.norm(seen - centre))
         axis.scatter(*centre, s=40, label=name)
-        axis.plot(*np.stack([centre, centre + 0.4 * depth * P[2, :3]]).T, color="black", linewidth=0.8)
+        ahead = P[2, :3] / np.linalg.norm(P[2, :3])
+        axis.plot(*np.stack([centre, centre + 0.4 * depth * ahead]).T, color="black", linewidth=0.8)
     axis.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="recovered cameras, in the arm's base")
     axis.set_aspect("equal")
     axis.legend()
@@ -267,7 +317,17 @@ def show_real_franka(answer: dict[str, Any], console: Console) -> None:
         answer["table_flatness_reason"] if flat is None else f"{flat:.3f}",
         f"{reference['table_flatness_mm']}",
     )
+    told, few = answer["uncertainty"], answer["few_poses"]
+    low, high = told["interval"]
+    table.add_row("predicted deviation, median [px]", f"{told['median_px']:.3f}", "")
+    table.add_row("inside 95 % ellipses", f"{told['inside']:.1%}", f"{low:.1%} to {high:.1%}")
+    table.add_row("largest error [predicted deviations]", f"{told['largest_sigmas']:.2f}", "")
     console.print(table)
+    console.print(
+        f"trained on {few['poses']} poses, {few['sets']} times ({few['refused']} refused): largest error "
+        f"{few['max_px'] or 0.0:.2f} px, {few['largest_sigmas'] or 0.0:.2f} predicted deviations; "
+        f"{few['beyond_4_sigmas']} of {few['corners']} corners beyond 4"
+    )
     variants = Table(title="variants", title_justify="left")
     for column in ("", "median [px]", "rms [px]", "largest [px]"):
         variants.add_column(column, justify="left" if not column else "right")

@@ -14,18 +14,21 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.geometry.cameras import triangulate
 from stereoservo.geometry.homogeneous import from_homogeneous
+from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.detectors import tag_registration
 from stereoservo_drivers.detectors.tag_registration import compile_kernels
-from stereoservo_sim.experiments.real.driven_cameras import DrivenCameras, undistort
 
 GreyImage = npt.NDArray[np.uint8]
 
 DICTIONARY = cv2.aruco.DICT_4X4_50
 DICTIONARY_NAME = "DICT_4X4_50"
 TAG_IDS = 50
+STANDING = 100
+"""Marker id from which corners of standing tags count, four a tag."""
+UNREGISTERED_SIGMA = 0.5
+"""Deviation [px] that is stated for corners that were not registered."""
 CELLS = 6
 """Cells along a side: four of data and the black border on both ends."""
 
@@ -35,11 +38,13 @@ class TagView:
     """One tag in one image: ``corners`` (4, 2) [px] in the dictionary's order, clockwise from the printed top
     left.
 
-    ``start``: the corners of cv2's subpixel refinement. ``registered``: whether the pattern fit was taken.
+    ``sigmas`` (4,) [px]: of the corners, an axis, from the noise of the image. ``start``: the corners of cv2's subpixel
+    refinement. ``registered``: whether the pattern fit was taken.
     ``blur`` [px] and ``correlation`` of pattern and image are NaN where it was not.
     """
 
     corners: FloatArray
+    sigmas: FloatArray
     start: FloatArray
     registered: bool
     blur: float
@@ -77,8 +82,9 @@ def register_tag(image: GreyImage, start: FloatArray, cells: FloatArray) -> TagV
     compile_kernels()
     fit = tag_registration.register_tag(image, start, cells)
     if fit is None:
-        return TagView(start, start, False, float("nan"), float("nan"))
-    return TagView(fit.corners, start, True, fit.blur, fit.correlation)
+        return TagView(start, np.full(4, UNREGISTERED_SIGMA), start, False, float("nan"), float("nan"))
+    sigmas = np.sqrt(np.trace(fit.covariances, axis1=1, axis2=2) / 2.0)
+    return TagView(fit.corners, sigmas, start, True, fit.blur, fit.correlation)
 
 
 def _area(quad: FloatArray) -> float:
@@ -114,21 +120,17 @@ def find_standing_tags(image: GreyImage, tags: tuple[int, ...]) -> dict[int, Flo
     return {tag: register_tag(image, found[tag], tag_cells(tag)).corners for tag in tags if tag in found}
 
 
-def flatness(model: DrivenCameras, seen: list[dict[int, FloatArray]], tags: tuple[int, ...]) -> Flatness:
-    """Triangulate the corners of ``tags`` from ``seen`` (one dict a camera of ``model``) and fit a plane."""
+def flatness(model: CellModel, tags: tuple[int, ...]) -> Flatness:
+    """Plane fitted to the model's static points that are corners of ``tags``."""
     nothing = np.zeros((0, 3))
     if not tags:
         return Flatness(None, "no table tags were asked for", (), nothing)
-    if not any(seen):
-        return Flatness(None, f"none of the table tags {list(tags)} is seen standing still", (), nothing)
-    shared = tuple(tag for tag in tags if sum(tag in camera for camera in seen) >= 2)
-    if not shared:
-        return Flatness(None, f"no table tag of {list(tags)} is seen by two cameras or more", (), nothing)
-    missing = np.full((4, 2), np.nan)
-    pixels = np.stack([np.concatenate([camera.get(tag, missing) for tag in shared]) for camera in seen])
-    straight = undistort(pixels, model.radial[:, None], model.sizes[:, None])
-    points = from_homogeneous(triangulate(model.Ps, straight, iterations=20))
-    points = points[np.isfinite(points).all(axis=1)]
+    shared = tuple(tag for tag in tags if any((i - STANDING) // 4 == tag for i in model.scene_ids))
+    if not shared or model.projective_to_euclidean is None:
+        return Flatness(
+            None, f"no table tag of {list(tags)} is seen standing still by two cameras or more", (), nothing
+        )
+    points = from_homogeneous(model.scene_points @ model.projective_to_euclidean.T)
     if len(points) < 4:
         return Flatness(
             None, f"only {len(points)} corners of table tags could be triangulated", shared, points
