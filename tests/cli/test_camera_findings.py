@@ -90,6 +90,15 @@ def test_rate_is_that_of_the_source_where_the_driver_counts() -> None:
     assert "rate_hz = 10" in found.remedy
 
 
+def test_frames_that_this_computer_left_out_are_no_fault_of_the_camera() -> None:
+    left = record("left", project_many(LEFT[None], points())[0])
+    left.seen[:] = left.seen[::3]  # every third was looked at: the numbers of the others are missing
+    found = named(list(examine_record(left, 7)), "left rate")
+    assert found.ok is None
+    assert "10.0 Hz of 30" in found.message
+    assert found.remedy.startswith("the camera delivers 30 Hz, this computer keeps up with 10.0")
+
+
 def test_no_frame_an_error_no_marker_and_a_mirrored_plate_are_told_apart() -> None:
     silent = CameraRecord(description("left"))
     (finding,) = examine_record(silent, 7)

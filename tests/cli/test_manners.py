@@ -90,12 +90,14 @@ def test_colour_is_for_terminals(monkeypatch):
 
 
 def test_calibration_tells_its_progress_in_lines_without_a_terminal(capsys):
-    progress = _telling(_lines("calibrating"))
+    progress = _telling("mycell", _lines("calibrating"))
     for share in (0.0, 0.01, 0.5, 0.51, 1.0):
         progress(EventMessage(1, "boot", 0, 0.0, "calibration", message="joint j1", progress=share))
     lines = capsys.readouterr().err.splitlines()
     assert 2 < len(lines) < 5
     assert lines[0] == "calibrating: 0 %: joint j1"
+    progress(EventMessage(2, "boot", 0, 0.0, "held", message="held by ann"))
+    assert capsys.readouterr().err == "held by ann: nothing moves until `stereoservo resume mycell`\n"
 
 
 def test_experiments_tell_their_progress_in_lines_without_a_terminal():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -34,6 +35,9 @@ class StubWatch:
     def poll(self) -> list[EventMessage]:
         found, self.events = self.events, []
         return found
+
+    def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:
+        return next(event for event in self.poll() if wanted(event))
 
     def close(self) -> None:
         self.closed = True
@@ -99,6 +103,15 @@ def test_a_goal_that_a_fault_ended_tells_the_fault(parts: tuple[GoalHandle, Any,
     handle.stream([(None, TARGET)])
     with pytest.raises(ClientError, match="was aborted: the cell became fault: no TPDO1 of node 4"):
         handle.reached()
+
+
+def test_whoever_waits_hears_the_events_of_that_goal_alone(parts: tuple[GoalHandle, Any, Any]) -> None:
+    handle, _, watch = parts
+    kinds = (("held", ID), ("held", "another"), ("resumed", ID), ("goal_reached", ID), ("held", ID))
+    watch.events = [EventMessage(k, "b", 0, 0.0, kind, id=goal) for k, (kind, goal) in enumerate(kinds)]
+    heard: list[str] = []
+    assert handle.wait(progress=lambda event: heard.append(event.kind)).outcome == "reached"
+    assert heard == ["held", "resumed", "goal_reached"]
 
 
 def test_a_handle_acknowledges_its_goal(parts: tuple[GoalHandle, Any, Any]) -> None:

@@ -239,6 +239,21 @@ def test_nobody_at_the_endpoint_is_an_error_that_names_it(tmp_path: Path) -> Non
         open_session(client_config(f"unixsock-stream/{tmp_path}/none.sock"))
 
 
+@pytest.mark.process
+def test_a_tls_connection_that_fails_names_what_certificates_must_be(tmp_path: Path) -> None:
+    endpoint = "tls/127.0.0.1:1"  # nobody: a certificate that is refused looks the same
+    with pytest.raises(SessionError, match=r"has no certificate: STEREOSERVO_TLS_DIR") as none:
+        open_session(client_config(endpoint))
+    assert ".rs:" not in str(none.value)
+    for command in (
+        "openssl req -x509 -newkey rsa:2048 -nodes -subj /CN=cells -keyout ca.key -out ca.pem",
+        "openssl req -x509 -newkey rsa:2048 -nodes -subj /CN=me -keyout key.pem -out cert.pem",
+    ):
+        subprocess.run(command.split(), cwd=tmp_path, check=True, capture_output=True)
+    with pytest.raises(SessionError, match=r"cert\.pem must be in date, X\.509 version 3"):
+        open_session(client_config(endpoint, tmp_path))
+
+
 def test_a_clients_tls_files_are_looked_for_before_it_connects(tmp_path: Path) -> None:
     with pytest.raises(SessionError, match=r"ca\.pem: no such file; a TLS directory holds"):
         client_config("tls/10.0.0.1:7447", tmp_path)

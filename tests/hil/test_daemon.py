@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereoservo.cli import main as cli
 from stereoservo.client import Client, ClientError, EventWatch, RefusedError
 from stereoservo.geometry.cameras import project
 from stereoservo.geometry.distortion import distort
@@ -317,7 +318,7 @@ def test_every_goal_has_one_terminal_event(client: Client) -> None:
     with EventWatch(client) as watch:
         first = client.goal("park", gain=0.05)
         second = client.goal("park", gain=0.05)
-        second.cancel()
+        assert cli.invoke(["cancel", CELL]) == 0  # the active one
         third = client.goal("park", gain=0.05)
         client.stop()
         assert first.wait(10.0).outcome == "preempted"

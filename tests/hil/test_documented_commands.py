@@ -100,7 +100,8 @@ class Desk:
         assert words[0] == "stereoservo", f"{command}: no such program here: it needs a marker"
         words = words[1:]
         if words[0] == "run":
-            self.started(Path(words[1]).stem, self.folder / words[1], *words[2:])
+            name = Path(words[1]).stem  # a shipped cell, by its name alone, is played by a fake as well
+            self.started(name, self.folder / f"{name}.toml", *words[2:])
             return 0, ""
         if words[0] in SERVERS:
             return self.served([sys.executable, "-m", "stereoservo.cli.main", *words])

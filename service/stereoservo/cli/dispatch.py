@@ -40,6 +40,7 @@ COMMANDS: dict[str, str] = {
     "resume": "operator_commands:resume",
     "reset": "operator_commands:reset",
     "acknowledge": "operator_commands:acknowledge",
+    "cancel": "operator_commands:cancel",
     "record": "record:record",
     "replay": "replay:replay",
     "export": "export:export",

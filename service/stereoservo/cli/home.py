@@ -24,4 +24,4 @@ def home(
         Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client,
         client.home(speed_scale) as handle,
     ):
-        follow(handle, json)
+        follow(handle, json, client.cell)

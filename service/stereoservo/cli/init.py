@@ -68,7 +68,7 @@ def init(
             tomllib.loads(options), context
         ).describe()
     except DriverError as error:
-        if error.code != "option" or options:
+        if error.code != "option" or (options and "is missing" not in str(error)):
             raise
         raise CommandError(
             "option",

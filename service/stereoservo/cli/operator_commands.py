@@ -1,5 +1,5 @@
 """Commands of the operator that set the state of a cell: ``stereoservo enable``, ``disable``, ``hold``, ``resume``,
-``reset`` (after a fault) and ``acknowledge`` (a goal that is reached).
+``reset`` (after a fault), ``acknowledge`` (a goal that is reached) and ``cancel``.
 """
 
 from __future__ import annotations
@@ -8,7 +8,14 @@ from typing import Annotated
 
 import typer
 
-from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption, emit
+from stereoservo.cli.output import (
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+)
 from stereoservo.client import Client
 
 
@@ -85,3 +92,23 @@ def acknowledge(
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         reply = client.acknowledge(goal_id)
     emit(reply, reply.message, json)
+
+
+def cancel(
+    cell: CellArgument,
+    goal_id: Annotated[
+        str, typer.Argument(metavar="[ID]", help="The goal, active or queued (default: the active one).")
+    ] = "",
+    endpoint: EndpointOption = None,
+    operator: OperatorOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Cancel a goal, whoever sent it: the arm brakes, and the next one of the queue begins."""
+    with Client(cell, endpoint=endpoint, operator=operator) as client:
+        goal_id = goal_id or client.status().goal
+        if not goal_id:
+            raise CommandError(
+                "no_goal", f"no goal is active in cell {client.cell!r}: there is nothing to cancel"
+            )
+        reply = client.cancel(goal_id)
+    emit(reply, f"goal {goal_id}: {reply.message}", json)

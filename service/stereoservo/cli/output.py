@@ -90,6 +90,14 @@ def note(message: str) -> None:
         print(message, file=sys.stderr, flush=True)
 
 
+def note_hold(kind: str, message: str, cell: str) -> None:
+    """Print that a motion which is waited for was held or resumed, with the way out; nothing for other events."""
+    if kind == "held":
+        note(f"{message}: nothing moves until `stereoservo resume {cell}`")
+    elif kind == "resumed":
+        note(message)
+
+
 def fail(error: BaseException, as_json: bool) -> None:
     """Print a failure: the message on stderr, and ``{"error": …}`` on stdout with ``--json``."""
     message = str(error) or type(error).__name__

@@ -5,6 +5,7 @@ slow, held or in fault. On the cell's host it believes the servo process itself,
 from __future__ import annotations
 
 import math
+import time
 
 from stereoservo.cli.local_state import (
     GATEWAY_SILENT,
@@ -17,7 +18,11 @@ from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, J
 from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionError
 from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import find_daemon
-from stereoservo.messages.wire import StateMessage
+from stereoservo.messages.wire import EventMessage, StateMessage
+
+CAUSES = ("held", "stopped", "goal_aborted", "calibration_aborted", "ring_kept")
+"""Kinds of the events that tell why an arm stands."""
+RECENT_EVENTS = 100
 
 
 def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
@@ -30,6 +35,7 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
     try:
         with Client(cell, endpoint=endpoint) as client:
             state = client.status()
+            causes = _causes(client, state)
     except (InvalidReplyError, NoReplyError, SessionError) as error:
         if directories is None:
             raise
@@ -37,7 +43,24 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
         raise _failure(code_of(error), silence, newest_state(directories), json) from error
     if not state.servo_alive:
         raise _failure("servo_silent", f"the servo process is silent. {SERVO_SILENT}", state, json)
-    emit(state, describe(state), json)
+    emit(state, "\n".join([describe(state), *causes]), json)
+
+
+def _causes(client: Client, state: StateMessage) -> list[str]:
+    """The last event of each kind that tells why an arm that is held, stopped or in fault stands, oldest first."""
+    if not any(reason.level in ("hold", "fault") for reason in state.reasons):
+        return []
+    recent: dict[str, EventMessage] = {}
+    page = client.events(max(1, state.last_event - RECENT_EVENTS))
+    for event in page.events:
+        if event.kind == "resumed" or (event.kind, event.name) == ("lifecycle", "active"):
+            recent.clear()
+        elif event.kind in CAUSES:
+            recent[event.kind] = event
+    return [
+        f"  event   {time.strftime('%H:%M:%S', time.localtime(event.t_wall))} {event.kind}: {event.message}"
+        for event in sorted(recent.values(), key=lambda event: event.seq)
+    ]
 
 
 def _failure(code: str, words: str, state: StateMessage | None, as_json: bool) -> CommandError:

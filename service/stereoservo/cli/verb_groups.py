@@ -14,7 +14,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "warmup",
     ),
     "Run": ("run", "status", "ls", "enable", "disable", "reset", "hold", "resume", "stop"),
-    "Move": ("calibrate", "teach", "goal", "ik", "acknowledge", "jog", "home", "auxiliary"),
+    "Move": ("calibrate", "teach", "goal", "ik", "acknowledge", "cancel", "jog", "home", "auxiliary"),
     "Look": ("watch", "web", "record", "replay", "export"),
     "Simulate and measure": ("demo", "emulate", "simulate", "reproduce", "bench"),
 }
@@ -43,6 +43,7 @@ EXAMPLES: dict[str, str] = {
     "goal": "goal mycell dock --check",
     "ik": "ik mycell dock",
     "acknowledge": "acknowledge mycell ID",
+    "cancel": "cancel mycell",
     "jog": "jog mycell j1=0.05 --seconds 1",
     "home": "home mycell",
     "auxiliary": "auxiliary mycell gripper=0.04",

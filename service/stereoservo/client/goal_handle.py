@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -96,13 +96,23 @@ class GoalHandle:
         self._ended = False
         self._lease = Lease(connection, goal.id, goal.lease_s)
 
-    def wait(self, timeout_s: float = 600.0) -> GoalResult:
-        """Wait for its terminal event. Raises TimedOutError (the goal continues), DaemonLostError."""
+    def wait(
+        self, timeout_s: float = 600.0, progress: Callable[[EventMessage], None] | None = None
+    ) -> GoalResult:
+        """Wait for its terminal event. ``progress`` is called with every event of it, as when the arm is held.
+
+        Raises TimedOutError (the goal continues), DaemonLostError.
+        """
+
+        def ends(event: EventMessage) -> bool:
+            if event.id != self.id:
+                return False
+            if progress is not None:
+                progress(event)
+            return event.kind in TERMINAL
+
         if self._result is None:
-            event = self._watch.wait(
-                lambda e: e.id == self.id and e.kind in TERMINAL, f"goal {self.id}", timeout_s
-            )
-            self._finish(event)
+            self._finish(self._watch.wait(ends, f"goal {self.id}", timeout_s))
         assert self._result is not None
         return self._result
 

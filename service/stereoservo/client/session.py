@@ -5,6 +5,7 @@ Bounded, local, without discovery, and never blocking.
 
 from __future__ import annotations
 
+import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,22 @@ def open_session(config: dict[str, Any]) -> Any:
         return zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(config).decode()))
     except zenoh.ZError as error:
         verb = "listen on" if config["mode"] == "router" else "connect to"
-        raise SessionError(f"cannot {verb} {where}: {error}") from error
+        cause = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))  # zenoh's own source line
+        raise SessionError(f"cannot {verb} {where}: {cause}{_certificate_hint(config, where)}") from error
+
+
+def _certificate_hint(config: dict[str, Any], where: str) -> str:
+    """What to look at where a client's TLS connection failed: zenoh tells a refused certificate as a time limit."""
+    if config["mode"] != "client" or "tls/" not in where:
+        return ""
+    tls = config["transport"]["link"].get("tls", {})
+    if "connect_certificate" not in tls:
+        return " This client has no certificate: STEREOSERVO_TLS_DIR names the directory with ca.pem, cert.pem, key.pem"
+    return (
+        f" Where the daemon listens there, a certificate was refused: {tls['connect_certificate']} must be in date, "
+        "X.509 version 3 (`openssl x509 -req` makes one with -extfile only) and signed by the daemon's authority; the "
+        f"daemon's must be signed by {tls['root_ca_certificate']} and hold this address"
+    )
 
 
 def close_session(session: Any, declared: list[Any]) -> bool:

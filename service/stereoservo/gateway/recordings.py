@@ -98,7 +98,7 @@ class ImageRecordings:
         silent = {
             name: RecordedImages(
                 name, f"{self._directory}/{name}.avi", 0, 0, 0,
-                f"its vision process has not said what it recorded within {LAST_WORD_S:g} s; see the daemon's log",
+                f"or more: its vision process has not said how many within {LAST_WORD_S:g} s; see the daemon's log",
             )
             for name in missing
         }  # fmt: skip

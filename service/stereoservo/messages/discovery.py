@@ -150,7 +150,12 @@ class DaemonProcess:
                 if info.pid == self.process.pid:
                     return info
             time.sleep(0.05)
-        raise DaemonError(f"the daemon was not ready within {timeout_s:g} s", None, self.output())
+        said = f"; it logs into {self._log}" if self._log is not None else ""
+        raise DaemonError(
+            f"the daemon was not ready within {timeout_s:g} s: a busy computer, or a first start that compiles? Start "
+            f"it again: what was compiled is kept{said}",
+            None, self.output(),
+        )  # fmt: skip
 
     def output(self) -> str:
         """Its log so far, where it logs into a file."""

@@ -143,7 +143,7 @@ def _telling() -> Iterator[DemonstrationProgress]:
         task = bar.add_task("stereoservo demo", total=1.0)
 
         def tell(text: str) -> None:
-            bar.console.print(text, highlight=False)
+            bar.console.print(text, highlight=False, soft_wrap=True)
             bar.update(task, description=text[:60])
 
         yield DemonstrationProgress(tell=tell, progress=lambda fraction: bar.update(task, completed=fraction))
@@ -151,7 +151,9 @@ def _telling() -> Iterator[DemonstrationProgress]:
 
 def _line(console: Console) -> Callable[[str], None]:
     start = time.monotonic()
-    return lambda text: console.print(f"{time.monotonic() - start:6.1f} s  {text}", highlight=False)
+    return lambda text: console.print(
+        f"{time.monotonic() - start:6.1f} s  {text}", highlight=False, soft_wrap=True
+    )
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -126,10 +126,14 @@ def conduct_live(
             cell_path = _emulate_drives(ends, cell_path, scratch, out, stage)
         if has_emulated_cameras(cell):
             cell_path = _emulate_cameras(ends, cell_path, scratch, out, stage)
-        stage.tell("starting the daemon (the first start compiles the kernels)")
+        stage.tell(
+            "starting the daemon (the first start compiles the kernels: minutes, more on a busy computer; nothing is "
+            "compiled twice)"
+        )
         options = ("--seed", str(seed), "--record", str(recording))
         with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
             daemon.wait_ready()
+            stage.tell(f"look on: {RUNTIME_VARIABLE}={scratch / 'run'} stereoservo web {cell.cell.name}")
             log = TruthLog.of_directory(cell_directories(cell.cell.name).runtime)
             log.follow()
             with Client(cell.cell.name) as client:

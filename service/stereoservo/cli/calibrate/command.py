@@ -25,6 +25,7 @@ from stereoservo.cli.output import (
     OperatorOption,
     emit,
     note,
+    note_hold,
 )
 from stereoservo.client import Client, FailedError
 from stereoservo.messages.check_report import CheckReport, ZeroReset
@@ -225,10 +226,15 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
         TimeElapsedColumn(),
     )
     if not console.is_terminal:
-        return run(_telling(_lines(what)))
+        return run(_telling(client.cell, _lines(what)))
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=1.0)
-        return run(_telling(lambda done, told: bar.update(task, completed=done, description=told or what)))
+        return run(
+            _telling(
+                client.cell,
+                lambda done, told: bar.update(task, completed=done, description=told or what),
+            )
+        )
 
 
 def _lines(what: str) -> Callable[[float, str], None]:
@@ -244,10 +250,11 @@ def _lines(what: str) -> Callable[[float, str], None]:
     return tell
 
 
-def _telling(tell: Callable[[float, str], None]) -> Callable[[EventMessage], None]:
-    """What hands the progress of events, 0 to 1 with its message, to ``tell``, and prints warnings."""
+def _telling(cell: str, tell: Callable[[float, str], None]) -> Callable[[EventMessage], None]:
+    """What hands the progress of events, 0 to 1 with its message, to ``tell``, and prints warnings and holds."""
 
     def progress(event: EventMessage) -> None:
+        note_hold(event.kind, event.message, cell)
         if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
             note(event.message)
         if event.progress is None:

@@ -93,7 +93,7 @@ def examine_cell(
 def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPlan, CellDirectories]]:
     """Findings on a cell file and this computer; returns the plan of a run. Raises as :func:`examine_cell`."""
     loaded = load_cell_file(path)
-    yield ExaminationFinding("cell file", True, f"{path} is valid")
+    yield ExaminationFinding("cell file", True, f"{path} is valid in itself")
     directories = cell_directories(loaded.cell.name)
     create_directories(directories)
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))

@@ -31,6 +31,7 @@ from stereoservo.cli.output import (
     goals_beginning,
     marker_ids,
     note,
+    note_hold,
     read_file,
 )
 from stereoservo.client import Client, ClientError, GoalHandle
@@ -289,7 +290,7 @@ def _run(
         if stream is not None:
             note(f"{handle.stream(stream)} set-points followed")
         if wait:
-            follow(handle, as_json)
+            follow(handle, as_json, client.cell)
             if requested.acknowledge_s is not None:
                 note(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
         else:
@@ -300,9 +301,9 @@ def _run(
         raise
 
 
-def follow(handle: GoalHandle, as_json: bool) -> None:
-    """Wait for a goal's end and print it. Raises CommandError unless it was reached."""
-    result = handle.wait()
+def follow(handle: GoalHandle, as_json: bool, cell: str) -> None:
+    """Wait for a goal's end and print it; a hold meanwhile too. Raises CommandError unless it was reached."""
+    result = handle.wait(progress=lambda event: note_hold(event.kind, event.message, cell))
     if result.outcome != "reached":
         tree = cast("dict[str, Any]", msgspec.to_builtins(result))
         raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.why}", goal=tree)
