@@ -65,13 +65,13 @@ MISTAKES = {
     ),
     "cameras swapped": Mistake("they are swapped", cameras=("swap left right", "clear all")),
     "mirrored plate": Mistake(
-        "left markers: none is seen, but 14 in the mirror image", cameras=("mirror left", "clear all")
+        "markers: none is seen, but 14 in the mirror image", cameras=("mirror left", "clear all")
     ),
     "camera sees nothing": Mistake(
         "right markers: none of 14 is seen", cameras=("bump right 60deg about y", "bump right back")
     ),
     "wrong gear ratio": Mistake(
-        "gear_ratio of 'j1' divided by", (_joint("j1", "gear_ratio", "320.0"),), answers=YES
+        "gear_ratio of 'j1' divided by", (_joint("j1", "gear_ratio", "240.0"),), answers=YES
     ),
     "encoder against motor": Mistake("moves against its command", drives=("invert 4", "invert 4 off"), answers=YES),
     "joints swapped": Mistake(

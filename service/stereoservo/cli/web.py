@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 HOST_NAME = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-END_S = 12.0
+END_S = 20.0
 """From Ctrl-C to an end by force. Pages are given 2 s, the link 6 s, then other threads `THREADS_S`."""
 THREADS_S = 1.0
 
