@@ -133,7 +133,11 @@ async def _serve(
 ) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
-    ending.wake = lambda: loop.call_soon_threadsafe(ended.set)  # type: ignore[assignment]
+
+    def wake() -> None:
+        loop.call_soon_threadsafe(ended.set)
+
+    ending.wake = wake
     try:
         found = await server.start(address, port, context, names)
     except OSError as error:
