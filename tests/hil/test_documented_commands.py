@@ -65,15 +65,24 @@ class Desk:
             shutil.copy(ROOT / "deploy" / "cells" / f"{name}.toml", folder / "deploy" / "cells")
         nowhere = {"matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "basis": [0, 1, 2, 4, 7]}
         (folder / "step.json").write_text(json.dumps(nowhere), encoding="utf-8")
+        self._given = set(folder.iterdir())
+
+    def tidied(self) -> None:
+        """Remove what a page has left, also one that failed and is tried again; daemons keep their logs."""
+        for path in set(self.folder.iterdir()) - self._given:
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.suffix != ".log":
+                path.unlink()
 
     def prepared(self, name: str, calibrates: bool = False) -> None:
         """A daemon of that cell that has calibrated itself, unless the page ``calibrates`` it, and knows the goals."""
-        if name not in self.daemons:
+        if name not in self.daemons or self.daemons[name].process.poll() is not None:
             self.started(name, self.folder / f"{name}.toml")
         with Client(name) as client:
             recover(client)
             if name not in self.calibrated and not calibrates:
-                assert client.calibrate(timeout_s=120.0).covariance_ok
+                assert client.calibrate(timeout_s=240.0).covariance_ok
                 self.taught(client, name)
 
     def taught(self, client: Client, name: str) -> None:
@@ -86,7 +95,11 @@ class Desk:
         """A daemon of that cell in place of the one that runs."""
         self.stopped(name)
         self.daemons[name] = DaemonProcess(file, options=options, log=self.folder / f"{name}.log")
-        self.daemons[name].wait_ready()
+        try:
+            self.daemons[name].wait_ready()
+        except BaseException:  # a page that is tried again starts another
+            self.stopped(name)
+            raise
 
     def stopped(self, name: str) -> None:
         if name in self.daemons:
@@ -147,11 +160,14 @@ class Desk:
         """A server that is ended by Ctrl-C once it has said where it is, as people do."""
         with tempfile.TemporaryFile("w+") as out:
             child = subprocess.Popen(words, cwd=self.folder, stdin=subprocess.PIPE, stdout=out, stderr=out)
-            eventually("a word", lambda: os.fstat(out.fileno()).st_size or child.poll() is not None)
-            time.sleep(0.5)
-            if child.poll() is None:
-                child.send_signal(signal.SIGINT)
-            code = child.wait(30)
+            try:
+                eventually("a word", lambda: os.fstat(out.fileno()).st_size or child.poll() is not None, 60.0)
+                time.sleep(0.5)
+                if child.poll() is None:
+                    child.send_signal(signal.SIGINT)
+                code = child.wait(60)
+            finally:
+                child.kill()
             out.seek(0)
             return (0 if code in (0, 130, -signal.SIGINT) else code), out.read()
 
@@ -186,6 +202,7 @@ def pages(with_something: Callable[[Path], bool]) -> list[object]:
 def worked_through(page: Path, desk: Desk, slow: bool) -> None:
     """Execute the commands of a page, each of which is to succeed."""
     found = runs(page, slow)
+    desk.tidied()
     for name in FAKES:
         mine = [one.command for one in found if re.search(rf"\b{name}\b", desk.filled(one.command))]
         if mine:

@@ -7,7 +7,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,10 @@ from stereoservo.messages.directories import cell_directories
 
 from .can_bench import CanBench
 
+pytestmark = pytest.mark.process
 ONE_DEGREE = math.radians(1.0)
 MOST_ANSWERS = 25
+MOST_STALLS = 3
 PATIENT = (
     "heartbeat_timeout_ms=400", "rpdo_deadline_ms=200", "max_missed_cycles=50", "command_timeout_s=0.4",
     "loop_timeout_ms=400",
@@ -61,13 +65,13 @@ MISTAKES = {
     ),
     "cameras swapped": Mistake("they are swapped", cameras=("swap left right", "clear all")),
     "mirrored plate": Mistake(
-        "left markers: none is seen, but 14 in the mirror image", cameras=("mirror left", "clear all")
+        "markers: none is seen, but 14 in the mirror image", cameras=("mirror left", "clear all")
     ),
     "camera sees nothing": Mistake(
         "right markers: none of 14 is seen", cameras=("bump right 60deg about y", "bump right back")
     ),
     "wrong gear ratio": Mistake(
-        "gear_ratio of 'j1' divided by", (_joint("j1", "gear_ratio", "320.0"),), answers=YES
+        "gear_ratio of 'j1' divided by", (_joint("j1", "gear_ratio", "240.0"),), answers=YES
     ),
     "encoder against motor": Mistake("moves against its command", drives=("invert 4", "invert 4 off"), answers=YES),
     "joints swapped": Mistake(
@@ -76,9 +80,10 @@ MISTAKES = {
         answers={**YES, "moved.j1": "j2+"},
     ),
     "sign inverted": Mistake(
-        "j4 was driven to + and turned to -", (_joint("j4", "direction", "-1"),),
-        answers={**YES, "moved.j4": "j4-"},
+        "j5 was driven to + and turned to -", (_joint("j5", "direction", "1"),),
+        answers={**YES, "moved.j5": "j5-"},
     ),
+    "another drive": Mistake("vendor_id is 0xfb in the cell file", (_joint("j1", "vendor_id", "0xfb"),)),
 }  # fmt: skip
 """On drives as they are shipped; two more need drives of another make."""
 OTHER_DRIVES = {
@@ -117,6 +122,28 @@ def other_box(roots: Path) -> Iterator[CanBench]:
     bench.end()
 
 
+class Watch:
+    """Looks where the emulated arm is, again and again. ``farthest`` [rad]: of any joint from ``start`` (n,)."""
+
+    def __init__(self, bench: CanBench, start: np.ndarray) -> None:
+        self.farthest = 0.0
+        self._bench, self._start = bench, start
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look)
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        while not self._ended.wait(0.05):
+            self.farthest = max(self.farthest, float(np.abs(self._bench.truth()[1] - self._start).max()))
+
+
 Run = Callable[..., tuple[int, dict[str, Any]]]
 
 
@@ -136,10 +163,10 @@ def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Run:
     return go
 
 
-def planted(bench: CanBench, mistake: Mistake, folder: Path) -> Path:
-    """The bench's cell file with a mistake in it."""
+def planted(bench: CanBench, mistakes: Sequence[Mistake], folder: Path) -> Path:
+    """The bench's cell file with mistakes in it."""
     text = bench.cell.read_text()
-    for pattern, replacement in mistake.edits:
+    for pattern, replacement in (edit for mistake in mistakes for edit in mistake.edits):
         text, count = re.subn(pattern, replacement, text)
         assert count == 1, f"{pattern}: {count} places"
     path = folder / f"{bench.name}.toml"
@@ -147,28 +174,35 @@ def planted(bench: CanBench, mistake: Mistake, folder: Path) -> Path:
     return path
 
 
-def examine(bench: CanBench, mistake: Mistake, run: Run, folder: Path) -> tuple[str, float]:
-    """What setup says is wrong, and the largest true motion of a joint [rad] until it said so."""
+def order(bench: CanBench, mistake: Mistake, which: int) -> None:
+    """Plant what of a mistake is the emulators' (0), or take it back (1)."""
     assert bench.emulator is not None
     assert bench.cameras is not None
-    path = planted(bench, mistake, folder)
-    if mistake.drives[0]:
-        bench.emulator.order(mistake.drives[0])
-    if mistake.cameras[0]:
-        bench.cameras.order(mistake.cameras[0])
+    for emulator, orders in ((bench.emulator, mistake.drives), (bench.cameras, mistake.cameras)):
+        if orders[which]:
+            emulator.order(orders[which])
+
+
+def wrong(run: Run, path: Path, answers: dict[str, str]) -> str:
+    """What setup says is wrong, with its cures."""
+    code, told = run(path, answers)
+    assert code == 1
+    assert told["error"]["code"] == "checks_failed", told
+    found = [check for check in told["error"]["checks"] if check["ok"] is False]
+    words = "; ".join(f"{check['name']}: {check['message']} | {check['cure']}" for check in found)
+    print(f"{words}\n")
+    return words
+
+
+def examine(bench: CanBench, mistake: Mistake, run: Run, folder: Path) -> tuple[str, float]:
+    """What setup says is wrong, and the largest true motion of a joint [rad] until it said so."""
+    path = planted(bench, [mistake], folder)
+    order(bench, mistake, 0)
     start = bench.truth()[1]
     try:
-        code, told = run(path, mistake.answers)
+        words = wrong(run, path, mistake.answers)
     finally:
-        if mistake.drives[1]:
-            bench.emulator.order(mistake.drives[1])
-        if mistake.cameras[1]:
-            bench.cameras.order(mistake.cameras[1])
-    assert code == 1
-    assert told["error"]["code"] == "checks_failed"
-    wrong = [check for check in told["error"]["checks"] if check["ok"] is False]
-    words = "; ".join(f"{check['name']}: {check['message']} | {check['cure']}" for check in wrong)
-    print(f"{words}\n")
+        order(bench, mistake, 1)
     return words, float(np.abs(bench.truth()[1] - start).max())
 
 
@@ -180,6 +214,34 @@ def test_a_planted_mistake_is_named_before_a_joint_moves_one_degree(
     told, moved = examine(box, MISTAKES[name], run, tmp_path)
     assert MISTAKES[name].named in told
     assert moved < (ONE_DEGREE if MISTAKES[name].answers else 1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_twelve_mistakes_in_one_box_are_named_one_after_the_other_before_a_joint_is_one_degree_away(
+    box: CanBench, run: Run, tmp_path: Path
+) -> None:
+    """A person who corrects what setup names, and runs it again, is led to all of them."""
+    left = dict(MISTAKES)
+    assert len(left) == 12
+    start, farthest, rounds = box.truth()[1], 0.0, []
+    with Watch(box, start) as watch, ExitStack() as planted_orders:
+        for mistake in left.values():
+            order(box, mistake, 0)
+            planted_orders.callback(order, box, mistake, 1)
+        stalls = 0
+        while left:
+            answers = {key: text for mistake in left.values() for key, text in mistake.answers.items()}
+            words = wrong(run, planted(box, list(left.values()), tmp_path), answers)
+            named = [name for name, mistake in left.items() if mistake.named in words]
+            stalls += not named  # a busy machine's own finding, such as a camera that is late: run it again
+            assert stalls <= MOST_STALLS, f"of {', '.join(left)} none is named"
+            rounds.append(named)
+            for name in named:
+                order(box, left.pop(name), 1)
+        farthest = watch.farthest
+    print(f"{len(rounds)} runs: {rounds}; {math.degrees(farthest):.3f} degrees at most")
+    assert farthest < ONE_DEGREE
 
 
 @pytest.mark.slow

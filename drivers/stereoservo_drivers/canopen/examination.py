@@ -261,8 +261,14 @@ def _jog_all(driver: CanJointDriver, usable: list[bool], may_move: MayMove) -> I
             continue
         trace, error = _jog(driver, k, sign * share)
         if error is None:
-            yield msgspec.structs.replace(jog_finding(trace), jogged=(joint.name, trace.travel))
-            continue
+            found = jog_finding(trace)
+            yield msgspec.structs.replace(found, jogged=(joint.name, trace.travel))
+            if found.ok is False:
+                continue
+            name = f"{joint.name} way back"  # else joints that are tried again and again wander off
+            trace, error = _jog(driver, k, -sign * share)
+            if error is None:
+                continue
         remedy = jog_finding(trace).remedy if trace.asked else ""
         yield ExaminationFinding(name, False, str(error), remedy)
         return
@@ -275,8 +281,8 @@ def _question(joint: CanJoint, sign: float) -> str:
         else f"{sign * JOG['prismatic'] * 1e3:+.0f} mm"
     )
     return (
-        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {travel}, slowly. Is its "
-        "surrounding clear and a hand on the emergency stop?"
+        f"Joint {joint.name} (node {joint.node_id}) is going to be enabled and moved by {travel} and back, slowly. Is "
+        "its surrounding clear and a hand on the emergency stop?"
     )
 
 

@@ -1,12 +1,21 @@
-"""Handler of Ctrl-C that raises KeyboardInterrupt and sets a flag for loops to poll, since an exception raised in a
-destructor or a library's callback is lost.
+"""Ctrl-C: a handler that raises KeyboardInterrupt and sets a flag for loops to poll, since an exception raised in a
+destructor or a library's callback is lost; and one for servers, which raises nothing and ends within a bounded time.
 """
 
 from __future__ import annotations
 
+import faulthandler
+import os
 import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
+STDERR = 2
+EXIT_FORCED = 130
 _asked = False
 
 
@@ -25,3 +34,57 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
     global _asked  # noqa: PLW0603  a process has one
     _asked = True
     raise KeyboardInterrupt
+
+
+class Ending:
+    """Whether a server was asked to end. ``wake``: called in the main thread when it is."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.wake: Callable[[], None] = lambda: None
+
+
+@contextmanager
+def ending(seconds: float) -> Iterator[Ending]:
+    """Within, SIGINT and SIGTERM ask for the end and raise nothing: an exception from anywhere tears an event loop,
+    which may lose the step of a task that is then waited for, and is itself lost in a destructor.
+
+    A process that has not ended ``seconds`` after it was asked is ended, and what each of its threads did is printed. A
+    second signal ends it at once.
+    """
+    found = Ending()
+
+    def ask(signum: int, frame: FrameType | None) -> None:
+        if found.asked:
+            os.write(STDERR, b"asked twice: ended at once\n")
+            os._exit(EXIT_FORCED)
+        found.asked = True
+        faulthandler.dump_traceback_later(
+            seconds, exit=True, file=STDERR
+        )  # needs neither this thread nor the GIL
+        found.wake()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield found
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def threads_left(seconds: float) -> list[str]:
+    """Names of the other threads that have not ended within ``seconds``: an exit waits for some of them, and others are
+    torn out of their libraries by it.
+    """
+    until = time.monotonic() + seconds
+    others = [thread for thread in threading.enumerate() if thread is not threading.current_thread()]
+    for thread in others:
+        thread.join(max(0.0, until - time.monotonic()))
+    return [thread.name for thread in others if thread.is_alive()]
+
+
+def leave(code: int) -> None:
+    """End the process without waiting for other threads."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

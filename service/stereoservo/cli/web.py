@@ -6,13 +6,13 @@ import asyncio
 import re
 import ssl
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stereoservo.cli import interruption
 from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, note
 from stereoservo.messages.keys import InvalidKeyError, check_name
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 HOST_NAME = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+END_S = 20.0
+"""From Ctrl-C to an end by force. Pages are given 2 s, the link 6 s, then other threads `THREADS_S`."""
+THREADS_S = 1.0
 
 
 def web(
@@ -93,9 +96,14 @@ def web(
         if len(tokens) > 1 or not json:
             note(f"token to command the arm as {operate}, good for one use: {token}")
 
-    server = PageServer(make_link, operate, announce)
-    with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(server, address, port, context, host or [], tokens, json))
+    interruption.check()  # one that was lost while packages were imported
+    with interruption.ending(END_S) as ending:
+        server = PageServer(make_link, operate, announce)
+        asyncio.run(_serve(server, address, port, context, host or [], tokens, json, ending))
+        left = interruption.threads_left(THREADS_S)
+        if left:
+            note(f"ended without waiting for what does not answer: {', '.join(left)}")
+            interruption.leave(0)
 
 
 def _check_names(hosts: list[str], operator: str | None) -> None:
@@ -121,7 +129,15 @@ async def _serve(
     names: list[str],
     tokens: list[str],
     as_json: bool,
+    ending: interruption.Ending,
 ) -> None:
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    def wake() -> None:
+        loop.call_soon_threadsafe(ended.set)
+
+    ending.wake = wake
     try:
         found = await server.start(address, port, context, names)
     except OSError as error:
@@ -129,11 +145,16 @@ async def _serve(
         raise CommandError(
             "listen", f"{address}:{port}: {error.strerror or error}; choose another --port"
         ) from error
-    shown = f"[{address}]" if ":" in address else address
-    url = f"{'http' if context is None else 'https'}://{shown}:{found}/"
-    emit({"url": url, "token": tokens[-1] if tokens else None}, f"{url}  (Ctrl-C ends it)", as_json)
     try:
-        await asyncio.Event().wait()
+        shown = f"[{address}]" if ":" in address else address
+        url = f"{'http' if context is None else 'https'}://{shown}:{found}/"
+        emit({"url": url, "token": tokens[-1] if tokens else None}, f"{url}  (Ctrl-C ends it)", as_json)
+        if not ending.asked:
+            await ended.wait()
+        note(
+            f"ending: pages are closed, and what they have started stops; by force after {END_S:g} s, or at once by a "
+            "second Ctrl-C"
+        )
     finally:
         await server.close()
 

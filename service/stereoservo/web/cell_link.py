@@ -34,6 +34,8 @@ AGAIN_S = 0.25
 """Before another session is tried; well within `LEASE_S`, so that a goal outlives a session that failed."""
 SILENT_S = 2.0
 INFO_EVERY_S = 0.5
+CLOSING_S = 6.0
+"""A query that is not answered, 2 s, and a session that hangs when it is closed, 2 s."""
 Publish = Callable[[str, bytes, bool], None]
 
 
@@ -87,7 +89,9 @@ class CellLink:
         self._leases.close()
         self._ended.set()
         if self._thread.is_alive():
-            self._thread.join(3.0)
+            self._thread.join(CLOSING_S)
+        elif self._client is not None:  # never started
+            self._client.close()
 
     # -- reading ----------------------------------------------------------------------------------------------
 

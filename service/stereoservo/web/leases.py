@@ -99,3 +99,5 @@ class Leases:
         """End all and the thread. Idempotent."""
         self.end()
         self._closed.set()
+        if self._thread.is_alive():
+            self._thread.join(RENEW_EVERY_S)

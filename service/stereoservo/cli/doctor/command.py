@@ -38,7 +38,9 @@ def doctor(
     ],
     jog: Annotated[
         bool,
-        typer.Option("--jog", help="Also turn each joint by one degree, once allowed: checks its units."),
+        typer.Option(
+            "--jog", help="Also turn each joint by one degree and back, once allowed: checks its units."
+        ),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Allow what --jog asks for.")] = False,
     seconds: Annotated[

@@ -87,6 +87,11 @@ def commission(
     ``names``: of the joints, base first.
     """
     asked: list[bool] = []
+    before: list[CameraRecord] = []
+
+    def look() -> list[CameraRecord]:
+        with dialogue.doing("looking at the plate"), ordinary_for_a_while():
+            return cameras.look()
 
     def may_move(_question: str) -> float:
         if not all(sound):
@@ -95,28 +100,28 @@ def commission(
             dialogue.heading("The first motion")
             dialogue.say(
                 f"Each joint is going to be enabled, moved by {SHARE:g} degrees (a slide: {2 * SHARE:g} mm), slowly, "
-                "and switched off, base first.\nCtrl-C stops it. Look at the arm: which joint moves, and which way?"
+                "looked at, moved back and switched off, base first.\n"
+                "Ctrl-C stops it. Look at the arm: which joint moves, and which way?"
             )
             asked.append(
                 dialogue.confirm(
                     "move", "Is the arm clear all around, and a hand on the emergency stop?", False
                 )
             )
-        return SHARE if asked[0] else 0.0
+        if not asked[0]:
+            return 0.0
+        before[:] = look()
+        return SHARE
 
     with Cameras(plan) as cameras:
-        before = cameras.look()
         for finding in examine_joints(plan, may_move):
             yield finding
             if finding.jogged is None:
                 continue
-            with dialogue.doing("looking at the plate"), ordinary_for_a_while():
-                after = cameras.look()
-                seen = seen_by_pictures(plan, finding.jogged, before, after)
+            seen = seen_by_pictures(plan, finding.jogged, before, look())
             yield seen
             if finding.ok is not False and seen.ok is not False:
                 yield asked_of_a_person(dialogue, finding.jogged, names)
-            before = after
 
 
 def in_fault(findings: Sequence[ExaminationFinding]) -> ExaminationFinding | None:
