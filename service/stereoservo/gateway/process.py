@@ -255,8 +255,8 @@ class Gateway:
             self._read_state()
         for event in events:
             self._core_event(event)
+        self._intake.expire()  # after the answers that came while this process had no time
         busy = self._queries() or bool(events)
-        self._intake.expire()
         self._publish_features()
         with self._preview_boundary:
             self._previews.poll()
