@@ -35,9 +35,9 @@ from stereoservo.messages.wire import (
 )
 
 TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
-READ_TRIES = 3
+READ_TRIES = 2
 """So often state, events and the like are asked for: on a busy computer a reply may take longer than the time-out, or
-be lost with a connection that is being opened anew."""
+be lost with a connection that is being opened anew. Together less than a gateway that hangs is given to live."""
 READ_PAUSE_S = 0.1
 """Before it is asked again, where the question ended at once: nobody was there to answer."""
 NEXT_EVENT = 2**53
