@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from stereoservo.client import Client, ClientError, EventWatch, InvalidReplyError, RefusedError
+from stereoservo.client import Client, ClientError, EventWatch, InvalidReplyError, NoReplyError, RefusedError
 from stereoservo.client.session import client_config, close_session, open_session
 from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import check_cell
@@ -84,6 +84,35 @@ def test_a_refusal_in_the_place_of_a_state_is_still_a_refusal(endpoint: str) -> 
         pytest.raises(RefusedError, match="state refused: no state yet"),
     ):
         client.status()
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "asked"),
+    [("events", 1, 2), ("events", 2, 2), ("hold", 1, 1)],
+    ids=["a reading is repeated", "not without end", "a command is not repeated"],
+)
+def test_a_reading_whose_reply_is_lost_is_asked_for_again(
+    endpoint: str, name: str, lost: int, asked: int
+) -> None:
+    session, heard = open_session(client_config(endpoint)), []
+
+    def answer(query: Any) -> None:
+        with query:
+            heard.append(str(query.key_expr))
+            if len(heard) > lost:
+                query.reply(str(query.key_expr), encode(EventList("boot", 1, 1, ())))
+
+    queryable = session.declare_queryable(f"{KEYS.prefix}/**", answer)
+    try:
+        with Client("demo", endpoint=endpoint, operator="anna") as client:
+            if lost < asked:
+                assert CALLS[name](client) == EventList("boot", 1, 1, ())
+            else:
+                with pytest.raises(NoReplyError, match="in 2 tries of 2 s" if asked == 2 else "within 2 s"):
+                    CALLS[name](client)
+        assert len(heard) == asked
+    finally:
+        close_session(session, [queryable])
 
 
 @contextmanager

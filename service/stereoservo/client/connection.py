@@ -5,7 +5,9 @@ from __future__ import annotations
 import getpass
 import os
 import re
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -33,6 +35,11 @@ from stereoservo.messages.wire import (
 )
 
 TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
+READ_TRIES = 2
+"""So often state, events and the like are asked for: on a busy computer a reply may take longer than the time-out, or
+be lost with a connection that is being opened anew. Together less than a gateway that hangs is given to live."""
+READ_PAUSE_S = 0.1
+"""Before it is asked again, where the question ended at once: nobody was there to answer."""
 NEXT_EVENT = 2**53
 """Above every event's number: a query from it on returns no event, only the number of the next one."""
 
@@ -94,8 +101,11 @@ class Connection:
         return reply
 
     def fetch(self, key: str, kind: type[_T]) -> _T:
-        """Query a message of type ``kind`` on ``key``. Raises RefusedError, NoReplyError, InvalidReplyError."""
-        data = self.query(key)
+        """Query a message of type ``kind`` on ``key``; without a reply ``READ_TRIES`` times: reading changes nothing.
+
+        Raises RefusedError, NoReplyError, InvalidReplyError.
+        """
+        data = self._read(key)
         try:
             return read_message(key, data, kind)
         except InvalidReplyError as error:
@@ -103,6 +113,18 @@ class Connection:
             if reply is None:
                 raise
             raise RefusedError(key.rpartition("/")[2], reply) from error
+
+    def _read(self, key: str) -> bytes:
+        """The payload of the first reply of up to ``READ_TRIES`` queries. Raises NoReplyError."""
+        for _ in range(READ_TRIES - 1):
+            asked_s = time.monotonic()
+            with suppress(NoReplyError):
+                return self.query(key)
+            time.sleep(max(0.0, READ_PAUSE_S - (time.monotonic() - asked_s)))
+        try:
+            return self.query(key)
+        except NoReplyError as error:
+            raise NoReplyError(key, error.timeout_s, READ_TRIES) from error
 
     def command(self, verb: str, command: Command) -> Reply:
         """Send a command and return the accepting reply. Raises RefusedError, NoReplyError."""

@@ -12,9 +12,11 @@ class ClientError(Exception):
 class NoReplyError(ClientError):
     """No reply: the daemon is gone, hangs, or does not authorise this client."""
 
-    def __init__(self, key: str, timeout_s: float) -> None:
+    def __init__(self, key: str, timeout_s: float, tries: int = 1) -> None:
+        within = f"within {timeout_s:g} s" if tries == 1 else f"in {tries} tries of {timeout_s:g} s"
         super().__init__(
-            f"no reply on {key} within {timeout_s:g} s: the daemon is gone, hangs, or refuses this client"
+            f"no reply on {key} {within}: the daemon is gone, hangs, or refuses this client; or this computer is "
+            "overloaded (`uptime`)"
         )
         self.key = key
         self.timeout_s = timeout_s

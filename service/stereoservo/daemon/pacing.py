@@ -6,6 +6,7 @@ cycle that ran over its slot's end skips the slots that have passed instead of c
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import mmap
 import os
@@ -159,12 +160,15 @@ def clock_pacing(period_ns: int) -> ClockPacing:
 
 
 def prepare_realtime(priority: int) -> list[str]:
-    """Freeze the garbage collector's generations and request SCHED_FIFO (``priority`` 0: leave the scheduler as it
-    is).
+    """Give back memory that loading left behind, freeze the garbage collector's generations and request SCHED_FIFO
+    (``priority`` 0: leave the scheduler as it is).
 
     Returns warnings, each with its remedy; the loop runs without as well, and may wake late under load.
     """
     gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # glibc's; others keep no freed memory, or not so much
+        trim(0)
     gc.freeze()
     if priority == 0:
         return []

@@ -95,6 +95,10 @@ STATE_EVERY_S = 0.05
 STEPS_EVERY_S = 0.05
 """How often step records are taken: their ring has room for seconds of them, and a batch costs less than each alone."""
 IDLE_S = 0.003
+"""Between passes without news."""
+REST_S = 0.006
+"""The same where no client and no event has come for ``REST_AFTER_S``; a stop has a thread of its own."""
+REST_AFTER_S = 1.0
 FINAL_PASSES = 100
 LAST_EVENTS_S = 3.0
 """A servo process whose supervisor was killed brings the arm to rest before it ends: its last events are waited for."""
@@ -252,8 +256,8 @@ class Gateway:
             self._read_state()
         for event in events:
             self._core_event(event)
+        self._intake.expire()  # after the answers that came while this process had no time
         busy = self._queries() or bool(events)
-        self._intake.expire()
         self._publish_features()
         with self._preview_boundary:
             self._previews.poll()
@@ -539,9 +543,12 @@ def run(plan: RunPlan, parent: int, termination: Termination) -> None:
     """Run until terminated; ``parent``: the supervisor."""
     gateway = Gateway(plan)
     try:
+        busy_s = time.monotonic()
         while not termination.asked:
-            if not gateway.run_once():
-                time.sleep(IDLE_S)
+            if gateway.run_once():
+                busy_s = time.monotonic()
+            else:
+                time.sleep(IDLE_S if time.monotonic() - busy_s < REST_AFTER_S else REST_S)
         for _ in range(
             FINAL_PASSES
         ):  # the last events of the servo process, above all that it stopped, are still published

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.client import Client, ClientError, GoalHandle, GoalResult, TimedOutError
+from stereoservo.client import Client, ClientError, GoalHandle, GoalResult
+from stereoservo.daemon.servo import SILENCE
 from stereoservo.kinematics.model import load_model
 from stereoservo.messages.goals import JointTarget, LawName
 from stereoservo.messages.wire import EventMessage, FeaturesMessage
@@ -23,14 +24,28 @@ from stereoservo_sim.demonstration.scenario import (
 
 LOOK_EVERY_S = 2.0
 RECENT_EVENTS = 50
+MOST_HOLDS = 20
 
 
 class LiveDemonstrator:
-    """``scenario.Operator`` as a goal client of a running daemon."""
+    """``scenario.Operator`` as a goal client of a running daemon.
 
-    def __init__(self, client: Client, progress: Callable[[float], None]) -> None:
+    As an operator would, it resumes an arm that was held since a busy computer left the gateway no time, ``MOST_HOLDS``
+    times at most, and tells so; any other hold ends what it waits for.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        progress: Callable[[float], None],
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
         self._client = client
         self._progress = progress
+        self._tell = tell
+        self._looked_s = time.monotonic()
+        self._holds = 0
+        client.while_waiting = self._look
 
     def enable(self) -> None:
         """Enable the arm."""
@@ -87,18 +102,14 @@ class LiveDemonstrator:
 
     def servo(self, target: VisualTarget, law: LawName) -> str:
         """Execute a goal to its end, under a lease."""
-        result = self._ended(self._client.goal(target, law=law, lease_s=2.0))
+        result: GoalResult = self._client.goal(target, law=law, lease_s=2.0).wait()
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
-    def _ended(self, handle: GoalHandle) -> GoalResult:
-        """Wait for a goal's end. Raises ClientError where the cell is held, since nobody would resume it."""
-        while True:
-            try:
-                return handle.wait(LOOK_EVERY_S)
-            except TimedOutError:
-                self._require_not_held()
-
-    def _require_not_held(self) -> None:
+    def _look(self) -> None:
+        """Every ``LOOK_EVERY_S``: whether the cell is held. Raises ClientError where nobody would resume it."""
+        if time.monotonic() - self._looked_s < LOOK_EVERY_S:
+            return
+        self._looked_s = time.monotonic()
         state = self._client.status()
         if not any(reason.code == "HELD" for reason in state.reasons):
             return
@@ -107,12 +118,14 @@ class LiveDemonstrator:
             for event in self._client.events(max(1, state.last_event - RECENT_EVENTS)).events
             if event.kind == "held"
         ]
-        raise ClientError(
-            f"the cell was held and nobody resumed it: {told[-1] if told else 'no event says why'}"
-        )
+        cause = told[-1] if told else "no event says why"
+        self._holds += 1
+        if SILENCE not in cause or self._holds > MOST_HOLDS:
+            raise ClientError(f"the cell was held and nobody resumed it: {cause}")
+        self._tell(f"{cause}: resumed")
+        self._client.resume()
 
     def _reach(self, handle: GoalHandle) -> None:
-        self._ended(handle)
         handle.reached()
 
     def rest(self, seconds: float) -> None:

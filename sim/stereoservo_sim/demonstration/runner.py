@@ -139,7 +139,11 @@ def conduct_live(
             with Client(cell.cell.name) as client:
                 names = tuple(joint.name for joint in client.info().joints)
                 calibrated, outcomes = perform(
-                    LiveDemonstrator(client, stage.progress), names, configurations, stage.tell, goals
+                    LiveDemonstrator(client, stage.progress, stage.tell),
+                    names,
+                    configurations,
+                    stage.tell,
+                    goals,
                 )
                 loop = client.status().loop
             times, positions = log.end()

@@ -7,27 +7,31 @@ from typing import Any
 
 import pytest
 
-from stereoservo.client import ClientError, TimedOutError
-from stereoservo_sim.demonstration.live_demonstrator import LiveDemonstrator
-
-
-class HeldGoal:
-    """A goal that never ends."""
-
-    id = "g1"
-
-    def wait(self, timeout_s: float) -> Any:
-        raise TimedOutError(f"goal g1: nothing within {timeout_s:g} s")
+from stereoservo.client import ClientError
+from stereoservo.daemon.servo import SILENCE
+from stereoservo_sim.demonstration import live_demonstrator
+from stereoservo_sim.demonstration.live_demonstrator import MOST_HOLDS, LiveDemonstrator
 
 
 class HeldCell:
-    """A client of a cell whose ``looks``-th status says that it is held."""
+    """A client, and a goal, of a cell that is held from its ``looks``-th status on; the goal ends where the cell was
+    resumed as often as it is held.
+    """
 
-    def __init__(self, looks: int) -> None:
-        self.looks = looks
+    while_waiting: Any
 
-    def goal(self, target: Any, **options: Any) -> HeldGoal:
-        return HeldGoal()
+    def __init__(self, looks: int, cause: str, holds: int = 1) -> None:
+        self.looks, self.cause, self.left = looks, cause, holds
+
+    def goal(self, target: Any, **options: Any) -> HeldCell:
+        return self
+
+    def reached(self) -> None:
+        while self.left:
+            self.while_waiting()
+
+    def resume(self) -> None:
+        self.left -= 1
 
     def status(self) -> Any:
         self.looks -= 1
@@ -36,13 +40,28 @@ class HeldCell:
 
     def events(self, first: int) -> Any:
         assert first == 1
-        heard = [("held", "first"), ("held", "the gateway was silent for 0.6 s"), ("lifecycle", "other")]
+        heard = [("held", f"held by {SILENCE}"), ("held", self.cause), ("lifecycle", "other")]
         return SimpleNamespace(events=[SimpleNamespace(kind=kind, message=text) for kind, text in heard])
+
+
+@pytest.fixture(autouse=True)
+def _looks_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_demonstrator, "LOOK_EVERY_S", 0.0)
 
 
 @pytest.mark.parametrize("looks", [1, 3])
 def test_a_held_cell_ends_the_demonstration_with_the_cause(looks: int) -> None:
-    cell: Any = HeldCell(looks)
-    with pytest.raises(ClientError, match=r"held.*silent for 0\.6 s"):
+    cell: Any = HeldCell(looks, "held by anna")
+    with pytest.raises(ClientError, match=r"held and nobody resumed it: held by anna"):
         LiveDemonstrator(cell, lambda _: None).move({"j1": 0.0})
     assert cell.looks == 0
+
+
+def test_an_arm_that_a_busy_computer_held_goes_on_and_not_without_end() -> None:
+    told: list[str] = []
+    cell: Any = HeldCell(1, f"held by {SILENCE}", MOST_HOLDS)
+    LiveDemonstrator(cell, lambda _: None, told.append).move({"j1": 0.0})
+    assert told == [f"held by {SILENCE}: resumed"] * MOST_HOLDS
+    cell = HeldCell(1, f"held by {SILENCE}", MOST_HOLDS + 1)
+    with pytest.raises(ClientError, match="said nothing"):
+        LiveDemonstrator(cell, lambda _: None).move({"j1": 0.0})
