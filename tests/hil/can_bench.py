@@ -27,6 +27,20 @@ RESTS_S = 0.2
 STANDS = 2e-4
 """[rad] Rigid bodies that hold their place move less in ``RESTS_S``."""
 RANGE = 0.15
+GRIPPER = """
+[[joints.options.gripper]]
+name = "claw"
+node_id = 9
+counts_per_rev = 1000
+gear_ratio = 100.0
+velocity = 0.1
+acceleration = 0.5
+quick_stop_deceleration = 1.0
+position_min = 0.0
+position_max = 0.08
+
+"""
+"""On a drive of its own; it begins open."""
 
 
 def cell_text(name: str, *, joints: str = "", drives: str = "") -> str:
@@ -43,7 +57,9 @@ def cell_text(name: str, *, joints: str = "", drives: str = "") -> str:
     head = re.sub(r'(?m)^background = "pybullet"', 'background = "plain"', head)
     if drives:
         head = head.replace("[emulate.drives]\n", f"[emulate.drives]\n{drives}\n", 1)
-    if joints:
+    if not joints:
+        head = head.replace("[emulate.drives]\n", f"{GRIPPER}[emulate.drives]\n", 1)
+    else:
         front, cameras = head.index("[joints]"), head.index("[emulate.cameras]")
         head = f"{head[:front]}{joints}\n{head[cameras:]}"
         # On a shared machine a light driver's samples may be late by more than the 0.1 s of a cell.

@@ -102,6 +102,19 @@ def test_stop_brakes_and_the_drives_stay_enabled(bench: CanBench, client: Client
     client.resume()
 
 
+def test_a_gripper_on_a_drive_of_its_own_closes_while_the_arm_is_servoed(
+    bench: CanBench, client: Client
+) -> None:
+    bench.needs_emulated_drives("the gripper is one of them")
+    client.auxiliary({"claw": 0.02})
+    away_and_back(bench, client, "stereo")
+    eventually("closed", lambda: abs(client.status().auxiliary["claw"] - 0.02) < 1e-3)
+    with pytest.raises(RefusedError, match=r"claw: 0\.5"):
+        client.auxiliary({"claw": 0.5})
+    client.auxiliary({"claw": 0.08})
+    eventually("open", lambda: abs(client.status().auxiliary["claw"] - 0.08) < 1e-3)
+
+
 # -- faults that are ordered of the emulated drives -------------------------------------------------------------
 
 
@@ -128,6 +141,7 @@ def falls_into_fault(bench: CanBench, client: Client, order: str, told: str) -> 
         ("reboot 5", "node 5: booted while in use"),
         ("nmt preop 4", "node 4: left operational"),
         ("duplicate 6 boots", "node 6"),
+        ("fault node 9 0x2310", "gripper 'claw' (node 9): 0x2310 over-current"),
     ],
 )
 def test_a_fault_of_a_drive_stops_all_axes_until_reset_and_enable(
