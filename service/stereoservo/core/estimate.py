@@ -40,6 +40,8 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, share_sights
+from stereoservo.core.target.track import present_arrays
+from stereoservo.core.target.track import take_frame as take_frame_of_target
 from stereoservo.core.workspace import LENS_SIZE, Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
@@ -58,9 +60,10 @@ def estimate(context: StepContext) -> StepContext:
     for sighting in context.state.watching.sightings:
         sighting.fresh = False
     for camera, observation in context.ingested.observations:
+        take_frame_of_target(camera, observation, context)
         _fold_frame(camera, observation, context)
     context.observations = tuple([observation for _, observation in context.ingested.observations])
-    arrays, state = context.derived.arrays, context.state
+    arrays, state = present_arrays(context), context.state
     if arrays is None or state.block.numbers.history_count == 0:
         return context
     context.arrays = arrays

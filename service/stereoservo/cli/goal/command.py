@@ -100,7 +100,14 @@ IncidenceOption = Annotated[
     Path | None,
     typer.Option("--incidence", metavar="FILE", help='JSON: {"incidences": […], "secondary": …}.'),
 ]
-FollowFileOption = Annotated[
+FollowFollowMarkersOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="IDS",
+        help="Go with a target that moves: its markers, 14,15,16 (cameras on the arm: of the body that they see).",
+    ),
+]
+FileOption = Annotated[
     str | None,
     typer.Option(
         "--follow",
@@ -174,6 +181,7 @@ def goal(
     displacement: DisplacementOption = None,
     incidence: IncidenceOption = None,
     follow_file: FollowFileOption = None,
+    follow_markers: FollowMarkersOption = None,
     file: FileOption = None,
     law: Annotated[
         str | None,
@@ -232,6 +240,7 @@ def goal(
             gain=_one_gain(gain, adaptive_gain),
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
+            follow_markers=None if follow_markers is None else marker_ids(follow_markers, "--follow-markers"),
         )  # fmt: skip
     if wait and requested.lease_s is None:
         requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
