@@ -100,19 +100,19 @@ IncidenceOption = Annotated[
     Path | None,
     typer.Option("--incidence", metavar="FILE", help='JSON: {"incidences": […], "secondary": …}.'),
 ]
-FollowFollowMarkersOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="IDS",
-        help="Go with a target that moves: its markers, 14,15,16 (cameras on the arm: of the body that they see).",
-    ),
-]
-FileOption = Annotated[
+FollowFileOption = Annotated[
     str | None,
     typer.Option(
         "--follow",
         metavar="FILE|-",
         help='A moving target: JSON lines {"stamp_s": …, "set_points" or "points": …}.',
+    ),
+]
+FollowMarkersOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="IDS",
+        help="Go with a target that moves: its markers, 14,15,16 (cameras on the arm: of the body that they see).",
     ),
 ]
 FileOption = Annotated[Path | None, typer.Option("--file", metavar="FILE", help="A whole goal as JSON.")]

@@ -59,7 +59,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     streamed = follow(source, context, arrays) if source.stream is not None else False
     found = goal_error(source, context, arrays, context.weights, pixels)
     error_px = found.error_px
-    may_end = not streamed and stands(source, context.state.target)
+    may_end = not streamed and (source.followed is None or stands(context.state.target))
     ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=may_end)
     if ended is not None:
         return ended
@@ -96,7 +96,7 @@ def _compiled_step(
     _aim(room, source)
     seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
     error_px = numbers.error_px if numbers.measured else None
-    may_end = stands(source, context.state.target)
+    may_end = source.followed is None or stands(context.state.target)
     ended = run_ended(source, context, error_px, seen, source.wanted, may_end=may_end)
     if ended is not None:
         return ended
@@ -228,7 +228,7 @@ def activate_run(source: LawRun, context: StepContext) -> None:
     source.started_ns = context.now_ns
     source.last_frames = sum(e.frames for e in context.state.cameras)
     source.renew_lease(context.now_ns)
-    if isinstance(source, ServoGoal):
+    if isinstance(source, ServoGoal) and source.goal.follow_markers:
         start_following(source, context)
 
 

@@ -107,8 +107,7 @@ def _stated(
 def start_following(source: ServoGoal, context: StepContext) -> None:
     """A goal that follows a target begins: the target is looked for, where it is not followed already."""
     arrays, state, goal = context.arrays, context.state, source.goal
-    if not goal.follow_markers or arrays is None:
-        return
+    assert arrays is not None
     cameras, body = len(context.settings.cameras), state.target
     reference = IDENTITY.copy()
     if _carried(context):
@@ -133,7 +132,7 @@ def start_following(source: ServoGoal, context: StepContext) -> None:
 
 
 def follow_target(source: ServoGoal, context: StepContext) -> Reason | None:
-    """Bring a goal to where its target is now, with the velocities of its set-points; why it cannot, where it cannot."""
+    """Bring a goal to where its target is now, with the velocities of its set-points; the reason where it cannot."""
     body, arrays, followed = context.state.target, context.arrays, source.followed
     assert arrays is not None
     assert followed is not None
@@ -168,6 +167,6 @@ def _unseen(source: ServoGoal, hint: str, value: float | None = None, limit: flo
     return Reason("TARGET_UNSEEN", "hold", ids, value, limit, "s" if value is not None else "", hint)
 
 
-def stands(source: ServoGoal, body: TargetBody | None) -> bool:
+def stands(body: TargetBody | None) -> bool:
     """Whether a goal's target stands, so that the goal may be reached for good."""
-    return source.followed is None or (body is not None and body.t_ns > 0 and body.still)
+    return body is not None and body.t_ns > 0 and body.still

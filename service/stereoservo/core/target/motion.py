@@ -279,7 +279,9 @@ def compare(
 def gate_sights(
     left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, pose: FloatArray, gate: float
 ) -> tuple[FloatArray, int, int]:
-    """Which of the markers ``seen`` (k,) the pose's covariance ``pose`` (6, 6) explains within a ``gate``, how many these are, and how many were seen."""
+    """Which of the markers ``seen`` (k,) are explained within a ``gate`` by the covariance ``pose`` (6, 6), how many
+    these are, and how many were seen.
+    """
     within, used, count = seen.copy(), 0, 0
     S = np.empty((2, 2))
     for i in range(seen.size):

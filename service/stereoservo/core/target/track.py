@@ -62,7 +62,7 @@ IDENTITY = np.eye(4)
 
 
 def take_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
-    """Follow the target in a frame; the markers of a body that is the target are then where they were at its shutter."""
+    """Follow the target in a frame; a model's body that is the target is then where it was at the shutter."""
     state, arrays = context.state, context.derived.arrays
     body = state.target
     if body is None or arrays is None:
