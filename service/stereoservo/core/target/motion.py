@@ -2,9 +2,10 @@
 covariance, by a Kalman filter on the pixels of its markers.
 
 The pose is a displacement ``D`` (4, 4) of its reference points in the model's frame, whatever that frame is. Twists are
-in a ``basis`` (6, 4, 4) of the displacements that is scaled so that a unit moves the markers by a pixel rms: in it the
-process noise is a multiple of the identity, and every direction is followed as fast as the images show it. The rate of
-the twist is a Gauss-Markov process (Singer 1970): it is followed while images come, and fades when they do not.
+in a ``basis`` (6, 4, 4) of the displacements that is scaled so that a unit moves the markers by a pixel rms. Where the
+model is metric, targets accelerate alike in all directions, and what they do along the rays, which is seen ten times
+less, is followed more slowly; where it is not, they accelerate alike in the images. The rate of the twist is a
+Gauss-Markov process (Singer 1970): it is followed while images come, and fades when they do not.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 FREEDOMS = 6
-ACCELERATION_PX = 120.0
+ACCELERATION_PX = 100.0
 """[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0
@@ -49,7 +50,7 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
 
     By camera: ``seen_ns`` (c,), the shutter of its last frame with enough markers, ``odd_ns`` (c,) of the last one that
     the motion did not explain, 0 where a later one was explained; ``told`` (c,): whether its estimate began anew since
-    the target was found. ``odd``: steps in a row with such frames of all cameras. ``first`` (c, k, 2) [px] with
+    the target was found. ``drift`` (6, 6): how accelerations are spread over the basis. ``odd``: steps in a row with such frames of all cameras. ``first`` (c, k, 2) [px] with
     ``first_seen`` (c, k): sights from which it is found, where it is not yet; ``stated``: ``points`` are known before.
 
     ``mark`` (4, 4): where it was at ``mark_ns``, ``farthest_px`` what its markers moved by since; ``still``: they did
@@ -65,6 +66,7 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
     rate: FloatArray
     covariance: FloatArray
     basis: FloatArray
+    drift: FloatArray
     seen_ns: IntArray
     odd_ns: IntArray
     told: BoolArray
@@ -84,20 +86,25 @@ def target_body(ids: IntArray, points: FloatArray | None, cameras: int, *, carri
     return TargetBody(
         ids=ids, points=np.zeros((k, 4)) if points is None else points.copy(), carried=carried,
         stated=points is not None, displacement=np.eye(4), twist=np.zeros(FREEDOMS), rate=np.zeros(FREEDOMS),
-        covariance=np.zeros((3 * FREEDOMS, 3 * FREEDOMS)), basis=np.zeros((FREEDOMS, 4, 4)),
+        covariance=np.zeros((3 * FREEDOMS, 3 * FREEDOMS)), basis=np.zeros((FREEDOMS, 4, 4)), drift=np.eye(FREEDOMS),
         seen_ns=np.zeros(cameras, np.int64), odd_ns=np.zeros(cameras, np.int64), told=np.zeros(cameras, np.bool_),
         first=np.zeros((cameras, k, 2)), first_seen=np.zeros((cameras, k)), mark=np.eye(4),
     )  # fmt: skip
 
 
-def begin(body: TargetBody, basis: FloatArray, matrices: FloatArray, carrier: FloatArray, t_ns: int) -> bool:
+def begin(
+    body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
+) -> bool:
     """The target is where it is said to be at ``t_ns``, moving no one knows how; whether its markers tell of all six
-    freedoms. ``basis`` (6, 4, 4) of displacements; seen by ``matrices`` (c, 3, 4) through ``carrier`` (4, 4).
+    freedoms. ``basis`` (6, 4, 4) of displacements, in the units of a ``metric`` frame or any; seen by ``matrices`` (c, 3, 4) through ``carrier`` (4, 4).
     """
-    scaled, good = scaled_basis(basis, matrices, carrier, transform_points(body.displacement, body.points))
+    scaled, drift, good = scaled_basis(
+        basis, matrices, carrier, transform_points(body.displacement, body.points)
+    )
     if not good:
         return False
     body.basis[:] = scaled
+    body.drift[:] = drift if metric else np.eye(FREEDOMS)
     body.twist[:], body.rate[:] = 0.0, 0.0
     widen(body, FOUND_PX)
     body.t_ns, body.odd, body.odd_ns[:], body.told[:] = t_ns, 0, 0, False
@@ -107,16 +114,20 @@ def begin(body: TargetBody, basis: FloatArray, matrices: FloatArray, carrier: Fl
 
 def widen(body: TargetBody, pose_px: float) -> None:
     """Its pose is known to ``pose_px``; of its motion nothing is."""
-    deviations = np.repeat((pose_px, SPEED_PX, ACCELERATION_PX), FREEDOMS)
-    body.covariance[:] = np.diag(deviations**2)
+    body.covariance[:] = 0.0
+    for k, block in enumerate(
+        (pose_px**2 * np.eye(FREEDOMS), SPEED_PX**2 * body.drift, ACCELERATION_PX**2 * body.drift)
+    ):
+        body.covariance[FREEDOMS * k : FREEDOMS * (k + 1), FREEDOMS * k : FREEDOMS * (k + 1)] = block
 
 
 @kernel
 def scaled_basis(
     basis: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
-) -> tuple[FloatArray, bool]:
+) -> tuple[FloatArray, FloatArray, bool]:
     """The ``basis`` (6, 4, 4) in combinations of which each moves the pixels of ``points`` (k, 4) by 1 px rms,
-    independently of the others; and whether it could be.
+    independently of the others; the covariance (6, 6) in it of what is spread alike over the former, at 1 px rms; and
+    whether it could be.
     """
     J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points)).reshape(
         (-1, FREEDOMS)
@@ -129,7 +140,9 @@ def scaled_basis(
             for j in range(FREEDOMS):
                 N[i, j] += J[row, i] * J[row, j]
     N /= float(max(count, 1))
-    scaled = np.zeros((FREEDOMS, 4, 4))
+    scaled, drift, trace = np.zeros((FREEDOMS, 4, 4)), np.eye(FREEDOMS), 0.0
+    for i in range(FREEDOMS):
+        trace += N[i, i] / FREEDOMS
     # N = L Lᵀ; twists T = L⁻ᵀ have Tᵀ N T = 1.
     L = np.zeros((FREEDOMS, FREEDOMS))
     for i in range(FREEDOMS):
@@ -139,7 +152,7 @@ def scaled_basis(
                 total -= L[i, k] * L[j, k]
             if i == j:
                 if not total > 1e-12 * N[i, i]:
-                    return scaled, False
+                    return scaled, drift, False
                 L[i, i] = math.sqrt(total)
             else:
                 L[i, j] = total / L[j, j]
@@ -154,7 +167,12 @@ def scaled_basis(
             for a in range(4):
                 for b in range(4):
                     scaled[k, a, b] += column[i] * basis[i, a, b]
-    return scaled, True
+    for i in range(FREEDOMS):  # Lᵀ L
+        for j in range(FREEDOMS):
+            drift[i, j] = 0.0
+            for k in range(FREEDOMS):
+                drift[i, j] += L[k, i] * L[k, j] / trace
+    return scaled, drift, True
 
 
 @kernel
@@ -200,8 +218,9 @@ def after(
 
 @kernel
 def elapse(
-    D: FloatArray, basis: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray, dt_s: float
-) -> None:
+    D: FloatArray, basis: FloatArray, drift: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray,
+    dt_s: float,
+) -> None:  # fmt: skip
     """The state ``dt_s`` later, in place: pose ``D`` (4, 4), ``twist`` and ``rate`` (6,), ``covariance`` (18, 18)."""
     n = FREEDOMS
     fade = math.exp(-dt_s / ACCELERATION_S)
@@ -221,7 +240,7 @@ def elapse(
         for b in range(3):
             for i in range(n):
                 for j in range(n):
-                    total = Q[a, b] if i == j else 0.0
+                    total = Q[a, b] * drift[i, j]
                     for c in range(a, 3):
                         for d in range(b, 3):
                             total += F[a, c] * F[b, d] * before[c * n + i, d * n + j]

@@ -159,11 +159,11 @@ def _find(
     arrays: ModelArrays,
 ) -> None:  # fmt: skip
     """Find the target by this frame, and those before of the other cameras."""
-    basis = displacements_of(arrays)
+    basis, metric = displacements_of(arrays), arrays.metric_basis is not None
     if basis is None:
         return
     if body.carried:
-        begin(body, basis, arrays.matrices, carrier, t_ns)
+        begin(body, basis, metric, arrays.matrices, carrier, t_ns)
         return
     body.first[camera], body.first_seen[camera], body.seen_ns[camera] = sights, seen, t_ns
     shown = body.first_seen * (np.abs(body.seen_ns - t_ns) <= TOGETHER_NS)[:, None]
@@ -174,7 +174,7 @@ def _find(
         if int(known.sum()) < FEWEST_TO_FIND:
             return
         _keep(body, known > 0.0, points)
-        begin(body, basis, arrays.matrices, carrier, t_ns)
+        begin(body, basis, metric, arrays.matrices, carrier, t_ns)
         return
     if int((shown.max(axis=0) > 0.0).sum()) < FEWEST:
         return
@@ -182,7 +182,7 @@ def _find(
     if rest > FOUND_REST_PX:
         return
     body.displacement[:] = D
-    begin(body, basis, arrays.matrices, carrier, t_ns)
+    begin(body, basis, metric, arrays.matrices, carrier, t_ns)
 
 
 def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], points: FloatArray) -> None:
@@ -217,7 +217,7 @@ def _follow(
     assert arrays is not None
     dt_s = (t_ns - body.t_ns) * 1e-9
     if dt_s > 0.0:
-        elapse(body.displacement, body.basis, body.twist, body.rate, body.covariance, dt_s)
+        elapse(body.displacement, body.basis, body.drift, body.twist, body.rate, body.covariance, dt_s)
         body.t_ns = t_ns
     pose = pose_at(body, t_ns)[0]
     left, J = compare(
