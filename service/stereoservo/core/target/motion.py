@@ -50,8 +50,9 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
 
     By camera: ``seen_ns`` (c,), the shutter of its last frame with enough markers, ``odd_ns`` (c,) of the last one that
     the motion did not explain, 0 where a later one was explained; ``told`` (c,): whether its estimate began anew since
-    the target was found. ``drift`` (6, 6): how accelerations are spread over the basis. ``odd``: steps in a row with such frames of all cameras. ``first`` (c, k, 2) [px] with
-    ``first_seen`` (c, k): sights from which it is found, where it is not yet; ``stated``: ``points`` are known before.
+    the target was found. ``drift`` (6, 6): how accelerations are spread over the basis. ``odd``: steps in a row with
+    such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): sights from which it is found,
+    where it is not yet; ``stated``: ``points`` are known before.
 
     ``mark`` (4, 4): where it was at ``mark_ns``, ``farthest_px`` what its markers moved by since; ``still``: they did
     not in the time before.
@@ -96,7 +97,8 @@ def begin(
     body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
 ) -> bool:
     """The target is where it is said to be at ``t_ns``, moving no one knows how; whether its markers tell of all six
-    freedoms. ``basis`` (6, 4, 4) of displacements, in the units of a ``metric`` frame or any; seen by ``matrices`` (c, 3, 4) through ``carrier`` (4, 4).
+    freedoms. ``basis`` (6, 4, 4) of displacements, in the units of a ``metric`` frame or any; seen by ``matrices``
+    (c, 3, 4) through ``carrier`` (4, 4).
     """
     scaled, drift, good = scaled_basis(
         basis, matrices, carrier, transform_points(body.displacement, body.points)
