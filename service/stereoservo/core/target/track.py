@@ -244,7 +244,7 @@ def _explained(
     pose = np.ascontiguousarray(body.covariance[:FREEDOMS, :FREEDOMS])
     within, used, count = gate_sights(left, J, variances, seen, pose, gate)
     if used >= FEWEST and 2 * used > count:
-        return within  # type: ignore[no-any-return]
+        return within
     if float((left * left).sum()) <= 2.0 * count * SMALL_PX**2:
         return seen
     return None
