@@ -116,6 +116,10 @@ FollowMarkersOption = Annotated[
     ),
 ]
 FileOption = Annotated[Path | None, typer.Option("--file", metavar="FILE", help="A whole goal as JSON.")]
+LawOption = Annotated[
+    str | None,
+    typer.Option(help=f"Installed here: {', '.join(plugins.names(plugins.LAWS))} (default: the cell's)."),
+]
 PointSourceOption = Annotated[
     str | None, typer.Option(help="Where points come from: triangulated or predicted.")
 ]
@@ -183,10 +187,7 @@ def goal(
     follow_file: FollowFileOption = None,
     follow_markers: FollowMarkersOption = None,
     file: FileOption = None,
-    law: Annotated[
-        str | None,
-        typer.Option(help=f"Installed here: {', '.join(plugins.names(plugins.LAWS))} (default: the cell's)."),
-    ] = None,
+    law: LawOption = None,
     point_source: PointSourceOption = None,
     jacobian: JacobianOption = None,
     centre: CentreOption = None,
