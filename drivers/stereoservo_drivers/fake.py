@@ -245,10 +245,10 @@ class FakeCameraDriver(SimulatedCamera):
 
     def _without_noise(self, camera: PinholeCamera, q: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (k, 2) of the body's markers, and which of them are seen (k,): of an arm at rest those of before."""
-        view = (q.tobytes(), self.camera, self.focus)
-        if not self._view or self._view[:3] != view:
+        view = (q.tobytes(), self.camera, self.focus, self.cell)
+        if not self._view or self._view[:4] != view:
             self._view = (*view, self._image_of(camera, q), self.cell.visible(q, camera))
-        return self._view[3].copy(), self._view[4].copy()
+        return self._view[4].copy(), self._view[5].copy()
 
     def _image_of(self, camera: PinholeCamera, q: FloatArray) -> FloatArray:
         return self.cell.in_world(camera, q).image_of(self.cell.marker_positions(q))[0]

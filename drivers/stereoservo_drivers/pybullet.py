@@ -106,6 +106,7 @@ class PybulletCameraDriver(SimulatedCamera):
         assert self._renderer is not None  # active: the lifecycle was checked
         if self._renderer.camera is not self.camera:  # it was bumped
             self._renderer = self._redraw()
+        self._renderer.cell = self.cell  # what it shows may move
         return Frame(
             camera=self.name,
             seq=seq,

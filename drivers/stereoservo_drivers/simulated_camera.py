@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from dataclasses import replace
 from typing import Annotated, Literal, NamedTuple
 
 import msgspec
@@ -15,7 +16,7 @@ from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.simulated_arm import cell_of_context
 from stereoservo_sim.world.history import FILE_NAME, HistoryError, TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell, workpiece_cell
-from stereoservo_sim.world.workpiece import Moved, MovedFile, MovedFileError
+from stereoservo_sim.world.workpiece import Moved, MovedFile, MovedFileError, moved_pose
 
 NonNegative = Annotated[float, Meta(ge=0)]
 HOLD_NS = 100_000_000
@@ -54,8 +55,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole. ``moved``: how far the
     camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
     what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: there
-    is one beside the body; the file ``simulated-workpiece.json`` there has its pose for every frame
-    (`stereoservo_sim.world.workpiece`).
+    is one beside the body; the file ``simulated-workpiece.json`` there has its pose or motion for every frame
+    (`stereoservo_sim.world.workpiece`), and with cameras on the arm that of the body.
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
     ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
     after activation without frames; ``freeze_after_s``: from then on the picture stands still though frames keep
@@ -96,7 +97,7 @@ class SimulatedCamera:
 
     def __init__(self, options: CameraOptions, context: DriverContext) -> None:
         self.name = context.camera
-        self.cell = _cell_of(options, context, self.driver)
+        self.cell = self._cell = _cell_of(options, context, self.driver)
         self._options = options
         self._context = context
         view = options.view or context.camera
@@ -135,6 +136,7 @@ class SimulatedCamera:
         self._frozen: FloatArray | None = None
         self._workpiece = MovedFile(context.runtime_dir)
         self._workpiece_pose: FloatArray | None = None
+        self._target_moved, self._moved_ns = Moved(), 0
         self.focus = 1.0
         """Focal length over its mean."""
         self.blackout = False
@@ -210,7 +212,7 @@ class SimulatedCamera:
         q = self._arm_at(t_shutter_ns, now_ns)
         if q is None:
             return []
-        self._workpiece_pose = self._workpiece_at(t_shutter_ns)
+        self._move_target(t_shutter_ns)
         if not self._stands_still(t_shutter_ns):
             self._stand(t_shutter_ns)
             since = (t_shutter_ns - self._activated_ns) * 1e-9
@@ -279,15 +281,23 @@ class SimulatedCamera:
         after = self._options.freeze_after_s
         return after is not None and (t_ns - self._activated_ns) * 1e-9 >= after
 
-    def _workpiece_at(self, t_ns: int) -> FloatArray | None:
-        """Pose of the workpiece for a frame taken now. Raises DriverError."""
-        part = self.cell.workpiece
-        if part is None or (self._stands_still(t_ns) and self._workpiece_pose is not None):
-            return self._workpiece_pose
+    def _move_target(self, t_ns: int) -> None:
+        """Put what moves by itself, the workpiece or, before cameras on the arm, the body, where it is at ``t_ns``.
+        Raises DriverError.
+        """
+        part, stand = self._cell.workpiece, self._cell.stand
+        if (part is None and stand is None) or (self._stands_still(t_ns) and self._moved_ns):
+            return
         try:
-            return part.pose(self._workpiece.now())
+            moved = self._workpiece.now(t_ns=t_ns)
         except MovedFileError as error:
             raise DriverError("workpiece", str(error), path=str(self._workpiece.path)) from error
+        self._moved_ns = t_ns
+        if part is not None:
+            self._workpiece_pose = part.pose(moved)
+        elif stand is not None and moved != self._target_moved:
+            self._target_moved = moved
+            self.cell = replace(self._cell, stand=moved_pose(stand, moved))
 
     def _open_history(self, now_ns: int) -> TrueJointHistory | None:
         shared = self._context.services.get("world")

@@ -144,3 +144,16 @@ def test_a_goal_as_taught_needs_no_sight(bench: Bench) -> None:
     assert isinstance(found.target, FeatureTarget)
     assert found.target.model_epoch == MODEL.epoch
     assert msgspec.json.encode(found.target)
+
+
+def test_a_goal_that_follows_a_target_gets_where_its_markers_were_when_it_was_taught(bench: Bench) -> None:
+    body, work = placed(BODY, HAND), placed(WORK, TABLE)
+    bench.taught(body | work)
+    asked, views = (min(work), max(work), 999), Cameras().pixels(work)
+    seen = bench.teaching.seen_when_taught(TaughtTarget("pick"), asked)
+    assert sorted(seen) == sorted(views)
+    for name, pixels in seen.items():
+        assert sorted(pixels) == [min(work), max(work)]
+        for marker, pixel in pixels.items():
+            np.testing.assert_allclose(pixel, views[name][marker], atol=1e-6)
+    assert bench.teaching.seen_when_taught(TaughtTarget("pick"), tuple(body)) == {}

@@ -320,3 +320,18 @@ def test_any_points_get_an_answer(points: dict[int, Any]) -> None:
     found = check_goal(Goal("12345678", PointTarget(points, 1)), RICH)
     if len(points) < 3 or set(points) - set(range(6)) or not all(any(point) for point in points.values()):
         assert found
+
+
+def test_markers_of_a_target_that_moves_go_with_goals_that_fix_a_pose() -> None:
+    goal = Goal("00000001", FeatureTarget({"left": GOOD, "right": GOOD}), follow_markers=(14, 15, 16, 17, 18))
+    assert check_goal(goal, CONTEXT) == []
+    seen = {"middle": {14: (1.0, 2.0)}, "left": {14: (1.0, 2.0), 19: (1.0, 2.0)}}
+    (camera, marker) = check_goal(msgspec.structs.replace(goal, follow_seen=seen), CONTEXT)
+    assert camera == "follow_seen: no camera 'middle'; cameras: left, right"
+    assert marker == "follow_seen.left: 19 not in follow_markers 14, 15, 16, 17, 18"
+    (twice,) = check_goal(msgspec.structs.replace(goal, follow_markers=(14, 14, 15, 16, 17)), CONTEXT)
+    assert twice == "follow_markers: 14 stands twice"
+    taught = Goal("00000002", TaughtTarget("pick", relative_to="workpiece"), follow_markers=(14,))
+    assert any("leave out relative_to 'workpiece'" in problem for problem in check_goal(taught, CONTEXT))
+    joints = Goal("00000003", JointTarget({}), follow_markers=(14,))
+    assert any("follows nothing that is seen" in problem for problem in check_goal(joints, CONTEXT))

@@ -40,6 +40,7 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, share_sights
+from stereoservo.core.target import track
 from stereoservo.core.workspace import LENS_SIZE, Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.status import ModelReadiness
@@ -58,13 +59,15 @@ def estimate(context: StepContext) -> StepContext:
     for sighting in context.state.watching.sightings:
         sighting.fresh = False
     for camera, observation in context.ingested.observations:
+        if context.state.target is not None:
+            track.take_frame(camera, observation, context)
         _fold_frame(camera, observation, context)
     context.observations = tuple([observation for _, observation in context.ingested.observations])
-    arrays, state = context.derived.arrays, context.state
+    state = context.state
+    arrays = context.derived.arrays if state.target is None else track.present_arrays(context)
     if arrays is None or state.block.numbers.history_count == 0:
         return context
-    context.arrays = arrays
-    room = context.derived.room
+    context.arrays, room = arrays, context.derived.room
     present(state.block.record, room.record, context.q, context.now_ns)
     context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
     if any(state.mobile):

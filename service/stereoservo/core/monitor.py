@@ -62,6 +62,7 @@ from stereoservo.core.prediction import (
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
 from stereoservo.core.state import CalibrationMotion, CoreState
+from stereoservo.core.target.track import beside_target
 from stereoservo.core.workspace import Workspace
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
@@ -456,7 +457,8 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     verdict = NOISE
     if odd and not _all_late(_cameras(odd), watching, context.settings):
         bench = bench_now(watching, _cameras(looked_at), arrays, context.settings)
-        verdict = diagnosed_beside_joint_errors(bench, proven=state.reanchoring is not None)
+        found = diagnosed_beside_joint_errors(bench, proven=state.reanchoring is not None)
+        verdict = beside_target(found, state)
     watching.last = [*watching.last[1 - OF :], verdict]
     if masked:
         unmask_returned(watching, _cameras(looked_at), context)

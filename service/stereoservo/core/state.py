@@ -22,6 +22,7 @@ from stereoservo.core.monitor_state import (
     nothing_sighted,
 )
 from stereoservo.core.settings import CoreSettings
+from stereoservo.core.target.motion import TargetBody
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Goal, Request
 from stereoservo.messages.reasons import Reason
@@ -30,7 +31,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
-STATE_VERSION = 10
+STATE_VERSION = 11
 LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
 
 
@@ -153,6 +154,17 @@ class LawRun(Leased, eq=False, kw_only=True):
     watch: ProgressHistory = msgspec.field(default_factory=ProgressHistory)
 
 
+class Followed(msgspec.Struct, eq=False, kw_only=True):
+    """Of a goal that follows a target: the displacement ``reference`` (4, 4) of the target at which its ``set_points``
+    (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,) hold.
+    """
+
+    reference: FloatArray
+    set_points: FloatArray
+    target_points: FloatArray
+    centre_target: FloatArray
+
+
 class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
     """A law drives the arm to set-points.
 
@@ -183,6 +195,7 @@ class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
     plan_s: float = 0.0
     start_points: FloatArray | None = None
     goal_joints: FloatArray | None = None
+    followed: Followed | None = None
 
 
 class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):
@@ -401,6 +414,8 @@ class CoreState(msgspec.Struct, eq=False):
     adjusted: tuple[str, ...]
     """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
     friction: FrictionCompensation | None = None  # while nothing works on a goal
+    target: TargetBody | None = None
+    """What moves by itself and is followed; None before a goal has named it."""
 
     @property
     def history(self) -> JointHistory:

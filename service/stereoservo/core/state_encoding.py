@@ -90,7 +90,7 @@ def _as_of_now(state: dict[str, Any]) -> dict[str, Any]:
     """A state with what it holds, in the places of this version."""
     if state["version"] < 7:
         state["stop_reason"] = None
-    return state if state["version"] == STATE_VERSION else state | {"block": _block_of(state)}
+    return state if state["version"] >= 10 else state | {"block": _block_of(state)}
 
 
 BEFORE_VERSION_10 = {
@@ -141,6 +141,8 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
     midst of trial motions, whose course is another one now.
     """
+    if version >= 10:
+        return state | {"version": STATE_VERSION}
     if version < 9 and state["source"]["type"] == "trials":
         raise StateVersionError(version)
     if version == 6:  # before stamps and gaps of the loop were checked

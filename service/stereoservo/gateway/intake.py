@@ -167,12 +167,13 @@ class Intake:
             if not isinstance(goal.target, TaughtTarget):
                 return goal
             resolved = self._teaching.resolve(goal.target)
+            seen = self._teaching.seen_when_taught(goal.target, goal.follow_markers)
         except TransferError as error:
             raise _Answered(
                 self._refused("the goal cannot be placed now", f"target: {error}", goal=goal.id)
             ) from error
         self._note = resolved.note
-        goal = msgspec.structs.replace(goal, target=resolved.target)
+        goal = msgspec.structs.replace(goal, target=resolved.target, follow_seen=goal.follow_seen or seen)
         self._require(
             check_goal(goal, self._context()), "the taught goal does not fit the cell any more", goal.id
         )

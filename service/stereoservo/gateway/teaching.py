@@ -20,7 +20,7 @@ from stereoservo.gateway.persistence import TaughtStore
 from stereoservo.gateway.point_alignment import TransferError
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import Feature, IncidenceTarget, TaughtTarget
+from stereoservo.messages.goals import Feature, IncidenceTarget, MarkerId, Pixel, TaughtTarget
 from stereoservo.messages.wire import Synthesise
 
 KNOWN_TOOLS = 100
@@ -83,6 +83,19 @@ class TaughtGoalRegistry:
     def resolve(self, target: TaughtTarget) -> TransferredGoal:
         """Set-points of a taught goal. Raises KeyError, TransferError."""
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
+
+    def seen_when_taught(
+        self, target: TaughtTarget, markers: tuple[MarkerId, ...]
+    ) -> dict[str, dict[int, Pixel]]:
+        """Raw pixels of those of the ``markers`` that are not on the body, by camera, when it was taught. Raises
+        KeyError.
+        """
+        others = self._store.goals[target.name].others
+        seen = {
+            camera: {marker: pixels[marker] for marker in markers if marker in pixels}
+            for camera, pixels in others.items()
+        }
+        return {camera: pixels for camera, pixels in seen.items() if pixels}
 
     def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
         """Incidences with static markers replaced by their current pixels. Raises TransferError."""

@@ -73,6 +73,7 @@ def _check_options(goal: Goal, context: GoalContext) -> list[str]:
         problems += _check_law(goal, settings)
     problems += _check_cameras(goal, settings)
     problems += _check_centre(goal, context)
+    problems += _check_following(goal, settings)
     if isinstance(goal.gain, AdaptiveGain) and not goal.gain.near > goal.gain.far:
         problems.append(
             f"gain: near {goal.gain.near:g} is not above far {goal.gain.far:g}; an adaptive gain falls with the error "
@@ -81,8 +82,37 @@ def _check_options(goal: Goal, context: GoalContext) -> list[str]:
     return problems + _check_handover(goal, settings)
 
 
+def _check_following(goal: Goal, settings: CoreSettings) -> list[str]:
+    ids, problems = goal.follow_markers, []
+    if goal.follow_seen and not ids:
+        problems.append("follow_seen: says where markers of a target are; name them in follow_markers, too")
+    if not ids:
+        return problems
+    if isinstance(goal.target, IncidenceTarget):
+        problems.append(
+            "follow_markers: go with targets that fix a pose; an incidence holds where it was sent"
+        )
+    if isinstance(goal.target, TaughtTarget) and goal.target.relative_to is not None:
+        problems.append(
+            f"follow_markers: carry the goal over by themselves; leave out relative_to {goal.target.relative_to!r}"
+        )
+    problems += [
+        f"follow_markers: {marker} stands twice" for marker in sorted({i for i in ids if ids.count(i) > 1})
+    ]
+    names = [camera.name for camera in settings.cameras]
+    for name, seen in goal.follow_seen.items():
+        if name not in names:
+            problems.append(f"follow_seen: no camera {name!r}; cameras: {listed(names)}")
+        others = [marker for marker in seen if marker not in ids]
+        if others:
+            problems.append(f"follow_seen.{name}: {listed(others)} not in follow_markers {listed(ids)}")
+    return problems
+
+
 def _not_with_joints(goal: Goal) -> list[str]:
     problems = []
+    if goal.follow_markers or goal.follow_seen:
+        problems.append("follow_markers: a target of joints follows nothing that is seen; leave it out")
     for field in LAW_FIELDS:
         value = getattr(goal, field)
         if value is not None:

@@ -168,6 +168,10 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``blend_px``: hand over to the next queued goal as soon as the error is below it, without stopping; without one it
     is reached as usual. ``acknowledge_s``: reached, the arm holds there and the queue waits until a client
     acknowledges (a gripper has closed), at most so long; then, and where it is not reached, the queue is cancelled.
+
+    ``follow_markers``: of a target that moves by itself, which the goal goes with. Cameras on the arm: of the body that
+    they see; else of another body, five or more. ``follow_seen``: for each camera, where these markers are (raw pixels)
+    when the target stands where the goal's set-points hold; none: where they are when it begins.
     """
 
     id: GoalId
@@ -188,6 +192,8 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mode: Literal["preempt", "queue"] = "preempt"
     blend_px: Pixels | None = None
     acknowledge_s: Duration | None = None
+    follow_markers: tuple[MarkerId, ...] = ()
+    follow_seen: dict[str, dict[int, Pixel]] = {}
     check: bool = False
 
 

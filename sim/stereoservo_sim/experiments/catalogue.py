@@ -160,6 +160,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(3),),
         ),
         Experiment(
+            "moving-targets",
+            "targets that slide and swing, followed by cameras on the arm and before cameras that stand",
+            "laws.moving_targets",
+            (repetitions(3),),
+        ),
+        Experiment(
             "singularities",
             "goals from wrist, elbow and shoulder singularities by every law: reached, refused, time-outs",
             "laws.singularities",

@@ -1,12 +1,14 @@
 """The simulated workpiece: a plate of two small faces beside the marker body, static until it is moved on request.
 
-Its present pose is in a file in the cell's runtime directory, so that a shell, a test or a demonstration can
-move it while the cell runs, whichever processes its cameras live in.
+Its present pose, or its motion, is in a file in the cell's runtime directory, so that a shell, a test or a
+demonstration can move it while the cell runs, whichever processes its cameras live in. With cameras on the arm the same
+file moves the marker body that they look at.
 """
 
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -52,6 +54,30 @@ class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return pose
 
 
+class Motion(Moved, frozen=True, forbid_unknown_fields=True):
+    """A displacement that goes on: at ``velocity_m_s``, turning at ``turn_rate_deg_s``, and swinging along ``swing_m``
+    at ``swing_hz``, from the monotonic time ``since_ns`` on (None: from when its file was written), for ``for_s``.
+    """
+
+    velocity_m_s: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    turn_rate_deg_s: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
+    swing_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    swing_hz: Annotated[float, Meta(ge=0, le=10)] = 0.0
+    since_ns: int | None = None
+    for_s: Annotated[float, Meta(gt=0)] | None = None
+
+    def at(self, t_ns: int) -> Moved:
+        """The displacement at ``t_ns``."""
+        elapsed_s = max(0.0, (t_ns - (self.since_ns or 0)) * 1e-9)
+        elapsed_s = elapsed_s if self.for_s is None else min(elapsed_s, self.for_s)
+        swing = float(np.sin(2.0 * np.pi * self.swing_hz * elapsed_s))
+        shift = (
+            np.array(self.shift_m) + elapsed_s * np.array(self.velocity_m_s) + swing * np.array(self.swing_m)
+        )
+        turn = np.array(self.turn_deg) + elapsed_s * np.array(self.turn_rate_deg_s)
+        return Moved(tuple(shift.tolist()), tuple(turn.tolist()))
+
+
 @dataclass(frozen=True, eq=False)
 class Workpiece:
     """The workpiece. ``body``: its faces in its own frame; ``stand`` (4, 4): its initial pose in the world."""
@@ -61,15 +87,20 @@ class Workpiece:
 
     def pose(self, moved: Moved) -> FloatArray:
         """Pose (4, 4) in the world, rotated about its own centre by world axes and translated."""
-        displacement = moved.matrix
-        pose = self.stand.copy()
-        pose[:3, :3] = displacement[:3, :3] @ self.stand[:3, :3]
-        pose[:3, 3] += displacement[:3, 3]
-        return pose
+        return moved_pose(self.stand, moved)
 
     def marker_positions(self, pose: FloatArray) -> FloatArray:
         """Markers in the world at ``pose`` (4, 4), (m, 3) [m], rows as ``body.ids``."""
         return self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def moved_pose(stand: FloatArray, moved: Moved) -> FloatArray:
+    """The pose ``stand`` (4, 4) rotated about its own origin by the world's axes and translated."""
+    displacement = moved.matrix
+    pose = stand.copy()
+    pose[:3, :3] = displacement[:3, :3] @ stand[:3, :3]
+    pose[:3, 3] += displacement[:3, 3]
+    return pose
 
 
 def plate_body(tilt: float = TILT) -> MarkerBody:
@@ -95,29 +126,43 @@ class MovedFile:
     def __init__(self, runtime_dir: Path, name: str = FILE_NAME) -> None:
         self.path = runtime_dir / name
         self._seen: tuple[int, int, int] | None = None
-        self._moved = Moved()
+        self._moved: Moved = Moved()
 
     def write(self, moved: Moved) -> None:
-        """Write a displacement atomically; it acts from the next shutter on. Raises OSError, ValueError."""
+        """Write a displacement or motion atomically; it acts from the next shutter on. Raises OSError, ValueError."""
         if not np.isfinite(moved.matrix).all():
             raise ValueError(f"{moved} is no displacement")
         fresh = self.path.with_name(f"{self.path.name}.{os.getpid()}")
         fresh.write_bytes(msgspec.json.encode(moved) + b"\n")
         fresh.replace(self.path)
 
-    def now(self, otherwise: Moved = Moved()) -> Moved:  # noqa: B008 - frozen
-        """Present displacement; ``otherwise`` where there is no file. Raises MovedFileError."""
+    def now(self, otherwise: Moved = Moved(), t_ns: int | None = None) -> Moved:  # noqa: B008 - frozen
+        """Present displacement, of a motion at ``t_ns``; ``otherwise`` where there is no file. Raises
+        MovedFileError.
+        """
         try:
             status = self.path.stat()
             seen = (status.st_ino, status.st_mtime_ns, status.st_size)
             if seen != self._seen:
-                self._moved = msgspec.json.decode(self.path.read_bytes(), type=Moved)
+                self._moved = self._read(status.st_mtime_ns)
                 self._seen = seen
         except FileNotFoundError:
             self._seen = None
             return otherwise
         except Exception as error:  # a decoder may raise anything
             raise MovedFileError(
-                f'{self.path}: {error}; such a file holds {{"shift_m": [x, y, z], "turn_deg": [x, y, z]}}'
+                f'{self.path}: {error}; such a file holds {{"shift_m": [x, y, z], "turn_deg": [x, y, z]}}, and of a '
+                'workpiece that goes on "velocity_m_s", "turn_rate_deg_s", or "swing_m" with "swing_hz"'
             ) from error
+        if isinstance(self._moved, Motion) and t_ns is not None:
+            return self._moved.at(t_ns)
         return self._moved
+
+    def _read(self, written_ns: int) -> Moved:
+        motion = msgspec.json.decode(self.path.read_bytes(), type=Motion)
+        if not any((*motion.velocity_m_s, *motion.turn_rate_deg_s, motion.swing_hz)):
+            return Moved(motion.shift_m, motion.turn_deg)
+        if motion.since_ns is not None:
+            return motion
+        elapsed_ns = max(0, time.time_ns() - written_ns)
+        return msgspec.structs.replace(motion, since_ns=time.monotonic_ns() - elapsed_ns)

@@ -108,7 +108,18 @@ FollowFileOption = Annotated[
         help='A moving target: JSON lines {"stamp_s": …, "set_points" or "points": …}.',
     ),
 ]
+FollowMarkersOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="IDS",
+        help="Go with a target that moves: its markers, 14,15,16 (cameras on the arm: of the body that they see).",
+    ),
+]
 FileOption = Annotated[Path | None, typer.Option("--file", metavar="FILE", help="A whole goal as JSON.")]
+LawOption = Annotated[
+    str | None,
+    typer.Option(help=f"Installed here: {', '.join(plugins.names(plugins.LAWS))} (default: the cell's)."),
+]
 PointSourceOption = Annotated[
     str | None, typer.Option(help="Where points come from: triangulated or predicted.")
 ]
@@ -174,11 +185,9 @@ def goal(
     displacement: DisplacementOption = None,
     incidence: IncidenceOption = None,
     follow_file: FollowFileOption = None,
+    follow_markers: FollowMarkersOption = None,
     file: FileOption = None,
-    law: Annotated[
-        str | None,
-        typer.Option(help=f"Installed here: {', '.join(plugins.names(plugins.LAWS))} (default: the cell's)."),
-    ] = None,
+    law: LawOption = None,
     point_source: PointSourceOption = None,
     jacobian: JacobianOption = None,
     centre: CentreOption = None,
@@ -231,6 +240,7 @@ def goal(
             gain=_one_gain(gain, adaptive_gain),
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
+            follow_markers=None if follow_markers is None else marker_ids(follow_markers, "--follow-markers"),
         )  # fmt: skip
     if wait and requested.lease_s is None:
         requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)

@@ -15,6 +15,7 @@ from stereoservo.core.goals.resolve import camera_index, marker_indices, normali
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
 from stereoservo.core.state import GoalResolution, ServoGoal
+from stereoservo.core.target.follow import require_followable
 from stereoservo.kinematics.kernels import invert4, transform_points
 from stereoservo.messages.goals import AdaptiveGain, Centre, Goal, JacobianName, LawName, PlanReport
 from stereoservo.numerics.arrays import FloatArray
@@ -45,6 +46,8 @@ def start_servoing(goal: Goal, aim: GoalResolution, context: StepContext) -> Ser
     arrays, model = context.arrays, context.state.model
     assert arrays is not None
     assert model is not None
+    if goal.follow_markers:
+        require_followable(goal, LAWS[name].follows_streams, name, aim.pose_known, context)
     weights, body, centre_target = _centre(goal.centre, aim, arrays, model.epoch)
     return ServoGoal(
         **run_fields(goal, context, used_cameras(goal, aim.wanted, context)),

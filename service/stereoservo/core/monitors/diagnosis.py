@@ -22,6 +22,7 @@ from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import MODEL_SIGMA_PX, camera_chi2, improbable
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
+from stereoservo.core.target.track import restart
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import ModelReadiness
 
@@ -39,6 +40,7 @@ def start_model_monitor(
         if marker in arrays.index:
             watching.masked[arrays.index[marker]] = 1.0
     state.watching = watching
+    restart(state, arrays)
 
 
 def emit_diagnosis(verdict: ModelDiagnosis, context: StepContext) -> None:

@@ -22,6 +22,7 @@ from stereoservo.core.prediction import body_points, centre_into, centre_of, sce
 from stereoservo.core.sources.progress import Traits, examine_progress
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
+from stereoservo.core.target.follow import follow_target, stands, start_following
 from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
@@ -40,6 +41,10 @@ SELF_MOTION_RATE = 0.5
 def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     """One step of a law: error, joint velocity, and whether the goal is reached or out of time."""
     law = context.derived.laws[source.law]
+    if source.followed is not None:
+        waits = follow_target(source, context)
+        if waits is not None:
+            return SourceOutput(np.zeros_like(context.q), needs_features=True, reasons=(waits,))
     if (
         law.kernel is not None
         and source.stream is None
@@ -54,7 +59,8 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     streamed = follow(source, context, arrays) if source.stream is not None else False
     found = goal_error(source, context, arrays, context.weights, pixels)
     error_px = found.error_px
-    ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=not streamed)
+    may_end = not streamed and (source.followed is None or stands(context.state.target))
+    ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=may_end)
     if ended is not None:
         return ended
     scene, task = choose(source, context, *scene_and_task(source, context, arrays, found))
@@ -72,7 +78,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
         velocity = velocity_of(step, len(context.q))
     except Exception as error:  # whatever a third party's law raises ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
-    if streamed:
+    if streamed or source.followed is not None:
         velocity = velocity + feed_forward(source, context, found.usable * source.wanted)
     if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has kept off the limits itself
         velocity = velocity + away_from_limits(context)
@@ -90,7 +96,8 @@ def _compiled_step(
     _aim(room, source)
     seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
     error_px = numbers.error_px if numbers.measured else None
-    ended = run_ended(source, context, error_px, seen, source.wanted)
+    may_end = source.followed is None or stands(context.state.target)
+    ended = run_ended(source, context, error_px, seen, source.wanted, may_end=may_end)
     if ended is not None:
         return ended
     if source.pose_known and (context.observations or source.choice.cameras == 0):
@@ -105,6 +112,8 @@ def _compiled_step(
         return _law_failed(source, context, error_px, error)
     step = _found_step(room, len(law.components))
     velocity = step.velocity
+    if source.followed is not None:
+        velocity = velocity + feed_forward(source, context, room.arrays["usable"] * source.wanted)
     if len(velocity) > RIGID_FREEDOMS:
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
@@ -219,6 +228,8 @@ def activate_run(source: LawRun, context: StepContext) -> None:
     source.started_ns = context.now_ns
     source.last_frames = sum(e.frames for e in context.state.cameras)
     source.renew_lease(context.now_ns)
+    if isinstance(source, ServoGoal) and source.goal.follow_markers:
+        start_following(source, context)
 
 
 def awaits_plan(source: ServoGoal, context: StepContext) -> bool:
@@ -499,7 +510,7 @@ def servo_progress_reasons(
 def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
     local = source.law if context.derived.laws[source.law].path == "free" else ""
     return _plain_traits(source, context)._replace(
-        wanted=source.wanted, moves=source.stream is not None, local_law=local
+        wanted=source.wanted, moves=source.stream is not None or source.followed is not None, local_law=local
     )
 
 

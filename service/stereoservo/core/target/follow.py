@@ -1,0 +1,172 @@
+"""Goals that hold relative to a target that moves: their set-points now, and the velocities that are fed forward.
+
+With cameras on the arm the set-points stand in the images and the body moves; with cameras that stand the set-points
+go with the target.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereoservo.core.context import RefusalError, StepContext
+from stereoservo.core.goals.resolve import camera_index, ideal_pixels, marker_indices
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.prediction import chain_at
+from stereoservo.core.state import Followed, ServoGoal
+from stereoservo.core.target.motion import TargetBody, find_pose, find_shape, pixel_rates, target_body
+from stereoservo.core.target.track import FEWEST, FEWEST_TO_FIND, IDENTITY, displacements_of, pose_at
+from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
+from stereoservo.messages.goals import Goal
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray
+
+LEAST_STATED = 3
+
+
+def require_followable(
+    goal: Goal, follows_streams: bool, law: str, pose_known: bool, context: StepContext
+) -> None:
+    """Raises RefusalError where a goal cannot follow the markers that it names."""
+    arrays = context.arrays
+    assert arrays is not None
+    ids = goal.follow_markers
+    if not follows_streams:
+        raise RefusalError(
+            "LAW_CANNOT_FOLLOW",
+            f"law {law!r} follows a way that was planned for a goal that stands",
+            subject=law,
+        )
+    if not pose_known:
+        raise RefusalError(
+            "TOO_FEW_MARKERS", "a goal that follows a target shows three markers or more in two cameras"
+        )
+    if displacements_of(arrays) is None:
+        raise RefusalError(
+            "TARGET_NOT_TRACKABLE",
+            "neither the model nor an arm of six joints tells what a displacement is: calibrate with a body by which "
+            "the model becomes metric",
+        )
+    if _carried(context):
+        marker_indices(ids, arrays)
+        if goal.centre is not None and goal.centre.point is not None:
+            raise RefusalError(
+                "CENTRE_UNCLEAR", "of a target that moves, the centre is given by markers, not as a point"
+            )
+        return
+    own = [str(marker) for marker in ids if marker in arrays.index]
+    if own:
+        raise RefusalError(
+            "NO_SUCH_MARKER",
+            f"marker {', '.join(own)} is on the body that the arm carries; markers of the target are others, which "
+            "both cameras see",
+            subject=own[0],
+        )  # fmt: skip
+    if len(ids) < FEWEST_TO_FIND and not goal.follow_seen:
+        raise RefusalError(
+            "TOO_FEW_MARKERS",
+            f"{len(ids)} markers of the target are named; at least {FEWEST_TO_FIND} are needed",
+            value=float(len(ids)), threshold=float(FEWEST_TO_FIND), unit="markers",
+        )  # fmt: skip
+    if goal.follow_seen:
+        _stated(goal, context, arrays)
+
+
+def _carried(context: StepContext) -> bool:
+    return context.settings.cameras[0].mount == "eye_in_hand"
+
+
+def _stated(
+    goal: Goal, context: StepContext, arrays: ModelArrays
+) -> tuple[np.ndarray, FloatArray, FloatArray, FloatArray]:
+    """Ids (k,) of the target's markers that the goal shows where it holds, their points (k, 4), ideal pixels (c, k, 2)
+    and which are given (c, k) 1 or 0. Raises RefusalError.
+    """
+    ids = np.array(sorted(goal.follow_markers), dtype=np.int64)
+    cameras = len(context.settings.cameras)
+    sights, seen = np.zeros((cameras, len(ids), 2)), np.zeros((cameras, len(ids)))
+    for name, markers in goal.follow_seen.items():
+        c = camera_index(name, context.settings)
+        for k, marker in enumerate(ids.tolist()):
+            if marker in markers:
+                sights[c, k] = ideal_pixels(arrays.lenses[c], np.array([markers[marker]], dtype=np.float64))[
+                    0
+                ]
+                seen[c, k] = float(np.isfinite(sights[c, k]).all())
+    points, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
+    there = known > 0.0
+    if int(there.sum()) < FEWEST:
+        raise RefusalError(
+            "TOO_FEW_MARKERS",
+            f"{int(there.sum())} of the target's markers are shown by two cameras where the goal holds; at least "
+            f"{FEWEST} are needed: teach it with the target in view",
+            value=float(there.sum()), threshold=float(FEWEST), unit="markers",
+        )  # fmt: skip
+    return ids[there], np.ascontiguousarray(points[there]), sights[:, there].copy(), seen[:, there].copy()
+
+
+def start_following(source: ServoGoal, context: StepContext) -> None:
+    """A goal that follows a target begins: the target is looked for, where it is not followed already."""
+    arrays, state, goal = context.arrays, context.state, source.goal
+    assert arrays is not None
+    cameras, body = len(context.settings.cameras), state.target
+    reference = IDENTITY.copy()
+    if _carried(context):
+        if body is None or not body.carried:
+            state.target = target_body(arrays.ids, arrays.marker_points, cameras, carried=True)
+    elif goal.follow_seen:
+        ids, points, sights, seen = _stated(goal, context, arrays)
+        if body is not None and not body.carried and body.t_ns > 0 and np.array_equal(body.ids, ids):
+            reference, _ = find_pose(body.basis, arrays.matrices, body.points, sights, seen)
+        else:
+            state.target = target_body(ids, points, cameras, carried=False)
+    else:
+        ids = np.array(sorted(goal.follow_markers), dtype=np.int64)
+        if body is not None and not body.carried and body.t_ns > 0 and bool(np.isin(body.ids, ids).all()):
+            reference = pose_at(body, context.now_ns)[0]
+        else:
+            state.target = target_body(ids, None, cameras, carried=False)
+    source.followed = Followed(
+        reference=reference, set_points=source.set_points.copy(), target_points=source.target_points.copy(),
+        centre_target=source.centre_target.copy(),
+    )  # fmt: skip
+
+
+def follow_target(source: ServoGoal, context: StepContext) -> Reason | None:
+    """Bring a goal to where its target is now, with the velocities of its set-points; the reason where it cannot."""
+    body, arrays, followed = context.state.target, context.arrays, source.followed
+    assert arrays is not None
+    assert followed is not None
+    source.rates = np.zeros_like(source.set_points)
+    if body is None or body.t_ns == 0:
+        return _unseen(source, "the target is looked for: bring its markers into the view of two cameras")
+    unseen_s = (context.now_ns - int(body.seen_ns.max())) * 1e-9
+    if unseen_s > context.settings.limits.coast_s:
+        return _unseen(
+            source, f"the target was not seen for {unseen_s:.2f} s", unseen_s, context.settings.limits.coast_s
+        )
+    pose, twist = pose_at(body, context.now_ns + context.inputs.period_ns // 2)
+    if body.carried:
+        carrier = chain_at(arrays, context.q)[0]
+        points = transform_points(pose, body.points)
+        source.rates = -pixel_rates(body.basis, twist, arrays.matrices, carrier, points)
+        return None
+    pose = pose_at(body, context.now_ns)[0]
+    moved = np.empty((4, 4))
+    multiply4_into(pose, invert4(followed.reference), moved)
+    source.target_points = transform_points(moved, followed.target_points)
+    source.centre_target = transform_points(moved, followed.centre_target[None])[0]
+    here, _ = project_points(arrays.matrices, source.target_points)
+    there, _ = project_points(arrays.matrices, followed.target_points)
+    source.set_points = here + np.where(source.wanted[..., None] > 0.0, followed.set_points - there, 0.0)
+    source.rates = pixel_rates(body.basis, twist, arrays.matrices, IDENTITY, source.target_points)
+    return None
+
+
+def _unseen(source: ServoGoal, hint: str, value: float | None = None, limit: float | None = None) -> Reason:
+    ids = ", ".join(str(marker) for marker in source.goal.follow_markers)
+    return Reason("TARGET_UNSEEN", "hold", ids, value, limit, "s" if value is not None else "", hint)
+
+
+def stands(body: TargetBody | None) -> bool:
+    """Whether a goal's target stands, so that the goal may be reached for good."""
+    return body is not None and body.t_ns > 0 and body.still

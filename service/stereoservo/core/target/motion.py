@@ -1,0 +1,462 @@
+"""The motion of a target, a rigid body that arm and cameras do not carry: pose, twist and rate of twist with their
+covariance, by a Kalman filter on the pixels of its markers.
+
+The pose is a displacement ``D`` (4, 4) of its reference points in the model's frame, whatever that frame is. Twists are
+in a ``basis`` (6, 4, 4) of the displacements that is scaled so that a unit moves the markers by a pixel rms. Where the
+model is metric, targets accelerate alike in all directions, and what they do along the rays, which is seen ten times
+less, is followed more slowly; where it is not, they accelerate alike in the images. The rate of the twist is a
+Gauss-Markov process (Singer 1970): it is followed while images come, and fades when they do not.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from stereoservo.kinematics.kernels import (
+    exp_twist,
+    image_jacobian,
+    invert4,
+    multiply4_into,
+    project_points,
+    transform_points,
+    triangulate,
+)
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.linear import damped_least_squares
+
+FREEDOMS = 6
+ACCELERATION_PX = 100.0
+"""[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
+ACCELERATION_S = 0.6
+SPEED_PX = 100.0
+"""[px/s] of a target that was just found."""
+FOUND_PX = 3.0
+"""Deviation of the pose of a target that was just found."""
+SIGHT_PX = 0.05
+"""Deviation of a sight besides its detector's: the body's shape is not exact."""
+
+
+class TargetBody(msgspec.Struct, eq=False, kw_only=True):
+    """A target that moves, followed in the images.
+
+    Markers ``ids`` (k,), ascending, at ``points`` (k, 4) of the model's frame when ``displacement`` (4, 4) is the
+    identity; ``carried``: the cameras are, and the target is the model's marker body, seen through the arm's joints.
+    ``twist`` [1/s] and ``rate`` [1/s²] (6,) in the ``basis`` (6, 4, 4), ``covariance`` (18, 18) of pose, twist and
+    rate, at ``t_ns``; 0: not found yet.
+
+    By camera: ``seen_ns`` (c,), the shutter of its last frame with enough markers, ``odd_ns`` (c,) of the last one that
+    the motion did not explain, 0 where a later one was explained; ``told`` (c,): whether its estimate began anew since
+    the target was found. ``drift`` (6, 6): how accelerations are spread over the basis. ``odd``: steps in a row with
+    such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): sights from which it is found,
+    where it is not yet; ``stated``: ``points`` are known before.
+
+    ``mark`` (4, 4): where it was at ``mark_ns``, ``farthest_px`` what its markers moved by since; ``still``: they did
+    not in the time before.
+    """
+
+    ids: IntArray
+    points: FloatArray
+    carried: bool
+    stated: bool
+    displacement: FloatArray
+    twist: FloatArray
+    rate: FloatArray
+    covariance: FloatArray
+    basis: FloatArray
+    drift: FloatArray
+    seen_ns: IntArray
+    odd_ns: IntArray
+    told: BoolArray
+    first: FloatArray
+    first_seen: FloatArray
+    t_ns: int = 0
+    odd: int = 0
+    mark: FloatArray
+    mark_ns: int = 0
+    farthest_px: float = 0.0
+    still: bool = True
+
+
+def target_body(ids: IntArray, points: FloatArray | None, cameras: int, *, carried: bool) -> TargetBody:
+    """A target that is not found yet; ``points`` (k, 4): its markers, None where they are not known before."""
+    k = len(ids)
+    return TargetBody(
+        ids=ids, points=np.zeros((k, 4)) if points is None else points.copy(), carried=carried,
+        stated=points is not None, displacement=np.eye(4), twist=np.zeros(FREEDOMS), rate=np.zeros(FREEDOMS),
+        covariance=np.zeros((3 * FREEDOMS, 3 * FREEDOMS)), basis=np.zeros((FREEDOMS, 4, 4)), drift=np.eye(FREEDOMS),
+        seen_ns=np.zeros(cameras, np.int64), odd_ns=np.zeros(cameras, np.int64), told=np.zeros(cameras, np.bool_),
+        first=np.zeros((cameras, k, 2)), first_seen=np.zeros((cameras, k)), mark=np.eye(4),
+    )  # fmt: skip
+
+
+def begin(
+    body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
+) -> bool:
+    """The target is where it is said to be at ``t_ns``, moving no one knows how; whether its markers tell of all six
+    freedoms. ``basis`` (6, 4, 4) of displacements, in the units of a ``metric`` frame or any; seen by ``matrices``
+    (c, 3, 4) through ``carrier`` (4, 4).
+    """
+    scaled, drift, good = scaled_basis(
+        basis, matrices, carrier, transform_points(body.displacement, body.points)
+    )
+    if not good:
+        return False
+    body.basis[:] = scaled
+    body.drift[:] = drift if metric else np.eye(FREEDOMS)
+    body.twist[:], body.rate[:] = 0.0, 0.0
+    widen(body, FOUND_PX)
+    body.t_ns, body.odd, body.odd_ns[:], body.told[:] = t_ns, 0, 0, False
+    body.mark[:], body.mark_ns, body.farthest_px, body.still = body.displacement, t_ns, 0.0, False
+    return True
+
+
+def widen(body: TargetBody, pose_px: float) -> None:
+    """Its pose is known to ``pose_px``; of its motion nothing is."""
+    body.covariance[:] = 0.0
+    for k, block in enumerate(
+        (pose_px**2 * np.eye(FREEDOMS), SPEED_PX**2 * body.drift, ACCELERATION_PX**2 * body.drift)
+    ):
+        body.covariance[FREEDOMS * k : FREEDOMS * (k + 1), FREEDOMS * k : FREEDOMS * (k + 1)] = block
+
+
+@kernel
+def scaled_basis(
+    basis: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray, bool]:
+    """The ``basis`` (6, 4, 4) in combinations of which each moves the pixels of ``points`` (k, 4) by 1 px rms,
+    independently of the others; the covariance (6, 6) in it of what is spread alike over the former, at 1 px rms; and
+    whether it could be.
+    """
+    J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points)).reshape(
+        (-1, FREEDOMS)
+    )
+    N = np.zeros((FREEDOMS, FREEDOMS))
+    count = 0
+    for row in range(J.shape[0]):
+        count += 1
+        for i in range(FREEDOMS):
+            for j in range(FREEDOMS):
+                N[i, j] += J[row, i] * J[row, j]
+    N /= float(max(count, 1))
+    scaled, drift, trace = np.zeros((FREEDOMS, 4, 4)), np.eye(FREEDOMS), 0.0
+    for i in range(FREEDOMS):
+        trace += N[i, i] / FREEDOMS
+    # N = L Lᵀ; twists T = L⁻ᵀ have Tᵀ N T = 1.
+    L = np.zeros((FREEDOMS, FREEDOMS))
+    for i in range(FREEDOMS):
+        for j in range(i + 1):
+            total = N[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 1e-12 * N[i, i]:
+                    return scaled, drift, False
+                L[i, i] = math.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    column = np.zeros(FREEDOMS)
+    for k in range(FREEDOMS):  # Lᵀ x = e_k
+        for i in range(FREEDOMS - 1, -1, -1):
+            total = 1.0 if i == k else 0.0
+            for j in range(i + 1, FREEDOMS):
+                total -= L[j, i] * column[j]
+            column[i] = total / L[i, i]
+        for i in range(FREEDOMS):
+            for a in range(4):
+                for b in range(4):
+                    scaled[k, a, b] += column[i] * basis[i, a, b]
+    for i in range(FREEDOMS):  # Lᵀ L
+        for j in range(FREEDOMS):
+            drift[i, j] = 0.0
+            for k in range(FREEDOMS):
+                drift[i, j] += L[k, i] * L[k, j] / trace
+    return scaled, drift, True
+
+
+@kernel
+def _carried(basis: FloatArray, carrier: FloatArray) -> FloatArray:
+    """``C Ĝ C⁻¹`` of every twist (6, 4, 4)."""
+    inverse, half, out = invert4(carrier), np.empty((4, 4)), np.empty(basis.shape)
+    for k in range(basis.shape[0]):
+        multiply4_into(carrier, basis[k], half)
+        multiply4_into(half, inverse, out[k])
+    return out
+
+
+@kernel
+def generator_of(basis: FloatArray, twist: FloatArray) -> FloatArray:
+    """``Σ t_j Ĝ_j`` (4, 4)."""
+    G = np.zeros((4, 4))
+    for k in range(basis.shape[0]):
+        for i in range(4):
+            for j in range(4):
+                G[i, j] += twist[k] * basis[k, i, j]
+    return G
+
+
+@kernel
+def displaced(D: FloatArray, basis: FloatArray, twist: FloatArray) -> FloatArray:
+    """``exp(Σ t_j Ĝ_j) D`` (4, 4)."""
+    out = np.empty((4, 4))
+    multiply4_into(exp_twist(generator_of(basis, twist)), D, out)
+    return out
+
+
+@kernel
+def after(
+    D: FloatArray, basis: FloatArray, twist: FloatArray, rate: FloatArray, dt_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Pose (4, 4) and twist (6,) of a target ``dt_s`` later; the rate fades."""
+    if dt_s < 0.0:  # a frame that was overtaken by another camera's
+        return displaced(D, basis, dt_s * twist), twist.copy()
+    fade = math.exp(-dt_s / ACCELERATION_S)
+    way = dt_s * twist + ACCELERATION_S**2 * (dt_s / ACCELERATION_S - 1.0 + fade) * rate
+    return displaced(D, basis, way), twist + ACCELERATION_S * (1.0 - fade) * rate
+
+
+@kernel
+def elapse(
+    D: FloatArray, basis: FloatArray, drift: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray,
+    dt_s: float,
+) -> None:  # fmt: skip
+    """The state ``dt_s`` later, in place: pose ``D`` (4, 4), ``twist`` and ``rate`` (6,), ``covariance`` (18, 18)."""
+    n = FREEDOMS
+    fade = math.exp(-dt_s / ACCELERATION_S)
+    F = np.eye(3)
+    F[0, 1], F[0, 2] = dt_s, ACCELERATION_S**2 * (dt_s / ACCELERATION_S - 1.0 + fade)
+    F[1, 2], F[2, 2] = ACCELERATION_S * (1.0 - fade), fade
+    jerk = 2.0 * ACCELERATION_PX**2 / ACCELERATION_S
+    Q = np.empty((3, 3))
+    Q[0, 0], Q[1, 1], Q[2, 2] = jerk * dt_s**5 / 20.0, jerk * dt_s**3 / 3.0, jerk * dt_s
+    Q[0, 1] = Q[1, 0] = jerk * dt_s**4 / 8.0
+    Q[0, 2] = Q[2, 0] = jerk * dt_s**3 / 6.0
+    Q[1, 2] = Q[2, 1] = jerk * dt_s**2 / 2.0
+    D[:], twist[:] = after(D, basis, twist, rate, dt_s)
+    rate *= fade
+    before = covariance.copy()
+    for a in range(3):
+        for b in range(3):
+            for i in range(n):
+                for j in range(n):
+                    total = Q[a, b] * drift[i, j]
+                    for c in range(a, 3):
+                        for d in range(b, 3):
+                            total += F[a, c] * F[b, d] * before[c * n + i, d * n + j]
+                    covariance[a * n + i, b * n + j] = total
+
+
+@kernel
+def solve_into(M: FloatArray, X: FloatArray) -> None:
+    """``M⁻¹ X`` (n, k) in place, by elimination with pivots; ``M`` (n, n) is overwritten."""
+    n, k = X.shape
+    for i in range(n):
+        pivot = i
+        for row in range(i + 1, n):
+            if abs(M[row, i]) > abs(M[pivot, i]):
+                pivot = row
+        for j in range(n):
+            M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
+        for j in range(k):
+            X[i, j], X[pivot, j] = X[pivot, j], X[i, j]
+        for row in range(n):
+            if row == i:
+                continue
+            share = M[row, i] / M[i, i]
+            for j in range(i, n):
+                M[row, j] -= share * M[i, j]
+            for j in range(k):
+                X[row, j] -= share * X[i, j]
+    for i in range(n):
+        for j in range(k):
+            X[i, j] /= M[i, i]
+
+
+@kernel
+def compare(
+    basis: FloatArray, points: FloatArray, D: FloatArray, matrix: FloatArray, carrier: FloatArray, sights: FloatArray,
+    seen: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """A frame against a pose ``D``: what it shows of the markers less the prediction (k, 2) [px], zeros where not
+    ``seen`` (k,), and the Jacobian (k, 2, 6) by the basis. ``matrix`` (1, 3, 4); ``sights`` (k, 2) ideal pixels.
+    """
+    there = transform_points(carrier, transform_points(D, points))
+    pixels, _ = project_points(matrix, there)
+    J = image_jacobian(_carried(basis, carrier), matrix, there)[0]
+    left = np.zeros(sights.shape)
+    for i in range(seen.size):
+        for a in range(2):
+            if seen[i] > 0.0:
+                left[i, a] = sights[i, a] - pixels[0, i, a]
+            else:
+                J[i, a, :] = 0.0
+    return left, J
+
+
+@kernel
+def gate_sights(
+    left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, pose: FloatArray, gate: float
+) -> tuple[FloatArray, int, int]:
+    """Which of the markers ``seen`` (k,) are explained within a ``gate`` by the covariance ``pose`` (6, 6), how many
+    these are, and how many were seen.
+    """
+    within, used, count = seen.copy(), 0, 0
+    S = np.empty((2, 2))
+    for i in range(seen.size):
+        if not seen[i] > 0.0:
+            continue
+        count += 1
+        for a in range(2):
+            for b in range(2):
+                total = variances[i] if a == b else 0.0
+                for k in range(FREEDOMS):
+                    for m in range(FREEDOMS):
+                        total += J[i, a, k] * pose[k, m] * J[i, b, m]
+                S[a, b] = total
+        u, v, determinant = left[i, 0], left[i, 1], S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
+        if S[1, 1] * u * u - 2.0 * S[0, 1] * u * v + S[0, 0] * v * v <= gate * determinant:
+            used += 1
+        else:
+            within[i] = 0.0
+    return within, used, count
+
+
+@kernel
+def fold_frame(
+    D: FloatArray, basis: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray, left: FloatArray,
+    J: FloatArray, variances: FloatArray, used: FloatArray,
+) -> None:  # fmt: skip
+    """Correct the state by a frame, in place: what is ``left`` (k, 2) of the markers ``used`` (k,), as of `compare`."""
+    n = FREEDOMS
+    N, b = np.zeros((n, n)), np.zeros(n)
+    for i in range(used.size):
+        if not used[i] > 0.0:
+            continue
+        w = 1.0 / variances[i]
+        for a in range(2):
+            for k in range(n):
+                b[k] += w * J[i, a, k] * left[i, a]
+                for m in range(n):
+                    N[k, m] += w * J[i, a, k] * J[i, a, m]
+    M, X = np.eye(n), np.empty((n, n + 1))
+    for i in range(n):
+        for j in range(n):
+            for k in range(n):
+                M[i, j] += N[i, k] * covariance[k, j]
+            X[i, j] = N[i, j]
+        X[i, n] = b[i]
+    solve_into(M, X)  # (1 + N C)⁻¹ [N | b]
+    step = np.zeros(3 * n)
+    before = covariance.copy()
+    gain = np.zeros((3 * n, n))
+    for i in range(3 * n):
+        for k in range(n):
+            step[i] += before[i, k] * X[k, n]
+            for j in range(n):
+                gain[i, j] += before[i, k] * X[k, j]
+    for i in range(3 * n):
+        for j in range(3 * n):
+            total = before[i, j]
+            for k in range(n):
+                total -= gain[i, k] * before[k, j]
+            covariance[i, j] = total
+    for i in range(3 * n):
+        for j in range(i):
+            covariance[i, j] = covariance[j, i] = 0.5 * (covariance[i, j] + covariance[j, i])
+    D[:] = displaced(D, basis, step[:n])
+    twist += step[n : 2 * n]
+    rate += step[2 * n :]
+
+
+@kernel
+def moved_by(left: FloatArray, J: FloatArray, used: FloatArray) -> tuple[float, float]:
+    """By how much [px] rms the rigid displacement moves the markers that explains best what is ``left`` (k, 2), and
+    what rms [px] it leaves.
+    """
+    weights = np.repeat(used, 2)
+    rows, errors = J.copy().reshape((-1, FREEDOMS)), left.copy().reshape(-1)
+    step, _ = damped_least_squares(rows, errors, weights, 1e-12)
+    moved = rest = 0.0
+    count = 0
+    for i in range(errors.size):
+        if not weights[i] > 0.0:
+            continue
+        along = 0.0
+        for k in range(FREEDOMS):
+            along += rows[i, k] * step[k]
+        moved += along * along
+        rest += (errors[i] - along) ** 2
+        count += 1
+    return math.sqrt(moved / max(count, 1)), math.sqrt(rest / max(count, 1))
+
+
+@kernel
+def pixel_rates(
+    basis: FloatArray, twist: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Pixel velocities (c, k, 2) [px/s] of ``points`` (k, 4), where they are now, that move with a ``twist`` (6,)."""
+    J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points))
+    rates = np.zeros(J.shape[:3])
+    for c in range(J.shape[0]):
+        for i in range(J.shape[1]):
+            for a in range(2):
+                for k in range(FREEDOMS):
+                    rates[c, i, a] += J[c, i, a, k] * twist[k]
+    return rates
+
+
+FITS = 40
+"""Rounds of least squares that find a target whose shape is known."""
+FOUND_REST_PX = 3.0
+"""What they may leave, rms."""
+
+
+@kernel
+def find_shape(
+    matrices: FloatArray, sights: FloatArray, seen: FloatArray, plane: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that two cameras or more show, and which these
+    are (k,) 1 or 0.
+    """
+    points, ok = triangulate(matrices, sights, seen, 5)
+    known = np.zeros(points.shape[0])
+    for i in range(points.shape[0]):
+        views, height = 0.0, 0.0
+        for c in range(seen.shape[0]):
+            views += 1.0 if seen[c, i] > 0.0 else 0.0
+        for k in range(4):
+            height += points[i, k] * plane[k]
+        if ok[i] and views >= 2.0 and height != 0.0:
+            known[i] = 1.0
+        for k in range(4):
+            points[i, k] = points[i, k] / height if known[i] > 0.0 else plane[k]
+    return points, known
+
+
+@kernel
+def find_pose(
+    basis: FloatArray, matrices: FloatArray, points: FloatArray, sights: FloatArray, seen: FloatArray
+) -> tuple[FloatArray, float]:
+    """The displacement (4, 4) of ``points`` (k, 4) that explains ``sights`` (c, k, 2), where ``seen`` (c, k), and what
+    it leaves [px] rms.
+    """
+    D = np.eye(4)
+    weights = np.repeat(seen.copy().reshape(-1), 2)
+    for _ in range(FITS):
+        there = transform_points(D, points)
+        pixels, _ = project_points(matrices, there)
+        J = image_jacobian(basis, matrices, there).reshape((-1, basis.shape[0]))
+        step, _ = damped_least_squares(J, (sights - pixels).reshape(-1), weights, 1e-9)
+        D = displaced(D, basis, step)
+    pixels, _ = project_points(matrices, transform_points(D, points))
+    total = count = 0.0
+    for c in range(seen.shape[0]):
+        for i in range(seen.shape[1]):
+            if seen[c, i] > 0.0:
+                total += (sights[c, i, 0] - pixels[c, i, 0]) ** 2 + (sights[c, i, 1] - pixels[c, i, 1]) ** 2
+                count += 2.0
+    rest = math.sqrt(total / count) if count > 0.0 else math.inf
+    return D, rest if math.isfinite(rest) else math.inf

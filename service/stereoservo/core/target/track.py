@@ -1,0 +1,300 @@
+"""The target body from frame to frame: found, followed, told apart from what else may have moved, and carried on
+through drop-outs.
+
+A frame is compared with the pose that the motion predicts at its shutter. What the motion does not explain in one
+camera, while another one agrees, is that camera's; what no camera explains is the target's own, where its speed can
+have brought it there, and else waits for the watch over the model: a joint zero or a marker that it names is not
+followed as a motion of the target.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+
+import numpy as np
+
+from stereoservo.core.block import HISTORY
+from stereoservo.core.context import StepContext
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitor_state import ModelDiagnosis
+from stereoservo.core.prediction import chain_at, gate_threshold, positions_at, undistort_sights
+from stereoservo.core.state import CoreState
+from stereoservo.core.target.motion import (
+    FOUND_REST_PX,
+    FREEDOMS,
+    SIGHT_PX,
+    SPEED_PX,
+    TargetBody,
+    after,
+    begin,
+    compare,
+    elapse,
+    find_pose,
+    find_shape,
+    fold_frame,
+    gate_sights,
+    moved_by,
+    widen,
+)
+from stereoservo.kinematics.kernels import project_points, transform_points
+from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import kernel
+from stereoservo.ports.devices import CameraObservation
+
+FEWEST = 3
+"""Markers of a frame that says something of the target."""
+FEWEST_TO_FIND = 5
+"""Markers, two cameras together, by which a target beside the body is found."""
+TOGETHER_NS = 40_000_000
+"""Between frames of several cameras from which it is found."""
+RECENT_NS = 150_000_000
+SMALL_PX = 0.5
+"""rms that needs no explanation: models are not exact."""
+RIGID_PX = 1.0
+"""rms that a motion of the target may leave."""
+FOUND_ANEW = 6
+"""Frames in a row that only a jump of the target explains, after which it is found anew."""
+OTHERS = ("joint_zero", "camera_moved", "marker_slipped")
+"""Verdicts of what else may have moved, which the target is not followed into."""
+STILL_S, STILL_PX = 0.5, 0.5
+"""A target whose markers moved by less in that time stands."""
+IDENTITY = np.eye(4)
+
+
+def take_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
+    """Follow the target in a frame; a model's body that is the target is then where it was at the shutter."""
+    state, arrays = context.state, context.derived.arrays
+    body = state.target
+    if body is None or arrays is None:
+        return
+    t_ns = observation.t_shutter_ns + state.cameras[camera].offset_ns
+    carrier = _carrier(body, t_ns, state, arrays)
+    if carrier is None:
+        return
+    sights, variances, seen = target_sights(
+        body.ids, observation.ids.astype(np.int64), np.array(observation.pixels, np.float64, order="C"),
+        np.array(observation.covariances, np.float64, order="C"), arrays.lenses[camera],
+    )  # fmt: skip
+    if body.carried:
+        seen = seen * (1.0 - state.watching.masked)
+    if state.reanchoring is None and int(seen.sum()) >= FEWEST:
+        if body.t_ns == 0:
+            _find(body, camera, t_ns, sights, seen, carrier, arrays)
+        if body.t_ns > 0:
+            _follow(body, camera, t_ns, (sights, variances, seen), carrier, context)
+    if body.carried and body.t_ns > 0:
+        if not body.told[camera]:  # what it said before was of a target that stood
+            state.cameras[camera].seen_ns[:] = 0
+            body.told[camera] = True
+        context.derived.room.arrays["marker_points"][:] = _points(body, t_ns)
+
+
+def present_arrays(context: StepContext) -> ModelArrays | None:
+    """The model with the markers of a body that is the target where they are now."""
+    arrays, body = context.derived.arrays, context.state.target
+    if arrays is None or body is None or not body.carried or body.t_ns == 0:
+        return arrays
+    points = _points(body, context.now_ns)
+    context.derived.room.arrays["marker_points"][:] = points
+    here = copy(arrays)
+    object.__setattr__(here, "marker_points", points)
+    return here
+
+
+def pose_at(body: TargetBody, t_ns: int) -> tuple[FloatArray, FloatArray]:
+    """Its displacement (4, 4) and twist (6,) at ``t_ns``."""
+    found: tuple[FloatArray, FloatArray] = after(
+        body.displacement, body.basis, body.twist, body.rate, (t_ns - body.t_ns) * 1e-9
+    )
+    return found
+
+
+def _points(body: TargetBody, t_ns: int) -> FloatArray:
+    points: FloatArray = transform_points(pose_at(body, t_ns)[0], body.points)
+    return points
+
+
+def _carrier(body: TargetBody, t_ns: int, state: CoreState, arrays: ModelArrays) -> FloatArray | None:
+    """What is between the target's frame and the cameras' at ``t_ns``; None where the joints then are not known."""
+    if not body.carried:
+        return IDENTITY
+    block, n = state.block, len(arrays.zero)
+    known, q = positions_at(
+        block.history_ns, block.history_positions.reshape((HISTORY, n)), block.numbers.history_count, t_ns
+    )
+    return chain_at(arrays, q)[0] if known else None
+
+
+@kernel
+def target_sights(
+    wanted: IntArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, lens: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of the markers ``wanted`` (k,), what a frame of ``ids`` (s,), raw ``pixels`` (s, 2) with ``covariances``
+    (s, 2, 2) shows: ideal pixels (k, 2), variances of a coordinate (k,) [px²], and which are seen (k,) 1 or 0.
+    """
+    ideal, spread, possible = undistort_sights(lens, pixels, covariances)
+    k = wanted.size
+    found, variances, seen = np.zeros((k, 2)), np.ones(k), np.zeros(k)
+    for s in range(ids.size):
+        for i in range(k):
+            if ids[s] == wanted[i] and possible[s]:
+                found[i] = ideal[s]
+                variances[i] = 0.5 * (spread[s, 0, 0] + spread[s, 1, 1]) + SIGHT_PX * SIGHT_PX
+                seen[i] = 1.0
+    return found, variances, seen
+
+
+def displacements_of(arrays: ModelArrays) -> FloatArray | None:
+    """Twists (6, 4, 4) that span all displacements; None where neither model nor arm knows them."""
+    if arrays.metric_basis is not None:
+        return arrays.metric_basis
+    return arrays.generators if len(arrays.generators) == FREEDOMS else None
+
+
+# -- finding it ------------------------------------------------------------------------------------------------
+
+
+def _find(
+    body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray, carrier: FloatArray,
+    arrays: ModelArrays,
+) -> None:  # fmt: skip
+    """Find the target by this frame, and those before of the other cameras."""
+    basis, metric = displacements_of(arrays), arrays.metric_basis is not None
+    if basis is None:
+        return
+    if body.carried:
+        begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+        return
+    body.first[camera], body.first_seen[camera], body.seen_ns[camera] = sights, seen, t_ns
+    shown = body.first_seen * (np.abs(body.seen_ns - t_ns) <= TOGETHER_NS)[:, None]
+    if int((shown.max(axis=1) > 0.0).sum()) < 2:
+        return
+    if not body.stated:
+        points, known = find_shape(arrays.matrices, body.first, shown, arrays.plane_at_infinity)
+        if int(known.sum()) < FEWEST_TO_FIND:
+            return
+        _keep(body, known > 0.0, points)
+        begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+        return
+    if int((shown.max(axis=0) > 0.0).sum()) < FEWEST:
+        return
+    D, rest = find_pose(basis, arrays.matrices, body.points, body.first, shown)
+    if rest > FOUND_REST_PX:
+        return
+    body.displacement[:] = D
+    begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+
+
+def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], points: FloatArray) -> None:
+    """The target has these markers alone, at ``points`` (k, 4)."""
+    body.ids, body.points = body.ids[known].copy(), np.ascontiguousarray(points[known])
+    body.first, body.first_seen = body.first[:, known].copy(), body.first_seen[:, known].copy()
+    body.stated = True
+
+
+def restart(state: CoreState, arrays: ModelArrays) -> None:
+    """A model is in use from here on: with its cameras found anew, what was followed is found anew, too."""
+    body = state.target
+    if body is None:
+        return
+    if not state.pending_reanchored:
+        state.target = None
+        return
+    body.t_ns, body.seen_ns[:], body.first_seen[:] = 0, 0, 0.0
+    if body.carried and body.points.shape == arrays.marker_points.shape:
+        body.points[:] = arrays.marker_points
+
+
+# -- following it ----------------------------------------------------------------------------------------------
+
+
+def _follow(
+    body: TargetBody, camera: int, t_ns: int, frame: tuple[FloatArray, FloatArray, FloatArray], carrier: FloatArray,
+    context: StepContext,
+) -> None:  # fmt: skip
+    sights, variances, seen = frame
+    state, arrays = context.state, context.derived.arrays
+    assert arrays is not None
+    dt_s = (t_ns - body.t_ns) * 1e-9
+    if dt_s > 0.0:
+        elapse(body.displacement, body.basis, body.drift, body.twist, body.rate, body.covariance, dt_s)
+        body.t_ns = t_ns
+    pose = pose_at(body, t_ns)[0]
+    left, J = compare(
+        body.basis, body.points, pose, arrays.matrices[camera : camera + 1], carrier, sights, seen
+    )
+    gate = gate_threshold(context.settings.gate_sigma)
+    used = _explained(body, left, J, variances, seen, gate)
+    if used is None:
+        since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
+        used = _odd(body, camera, t_ns, (left, J, variances, seen), since_s, gate, state)
+    if used is None:
+        return
+    fold_frame(
+        body.displacement, body.basis, body.twist, body.rate, body.covariance, left, J, variances, used
+    )
+    body.seen_ns[camera], body.odd_ns[camera] = t_ns, 0
+    _look_whether_still(body, t_ns, arrays.matrices[camera : camera + 1], carrier)
+
+
+def _explained(
+    body: TargetBody, left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, gate: float
+) -> FloatArray | None:
+    """The markers (k,) 1 or 0 that the predicted motion explains; None where it does not explain most of them."""
+    pose = np.ascontiguousarray(body.covariance[:FREEDOMS, :FREEDOMS])
+    within, used, count = gate_sights(left, J, variances, seen, pose, gate)
+    if used >= FEWEST and 2 * used > count:
+        return within
+    if float((left * left).sum()) <= 2.0 * count * SMALL_PX**2:
+        return seen
+    return None
+
+
+def _odd(
+    body: TargetBody, camera: int, t_ns: int, frame: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    since_s: float, gate: float, state: CoreState,
+) -> FloatArray | None:  # fmt: skip
+    """The markers (k,) of a frame that the predicted motion does not explain, where another motion of the target does;
+    None where it may be something else, or is not decided yet.
+    """
+    left, J, variances, seen = frame
+    body.odd_ns[camera] = t_ns
+    recent = np.maximum(body.seen_ns, body.odd_ns) > t_ns - RECENT_NS
+    if bool((body.odd_ns[recent] == 0).any()):
+        return None  # the others agree: it is the camera
+    body.odd += 1
+    moved_px, rest_px = moved_by(left, J, seen)
+    if not rest_px <= RIGID_PX:
+        return None
+    quick = moved_px > SPEED_PX * since_s + SMALL_PX
+    named = any(verdict.kind in OTHERS for verdict in (*state.watching.last, state.watching.verdict))
+    if quick and (named or body.odd < FOUND_ANEW):
+        return None
+    widen(body, moved_px + SMALL_PX)
+    body.odd, body.told[:] = 0, not quick
+    return _explained(body, left, J, variances, seen, gate)
+
+
+def _look_whether_still(body: TargetBody, t_ns: int, matrix: FloatArray, carrier: FloatArray) -> None:
+    here, _ = project_points(
+        matrix, transform_points(carrier, transform_points(body.displacement, body.points))
+    )
+    there, _ = project_points(matrix, transform_points(carrier, transform_points(body.mark, body.points)))
+    moved_px = float(np.sqrt(((here - there) ** 2).sum(axis=-1).mean()))
+    body.farthest_px = max(body.farthest_px, moved_px)
+    if body.farthest_px > STILL_PX:
+        body.still = False
+    if (t_ns - body.mark_ns) * 1e-9 >= STILL_S:
+        body.still = body.farthest_px <= STILL_PX
+        body.mark[:], body.mark_ns, body.farthest_px = body.displacement, t_ns, 0.0
+
+
+# -- the watch -------------------------------------------------------------------------------------------------
+
+
+def beside_target(verdict: ModelDiagnosis, state: CoreState) -> ModelDiagnosis:
+    """The verdict of a round, where the target that cameras on the arm look at may have moved as it says of them."""
+    body = state.target
+    if body is None or not body.carried or body.t_ns == 0 or verdict.kind in ("ok", *OTHERS):
+        return verdict
+    return ModelDiagnosis()

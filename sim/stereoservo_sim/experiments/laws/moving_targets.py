@@ -1,0 +1,231 @@
+"""Experiment: targets that move by themselves, followed by cameras on the arm and before cameras that stand.
+
+The demo's arm in lockstep. With cameras on the arm the marker body slides or swings before them, and the goal is that
+they see it where they saw it at first; with cameras that stand the workpiece slides beside the body, and the goal is
+that the body stays beside it. Judged by the truth, which the core never sees.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
+from stereoservo.daemon.lockstep import LockstepCell
+from stereoservo.messages.cell_file import CellFile, Mount, load_cell_file
+from stereoservo.messages.goals import FeatureTarget, Goal, LawName, RunGoal
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.cells import shipped_cell_path
+from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
+from stereoservo_sim.experiments.laws.driven_tasks import labelled, picture, saved
+from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.exact_model import exact_simulated_model
+from stereoservo_sim.world.history import TrueJointHistory
+from stereoservo_sim.world.simulated_cell import SimulatedCell, hand_cell, workpiece_cell
+from stereoservo_sim.world.workpiece import Motion, Moved, MovedFile, moved_pose
+
+NOISE_PX, RATE_HZ = 0.1, 30.0
+GAIN = 2.0
+LAWS: tuple[LawName, ...] = ("stereo", "cartesian3")
+MOTIONS: dict[str, tuple[float, float, float]] = {
+    "5 mm/s": (0.005, 0.0, 0.0), "20 mm/s": (0.02, 0.0, 0.0), "50 mm/s": (0.05, 0.0, 0.0),
+    "±20 mm at 0.5 Hz": (0.0, 0.02, 0.5),
+}  # fmt: skip
+"""By name: speed [m/s], amplitude [m], frequency [Hz]."""
+REST_S, SETTLE_S, JUDGED_S = 1.0, 2.0, 2.0
+"""The target stands; then it moves: until the error is judged, and for so long."""
+STEADY_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How a moving target was followed: largest and rms distance [px] of a marker from its goal, over cameras, markers
+    and time; the ``verdicts`` that the watch over the model gave, and why the goal ended, '' where it did not.
+    """
+
+    largest_px: float
+    rms_px: float
+    verdicts: tuple[str, ...]
+    ended: str
+
+
+def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """Every mount, law and motion with ``seeds`` seeds from ``seed`` on; the JSON object of the command."""
+    rows: list[dict[str, Any]] = []
+    mounts: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
+    conditions = [(mount, law, name, True) for mount in mounts for law in LAWS for name in MOTIONS]
+    conditions += [("eye_in_hand", "stereo", name, False) for name in MOTIONS]
+    for k, (mount, law, name, follows) in enumerate(conditions):
+        flown = []
+        for s in range(seeds):
+            progress("conditions and seeds", k * seeds + s, len(conditions) * seeds)
+            flown.append(follow(mount, law, name, seed + s, follows=follows))
+        steady = sum(one.largest_px <= STEADY_PX and not one.ended for one in flown)
+        rows.append(
+            {
+                "cameras": "on the arm" if mount == "eye_in_hand" else "standing",
+                "law": law,
+                "target": name,
+                "followed": follows,
+                "rms_px": float(np.sqrt(np.mean([one.rms_px**2 for one in flown]))),
+                "largest_px": max(one.largest_px for one in flown),
+                "within_1_px": f"{steady} of {seeds}",
+                "verdicts": ", ".join(sorted({verdict for one in flown for verdict in one.verdicts})),
+            }
+        )
+    return {
+        "experiment": "moving-targets",
+        "rows": rows,
+        "seed": seed,
+        "seeds": seeds,
+        "assumptions": [
+            f"exact model, {NOISE_PX:g} px noise a marker, cameras at {RATE_HZ:g} Hz, loop at 250 Hz, gain {GAIN:g}/s",
+            f"errors are judged from {SETTLE_S:g} s after the target sets out, for {JUDGED_S:g} s, over all markers in "
+            "both cameras, by the truth",
+            "followed: with follow_markers; else as a goal that stands",
+        ],
+    }
+
+
+def cell_of(mount: Mount) -> CellFile:
+    """A shipped cell with fakes for arm and cameras."""
+    cell = load_cell_file(shipped_cell_path("eye_in_hand" if mount == "eye_in_hand" else "workpiece"))
+    options: dict[str, Any] = {"noise_px": NOISE_PX, "rate_hz": RATE_HZ}
+    if mount == "eye_to_hand":
+        options["workpiece"] = True
+    cameras = tuple(
+        msgspec.structs.replace(camera, driver="fake", detector=None, detector_options={}, options=options)
+        for camera in cell.camera
+    )
+    return msgspec.structs.replace(
+        cell, camera=cameras, joints=msgspec.structs.replace(cell.joints, driver="fake", options={})
+    )
+
+
+def motion_of(name: str, direction: FloatArray, since_ns: int) -> Motion:
+    """One of `MOTIONS` along a unit vector (3,) in the world."""
+    speed, amplitude, hz = MOTIONS[name]
+    v, a = (speed * direction).tolist(), (amplitude * direction).tolist()
+    return Motion(velocity_m_s=(v[0], v[1], v[2]), swing_m=(a[0], a[1], a[2]), swing_hz=hz, since_ns=since_ns)
+
+
+def direction_of(cell: SimulatedCell, seed: int) -> FloatArray:
+    """A direction (3,) in the world: to the right in the images, and less so up or down, nearer or farther."""
+    camera_to_world = np.linalg.inv(cell.rig.world_to_rig)[:3, :3]
+    if cell.stand is not None:
+        camera_to_world = cell.flange(cell.base)[:3, :3] @ camera_to_world
+    up, far = np.random.default_rng([seed, 19]).uniform(-0.4, 0.4, 2)
+    found: FloatArray = camera_to_world @ np.array([1.0, up, far]) / np.sqrt(1.0 + up * up + far * far)
+    return found
+
+
+def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -> Followed:
+    """Follow a target that moves in one way; deterministic given the seed."""
+    world = hand_cell() if mount == "eye_in_hand" else workpiece_cell()
+    history = TrueJointHistory.in_memory(len(world.base), capacity=1 << 14)
+    seen: list[tuple[int, FloatArray]] = []
+    verdicts: set[str] = set()
+
+    def watch(inputs: StepInputs, outputs: StepOutputs) -> None:
+        newest = history.newest()
+        if newest is not None:
+            seen.append((newest[0], newest[1].copy()))
+        verdicts.update(e.name for e in outputs.events if e.kind == "health" and e.name != "ok")
+
+    with (
+        tempfile.TemporaryDirectory(prefix="stereoservo-moving-") as scratch,
+        LockstepCell(
+            cell_of(mount), cell_dir=Path(scratch), runtime_dir=Path(scratch), seed=seed,
+            services={"world": history}, on_step=watch,
+        ) as cell,
+    ):  # fmt: skip
+        cell.run_for(0.5)
+        LockstepOperator(cell, seed=seed).enable()
+        cell.update_model(ModelUpdate(exact_simulated_model(world, seed)))
+        cell.run_for(0.5)
+        goal = _goal(world, law, follows)
+        cell.submit(RunGoal(goal))
+        cell.run_for(REST_S)
+        since_ns = cell.clock.now_ns()
+        motion = motion_of(name, direction_of(world, seed), since_ns)
+        MovedFile(Path(scratch)).write(motion)
+        cell.run_for(SETTLE_S + JUDGED_S)
+        ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
+    judged = [(t, q) for t, q in seen if t >= since_ns + round(SETTLE_S * 1e9)]
+    errors = np.array([_errors(world, motion.at(t), q) for t, q in judged[::3]])
+    return Followed(
+        float(errors.max()), float(np.sqrt((errors**2).mean())), tuple(sorted(verdicts)),
+        "; ".join(reason.code for event in ends for reason in event.reasons),
+    )  # fmt: skip
+
+
+def _goal(world: SimulatedCell, law: LawName, follows: bool) -> Goal:
+    """What is seen now, relative to the target where it is now."""
+    named = partial(_named, decimals=6)
+    target = FeatureTarget(
+        {camera: named(world.body.ids, pixels) for camera, pixels in world.truth_pixels(world.base).items()}
+    )
+    goal = Goal(
+        "0000abcd", target, law=law, gain=GAIN, tolerance_px=0.06 if follows else 0.001, time_limit_s=600.0
+    )
+    if not follows:
+        return goal
+    part = world.workpiece
+    if part is None:
+        return msgspec.structs.replace(goal, follow_markers=tuple(int(i) for i in world.body.ids))
+    positions = part.marker_positions(part.stand)
+    seen = {
+        camera.name: named(part.body.ids, world.in_world(camera, world.base).image_of(positions)[0])
+        for camera in world.rig.cameras
+    }
+    return msgspec.structs.replace(
+        goal, follow_markers=tuple(int(i) for i in part.body.ids), follow_seen=seen
+    )
+
+
+def _named(ids: Any, pixels: FloatArray, decimals: int) -> dict[int, tuple[float, float]]:
+    return {
+        int(i): (round(float(u), decimals), round(float(v), decimals))
+        for i, (u, v) in zip(ids, pixels, strict=True)
+    }
+
+
+def _errors(world: SimulatedCell, moved: Moved, q: FloatArray) -> FloatArray:
+    """Distances (c, m) [px] of the body's markers from where the goal has them, with the arm at ``q`` (n,)."""
+    here = world
+    if world.stand is not None:
+        here = SimulatedCell(world.robot, world.body, world.rig, world.base, moved_pose(world.stand, moved))
+    found = []
+    for camera in world.rig.cameras:
+        wanted = world.marker_positions(world.base)
+        if world.stand is None:  # translations alone
+            wanted = wanted + moved.matrix[:3, 3]
+        goal = world.in_world(camera, world.base).image_of(wanted)[0]
+        seen = here.in_world(camera, q).image_of(here.marker_positions(q))[0]
+        found.append(np.linalg.norm(seen - goal, axis=-1))
+    return np.array(found)
+
+
+def draw_moving_targets(answer: dict[str, Any], folder: Path) -> list[Path]:
+    """Largest errors, a bar a condition. Raises OSError."""
+    figure = picture(9, 4)
+    axis = figure.subplots(1, 1)
+    rows = answer["rows"]
+    axis.bar(range(len(rows)), [row["largest_px"] for row in rows])
+    axis.set_xticks(
+        range(len(rows)),
+        [
+            "\n".join((row["cameras"], row["law"], row["target"], "" if row["followed"] else "not followed"))
+            for row in rows
+        ],
+        fontsize=5, rotation=60,
+    )  # fmt: skip
+    axis.set_yscale("log")
+    labelled(axis, "largest error while the target moves", "", "[px]")
+    return [saved(figure, folder, "moving-targets")]

@@ -1,0 +1,233 @@
+"""Targets that move by themselves before cameras on the arm: followed within a pixel, with the right causes named, and
+carried through drop-outs. The truth is Euclidean, conjugated into a random projective frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from core.conftest import BASE, flange_at
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.state_encoding import decode_state, encode_state
+from stereoservo.core.target.motion import (
+    ACCELERATION_S,
+    after,
+    displaced,
+    elapse,
+    fold_frame,
+    pixel_rates,
+    scaled_basis,
+    solve_into,
+)
+from stereoservo.kinematics.kernels import image_jacobian, project_points, transform_points
+from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
+
+NOISE_PX = 0.1
+MARKERS = tuple(range(8))
+
+
+def slide(bench: Any, way: Callable[[float], np.ndarray]) -> None:
+    """The body before the cameras goes along ``way`` (3,) [m] in the world, by the seconds from now."""
+    begin_ns, markers = bench.now_ns, bench.truth.markers
+
+    def points(q: np.ndarray) -> np.ndarray:
+        D = np.eye(4)
+        D[:3, 3] = way((bench.now_ns - begin_ns) * 1e-9)
+        return (np.linalg.inv(flange_at(q)) @ D @ flange_at(BASE) @ markers.T).T[:, :3]
+
+    bench.truth.points = points
+
+
+def following(benches: Any, seed: int, *, follows: bool = True) -> tuple[Any, np.ndarray]:
+    """A bench whose arm holds what its cameras see, and the pixels of that."""
+    bench = benches(seed, noise_px=NOISE_PX, mount="eye_in_hand").ready()
+    wanted = bench.truth.pixels(bench.q)
+    goal = Goal(
+        "00000001", FeatureTarget(bench.features(bench.q)), law="stereo", gain=2.0, tolerance_px=0.1,
+        time_limit_s=60.0, follow_markers=MARKERS if follows else (),
+    )  # fmt: skip
+    slide(bench, lambda t: 1e-6 * np.ones(3) * min(t, 1.0))
+    assert bench.reply(RunGoal(goal)).accepted
+    return bench, wanted
+
+
+def largest_px(bench: Any, wanted: np.ndarray, seconds: float) -> float:
+    """Largest distance of a marker from its goal over time."""
+    errors = []
+    for _ in range(round(seconds * bench.settings.rate_hz)):
+        bench.step()
+        errors.append(np.linalg.norm(bench.truth.pixels(bench.q) - wanted, axis=-1).max())
+    return float(max(errors))
+
+
+def verdicts(bench: Any) -> set[str]:
+    return {event.name for event in bench.events if event.kind == "health" and event.name != "ok"}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_target_that_slides_is_followed_and_no_other_cause_is_named(benches: Any, seed: int) -> None:
+    bench, wanted = following(benches, seed)
+    bench.run(0.4)
+    direction = np.random.default_rng([seed, 19]).standard_normal(3)
+    slide(bench, lambda t: 0.05 * t * direction / np.linalg.norm(direction))
+    bench.run(2.0)
+    assert largest_px(bench, wanted, 1.0) < 1.5
+    assert verdicts(bench) == set()
+    assert bench.core.state.source.goal.id == "00000001"  # it goes on as long as the target does
+
+
+def test_without_its_name_the_same_target_is_lost(benches: Any) -> None:
+    bench, wanted = following(benches, 0, follows=False)
+    slide(bench, lambda t: 0.05 * t * np.array([0.0, 1.0, 0.0]))
+    bench.run(1.0)
+    assert largest_px(bench, wanted, 0.5) > 5.0
+
+
+def test_it_is_carried_through_a_drop_out(benches: Any) -> None:
+    bench, wanted = following(benches, 2)
+    slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))
+    bench.run(2.0)
+    bench.cameras_on = [False, False]
+    assert largest_px(bench, wanted, 0.3) < 3.0
+    bench.cameras_on = [True, True]
+    bench.run(0.5)
+    assert largest_px(bench, wanted, 0.5) < 1.5
+    assert verdicts(bench) == set()
+
+
+def test_a_camera_that_is_bumped_while_the_target_slides_is_named(benches: Any) -> None:
+    bench, _ = following(benches, 3)
+    slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))
+    bench.run(1.5)
+    angle = np.radians(1.5)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    K = np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]])
+    bench.truth.cameras[1] = K @ turn @ np.linalg.inv(K) @ bench.truth.cameras[1]
+    found = bench.until(lambda e: e.kind == "health" and e.name != "ok", 1.0)
+    assert (found.name, found.cameras) == ("camera_moved", ("right",))
+
+
+def test_a_joint_whose_zero_jumps_while_the_target_slides_is_named(benches: Any) -> None:
+    bench, _ = following(benches, 4)
+    slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))
+    bench.run(1.5)
+    bench.zero_offset = bench.zero_offset + np.array([0, 0, 0, 0, 0.03, 0])
+    found = bench.until(lambda e: e.kind == "health" and e.name != "ok", 1.0)
+    assert found.name == "joint_zero"
+    assert found.reasons[0].subject == "j5"
+
+
+def test_its_state_survives_serialisation_bit_for_bit(benches: Any) -> None:
+    bench, _ = following(benches, 5)
+    slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))
+    bench.run(0.8)
+    twin = ServoCore(bench.settings, decode_state(encode_state(bench.core.state)))
+    start = len(bench.log)
+    bench.run(0.5)
+    for inputs, outputs in bench.log[start:]:
+        assert twin.step(inputs).command.tobytes() == outputs.command.tobytes()
+    assert encode_state(twin.state) == encode_state(bench.core.state)
+
+
+def test_a_goal_that_cannot_follow_is_refused_with_its_cause(benches: Any) -> None:
+    bench = benches(0, mount="eye_in_hand").ready()
+    target = FeatureTarget(bench.features(bench.q))
+    reply = bench.reply(RunGoal(Goal("00000001", target, follow_markers=(77,))))
+    assert (reply.accepted, reply.reasons[0].code) == (False, "NO_SUCH_MARKER")
+    reply = bench.reply(RunGoal(Goal("00000002", target, law="trajectory", follow_markers=MARKERS)))
+    assert (reply.accepted, reply.reasons[0].code) == (False, "LAW_CANNOT_FOLLOW")
+    standing = benches(0).ready()
+    target = FeatureTarget(standing.features(standing.q))
+    reply = standing.reply(RunGoal(Goal("00000003", target, follow_markers=(1, 20, 21, 22, 23))))
+    assert (reply.accepted, reply.reasons[0].subject) == (False, "1")
+
+
+# -- the filter's arithmetic -----------------------------------------------------------------------------------
+
+
+def scene(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Twists (6, 4, 4) of a metric frame conjugated into a random one, cameras (2, 3, 4), points (8, 4), a carrier."""
+    rng = np.random.default_rng(seed)
+    H = np.eye(4) + 0.2 * rng.standard_normal((4, 4))
+    twists = np.zeros((6, 4, 4))
+    for k in range(3):
+        twists[k, k, 3] = 1.0
+        i, j = (k + 1) % 3, (k + 2) % 3
+        twists[3 + k, j, i], twists[3 + k, i, j] = 1.0, -1.0
+    K = np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]])
+    cameras = np.array([K @ np.column_stack([np.eye(3), [s, 0.0, 1.0]]) for s in (-0.1, 0.1)])
+    points = np.column_stack([rng.uniform(-0.1, 0.1, (8, 3)), np.ones(8)])
+    back = np.linalg.inv(H)
+    return (
+        back @ twists @ H,
+        np.ascontiguousarray(cameras @ H),
+        np.ascontiguousarray(points @ back.T),
+        np.eye(4),
+    )
+
+
+def test_the_scaled_basis_moves_the_markers_by_a_pixel_each_way() -> None:
+    basis, cameras, points, carrier = scene(0)
+    scaled, drift, good = scaled_basis(basis, cameras, carrier, points)
+    J = image_jacobian(scaled, cameras, points).reshape(-1, 6)
+    assert good
+    np.testing.assert_allclose(J.T @ J / len(J), np.eye(6), atol=1e-8)
+    whitening = np.linalg.lstsq(scaled.reshape(6, 16).T, basis.reshape(6, 16).T, rcond=None)[0]
+    np.testing.assert_allclose(
+        drift, 6.0 * whitening @ whitening.T / np.trace(whitening @ whitening.T), atol=1e-8
+    )
+
+
+def test_a_frame_is_folded_as_a_kalman_filter_does() -> None:
+    rng = np.random.default_rng(1)
+    basis = scene(1)[0]
+    root = rng.standard_normal((18, 18))
+    P = root @ root.T + np.eye(18)
+    J, left, variances = rng.standard_normal((8, 2, 6)), rng.standard_normal((8, 2)), rng.uniform(0.5, 2.0, 8)
+    used = np.array([1.0] * 6 + [0.0, 1.0])
+    H = np.zeros((14, 18))
+    H[:, :6] = J[used > 0].reshape(-1, 6)
+    S = H @ P @ H.T + np.diag(np.repeat(variances[used > 0], 2))
+    gain = P @ H.T @ np.linalg.inv(S)
+    step = gain @ left[used > 0].reshape(-1)
+    D, twist, rate, covariance = np.eye(4), np.zeros(6), np.zeros(6), P.copy()
+    fold_frame(D, basis, twist, rate, covariance, left, J, variances, used)
+    np.testing.assert_allclose(covariance, P - gain @ H @ P, atol=1e-8)
+    np.testing.assert_allclose(np.concatenate([twist, rate]), step[6:], atol=1e-8)
+    np.testing.assert_allclose(D, displaced(np.eye(4), basis, step[:6]), atol=1e-9)
+
+
+def test_time_passes_in_two_steps_as_in_one_for_the_known_part() -> None:
+    basis = scene(2)[0]
+    rng = np.random.default_rng(2)
+    P = np.zeros((18, 18))
+    drift = np.eye(6)
+    twist, rate = 0.01 * rng.standard_normal(6), 0.0 * rng.standard_normal(6)
+    one, two = [np.eye(4), twist.copy(), rate.copy()], [np.eye(4), twist.copy(), rate.copy()]
+    elapse(one[0], basis, drift, one[1], one[2], P.copy(), 0.2)
+    for _ in range(2):
+        elapse(two[0], basis, drift, two[1], two[2], P.copy(), 0.1)
+    np.testing.assert_allclose(one[0], two[0], atol=1e-12)
+    _, later = after(np.eye(4), basis, np.zeros(6), np.ones(6), 0.3)
+    np.testing.assert_allclose(later, ACCELERATION_S * (1.0 - np.exp(-0.3 / ACCELERATION_S)), atol=1e-12)
+
+
+def test_pixel_rates_are_those_of_finite_differences() -> None:
+    basis, cameras, points, carrier = scene(3)
+    twist, dt = np.random.default_rng(3).standard_normal(6), 1e-6
+    here, _ = project_points(cameras, points)
+    there, _ = project_points(cameras, transform_points(displaced(np.eye(4), basis, dt * twist), points))
+    rates = pixel_rates(basis, twist, cameras, carrier, points)
+    np.testing.assert_allclose(rates, (there - here) / dt, rtol=1e-3, atol=1e-2)
+
+
+def test_linear_equations_are_solved() -> None:
+    rng = np.random.default_rng(4)
+    A, B = rng.standard_normal((6, 6)), rng.standard_normal((6, 3))
+    X = B.copy()
+    solve_into(A.copy(), X)
+    np.testing.assert_allclose(X, np.linalg.solve(A, B), atol=1e-9)
