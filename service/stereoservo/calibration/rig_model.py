@@ -9,6 +9,7 @@ where the data determine the model.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -65,6 +66,17 @@ class LensPriors:
 
     mean: FloatArray
     information: FloatArray
+
+
+@dataclass(frozen=True)
+class PinholeTies:
+    """Standard deviations [px] of what ties cameras to their lenses and to a pinhole's form, of each camera: ``skew``,
+    ``aspect`` (of fx - fy) and ``centre`` (of the lens centre about the principal point); infinite where it is free.
+    """
+
+    skew: float
+    aspect: float
+    centre: float
 
 
 @dataclass(frozen=True)
@@ -136,7 +148,8 @@ class Measurements:
     """Raw pixels in a flat list: camera, stop and marker of each (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px].
 
     ``offsets`` (s, n): joint positions of each stop minus the zero, ``joint_errors`` included. ``lens_priors`` count as
-    measurements of those lenses that are free. ``joint_noise``: of the readings; None where they are exact.
+    measurements of those lenses that are free, ``pinhole_ties`` of a metric rig's cameras that are free.
+    ``joint_noise``: of the readings; None where they are exact.
     """
 
     offsets: FloatArray
@@ -148,6 +161,7 @@ class Measurements:
     lens_priors: LensPriors | None = None
     joint_noise: JointNoise | None = None
     joint_errors: JointErrors | None = None
+    pinhole_ties: PinholeTies | None = None
 
     @property
     def corrections(self) -> FloatArray:
@@ -218,13 +232,22 @@ class Charts:
 
 
 def full_charts(
-    rig: RigModel, stratum: Stratum, *, cameras: bool = True, points: bool = True, lenses: LensModel = "none"
+    rig: RigModel,
+    stratum: Stratum,
+    *,
+    generators: bool = True,
+    cameras: bool = True,
+    points: bool = True,
+    lenses: LensModel = "none",
 ) -> Charts:
-    """Minimal charts around ``rig``; cameras or points may be kept fixed, ``lenses`` selects their free parameters.
+    """Minimal charts around ``rig``; generators, cameras or points may be kept fixed, ``lenses`` selects their free
+    parameters.
 
     With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
-    loses the remaining gauge, further ones are free.
+    loses the remaining gauge, further ones are free. Where neither generators nor points are free, lengths are known:
+    no gauge remains, and the second camera is free, too.
     """
+    gauge: Literal["right", "other"] = "right" if generators or points else "other"
     none = np.zeros((0, 3, 4))
     matrices: tuple[FloatArray, ...] = tuple(none for _ in rig.cameras)
     if cameras:
@@ -232,12 +255,15 @@ def full_charts(
         matrices = (
             left,
             *(
-                camera_basis(matrix, "right" if c == 0 else "other", stratum)
+                camera_basis(matrix, gauge if c == 0 else "other", stratum)
                 for c, matrix in enumerate(rig.cameras[1:])
             ),
         )
     return Charts(
-        tuple(generator_basis(h, kind, stratum) for h, kind in zip(rig.generators, rig.kinds, strict=True)),
+        tuple(
+            generator_basis(h, kind, stratum) if generators else np.zeros((0, 4, 4))
+            for h, kind in zip(rig.generators, rig.kinds, strict=True)
+        ),
         matrices,
         tuple(lens_basis(lenses) for _ in rig.lenses),
         tuple(point_bases(rig.points, stratum) if points else np.zeros((len(rig.points), 0, 4))),
