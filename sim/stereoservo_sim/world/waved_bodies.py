@@ -5,7 +5,9 @@ cameras. Projected by Brown's model as OpenCV states it, written apart from the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -147,3 +149,57 @@ def _views(rng, cameras, places, sigma, body, known, turn, place) -> WavedRig:  
         tuple(f"{s}" for s in range(places)), pixels, np.full(pixels.shape[:3], sigma), body if known else None,
     )  # fmt: skip
     return WavedRig(K, d, T, body, views)
+
+
+def rendered_pictures(seed: int, folder: Path, *, places: int = 12, noise: float = 2.0) -> WavedRig:
+    """Write pictures of a board that is waved before two cameras, ``folder``/left/00.png and so on, and return the truth.
+
+    Pixels are means of 2x2 samples of the board's squares, with ``noise`` [grey levels].
+    """
+    rig = waved(seed, places=places, sigma=0.0)
+    rng = np.random.default_rng(seed)
+    for c, name in enumerate(("left", "right")):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        ideal = _ideal_samples(rig.K[c], rig.distortion[c])
+        for s in range(places):
+            plane = _plane_of(rig, c, s)
+            levels = _squares(ideal @ np.linalg.inv(plane).T).reshape(SIZE[1], 2, SIZE[0], 2).mean(axis=(1, 3))
+            image = np.clip(np.round(levels + noise * rng.normal(size=levels.shape)), 0, 255).astype(np.uint8)
+            cv2.imwrite(str(folder / name / f"{s:02d}.png"), image)
+    return rig
+
+
+def _ideal_samples(K: FloatArray, d: FloatArray) -> FloatArray:
+    """Normalised rays (n, 3) of 2x2 samples a pixel, row by row."""
+    half = np.array([-0.25, 0.25])
+    u = (np.arange(SIZE[0])[:, None] + half).ravel()
+    v = (np.arange(SIZE[1])[:, None] + half).ravel()
+    return _rays(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2), K, d)
+
+
+def _rays(pixels: FloatArray, K: FloatArray, d: FloatArray) -> FloatArray:
+    """Normalised rays (n, 3) of distorted pixels (n, 2): `project` inverted by fixed-point iteration."""
+    seen = np.column_stack([(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1]])
+    found = seen.copy()
+    for _ in range(40):
+        there = project(np.column_stack([found, np.ones(len(found))]), np.eye(3), d)
+        found = found + (seen - there)
+    return np.column_stack([found, np.ones(len(found))])
+
+
+def _plane_of(rig: WavedRig, c: int, s: int) -> FloatArray:
+    """Homography (3, 3) from the board's coordinates [pitches] to normalised rays, of its corners as they were seen."""
+    seen = np.isfinite(rig.views.pixels[c, s]).all(axis=1)
+    rays = _rays(rig.views.pixels[c, s, seen], rig.K[c], rig.distortion[c])
+    H, _ = cv2.findHomography(rig.body[seen, :2] / PITCH, rays[:, :2])
+    return np.asarray(H)
+
+
+def _squares(points: FloatArray) -> FloatArray:
+    """Grey levels (n,) of homogeneous points of the board's plane [pitches]: white paper with 10x7 squares."""
+    front = points[:, 2] > 0.0
+    x, y = (points[:, :2] / np.where(front, points[:, 2], 1.0)[:, None]).T
+    on_squares = (x > -1.0) & (x < BOARD[0]) & (y > -1.0) & (y < BOARD[1])
+    on_paper = (x > -2.0) & (x < BOARD[0] + 1.0) & (y > -2.0) & (y < BOARD[1] + 1.0) & front
+    dark = (np.floor(x).astype(np.int64) + np.floor(y).astype(np.int64)) % 2 == 0
+    return np.where(on_paper, np.where(on_squares & dark, 35.0, 215.0), 120.0)

@@ -132,7 +132,9 @@ def _line_lens(views: RigViews, k: int) -> FloatArray:
     if lines:
         sigma = float(np.median(views.sigmas[k][views.seen[k]]))
         try:
-            return lens_from_lines(lines, sigma, camera.width, camera.height).lens
+            found = lens_from_lines(lines, sigma, camera.width, camera.height).lens
+            # Lines hardly show the centre of a weak distortion, and the principal point goes with it.
+            return np.append(found[0], straight_lens(camera.width, camera.height)[1:])
         except GeometryError:
             pass  # the bundle finds the lens from a straight one, too
     return straight_lens(camera.width, camera.height)

@@ -24,6 +24,7 @@ from stereoservo.calibration.rig_model import (
     RigModel,
     displacements,
     predicted,
+    residuals,
     rig_at,
 )
 from stereoservo.geometry.strata import decompose_camera
@@ -41,6 +42,7 @@ OUTLIER = 5.0
 """Residual, in estimated standard deviations of the noise, beyond which a measurement is left out."""
 ROUNDS = 3
 EVALUATIONS = 150
+POSE_STEPS = 30
 FRAMES = 60
 """Frames of the body among which the one is taken in which its middle angle stays farthest from a quarter turn."""
 
@@ -130,6 +132,8 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     data, body_frame = _measurements(views, start)
     fit = RigFit(views, None, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, start.reference is None)
     rig = _rig(start, body_frame)
+    if start.reference is None:
+        fit = replace(fit, data=_with_poses_settled(rig, data))
     if start.reference is not None:
         fit = _settled(fit, rig, lenses, PinholeTies(LOOSE, LOOSE, LOOSE))
         rig = fit.rig
@@ -192,6 +196,41 @@ def _settled(begun: RigFit, rig: RigModel, lenses: LensModel, ties: PinholeTies)
             "The data leave the cameras open, or views are wrong: wave the body also tilted, near and far",
         )  # fmt: skip
     return fit
+
+
+def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
+    """The measurements with the hand's readings at the least residuals of each stop, cameras and body as they are:
+    Levenberg-Marquardt of each stop on its own, for the bundle does not damp the hand's errors.
+    """
+    s = len(data.offsets)
+    damping = np.full(s, 1e-3)
+
+    def squares(error: FloatArray) -> FloatArray:
+        found = np.bincount(data.stop, (error.reshape(-1, 2) ** 2).sum(axis=1), s)
+        return np.where(np.isfinite(found), found, np.inf)
+
+    error = residuals(rig, data)
+    cost = squares(error)
+    for _ in range(POSE_STEPS):
+        J = joint_columns(rig, data)
+        stop = np.repeat(data.stop, 2)
+        normal, gradient = np.zeros((s, 6, 6)), np.zeros((s, 6))
+        np.add.at(normal, stop, J[:, :, None] * J[:, None, :])
+        np.add.at(gradient, stop, J * error[:, None])
+        scale = np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-12)
+        damped = normal + np.eye(6) * (damping[:, None] * scale)[:, None, :]
+        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        trial = replace(data, offsets=data.offsets - step)
+        there = residuals(rig, trial)
+        found = squares(there)
+        better = found < cost
+        done = cost - found <= 1e-6 * cost
+        data = replace(data, offsets=np.where(better[:, None], trial.offsets, data.offsets))
+        error = np.where(better[stop], there, error)
+        cost, damping = np.where(better, found, cost), damping * np.where(better, 0.1, 10.0)
+        if done.all():
+            break
+    return data
 
 
 def _rig(start: RigStart, body_frame: FloatArray) -> RigModel:
