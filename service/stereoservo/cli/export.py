@@ -55,7 +55,8 @@ def export(
         ),
     ] = None,
     opencv: Annotated[
-        Path | None, typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write.")
+        Path | None,
+        typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write."),
     ] = None,
     ros: Annotated[
         Path | None,
@@ -84,7 +85,9 @@ def export(
         _export_flight(file, output if output is not None else file.with_suffix(".foxglove.mcap"), json)
 
 
-def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: Path | None, json: bool) -> None:
+def _export_cameras(
+    file: Path, opencv: Path | None, ros: Path | None, kalibr: Path | None, json: bool
+) -> None:
     from stereoservo.calibration.camera_rig import exchange  # OpenCV and YAML: for this alone
     from stereoservo.calibration.camera_rig.rig_calibration import load_rig
 
@@ -106,7 +109,11 @@ def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: P
         exchange.save_kalibr(cameras, kalibr)
         written.append(str(kalibr))
     names = [camera.name for camera in cameras]
-    emit({"written": written, "cameras": names, "unit": unit}, f"{', '.join(names)}: {', '.join(written)}", json)
+    emit(
+        {"written": written, "cameras": names, "unit": unit},
+        f"{', '.join(names)}: {', '.join(written)}",
+        json,
+    )
 
 
 def _export_flight(file: Path, target: Path, json: bool) -> None:

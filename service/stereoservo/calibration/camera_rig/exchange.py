@@ -64,7 +64,9 @@ def load_opencv(path: Path) -> tuple[RigCamera, ...]:
         return None
 
     def number(name: str, k: int) -> int:
-        node = next((n for n in (storage.getNode(f"{name}{k}"), storage.getNode(name)) if not n.empty()), None)
+        node = next(
+            (n for n in (storage.getNode(f"{name}{k}"), storage.getNode(name)) if not n.empty()), None
+        )
         return 0 if node is None else int(node.real())
 
     if (single := matrix("camera_matrix")) is not None:
@@ -126,7 +128,12 @@ def load_ros(paths: Sequence[Path]) -> tuple[RigCamera, ...]:
             raise _bad(path, f"distortion model {tree['distortion_model']!r}; plumb_bob is valid")
         K, D, R1, P = (
             _numbers(path, tree, key)
-            for key in ("camera_matrix", "distortion_coefficients", "rectification_matrix", "projection_matrix")
+            for key in (
+                "camera_matrix",
+                "distortion_coefficients",
+                "rectification_matrix",
+                "projection_matrix",
+            )
         )
         R1, P = R1.reshape(3, 3), P.reshape(3, 4)
         R, t = None, None
@@ -148,7 +155,8 @@ def save_kalibr(cameras: Sequence[RigCamera], path: Path) -> None:
     for k, camera in enumerate(cameras):
         if any(camera.distortion[4:]):
             raise CalibrationError(
-                "bad_file", f"camera {camera.name!r} has a third radial term; Kalibr's radtan has k1, k2, p1, p2"
+                "bad_file",
+                f"camera {camera.name!r} has a third radial term; Kalibr's radtan has k1, k2, p1, p2",
             )
         others = [n for n in range(len(cameras)) if n != k]
         one: dict[str, Any] = {
@@ -273,12 +281,18 @@ def _camera(
     if len(distortion) > 5 and any(distortion[5:]):
         raise _bad(path, f"camera {name!r} has {len(distortion)} coefficients; k1, k2, p1, p2, k3 are valid")
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 1] != 0.0:
-        raise _bad(path, f"camera {name!r}: a finite camera matrix (3, 3) without skew is needed, got {K.tolist()}")
+        raise _bad(
+            path, f"camera {name!r}: a finite camera matrix (3, 3) without skew is needed, got {K.tolist()}"
+        )
     R = np.eye(3) if R is None else R
     if not np.abs(R.T @ R - np.eye(3)).max() < ROTATION or np.linalg.det(R) < 0:
         raise _bad(path, f"camera {name!r}: {R.tolist()} is no rotation")
     shift = (0.0, 0.0, 0.0) if t is None else tuple(t.ravel().tolist())
-    kept = distortion[:5] if len(distortion) >= 5 and distortion[4] != 0.0 else [*distortion, 0.0, 0.0, 0.0, 0.0][:4]
+    kept = (
+        distortion[:5]
+        if len(distortion) >= 5 and distortion[4] != 0.0
+        else [*distortion, 0.0, 0.0, 0.0, 0.0][:4]
+    )
     return RigCamera(
         name, *size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])), tuple(kept),
         tuple(map(tuple, R.tolist())), shift,

@@ -85,9 +85,7 @@ def _start_of_layout(views: RigViews) -> RigStart:
     counts = views.seen.sum(axis=2)
     best = np.argmax(counts, axis=0)
     body = np.array([np.linalg.inv(extrinsics[best[i]]) @ poses[best[i], i] for i in range(s)])
-    cameras = np.array(
-        [_pinhole(focals[k], lenses[k, 1:3]) @ extrinsics[k][:3] for k in range(c)]
-    )
+    cameras = np.array([_pinhole(focals[k], lenses[k, 1:3]) @ extrinsics[k][:3] for k in range(c)])
     return RigStart(cameras, body, views.layout.copy(), lenses, None)
 
 
@@ -302,4 +300,6 @@ def _metric_start(
         body[new] = (X[stop, new] - poses[stop, :3, 3]) @ poses[stop, :3, :3]
     # The first camera is K [I | 0] in this frame. The others' matrices are not of square pixels yet: the bundle's ties
     # make them so from where they explain the images.
-    return RigStart(matrices / np.linalg.norm(matrices[:, 2, :3], axis=1)[:, None, None], poses, body, lenses, reference)
+    return RigStart(
+        matrices / np.linalg.norm(matrices[:, 2, :3], axis=1)[:, None, None], poses, body, lenses, reference
+    )

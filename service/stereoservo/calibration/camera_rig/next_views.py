@@ -16,8 +16,18 @@ from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import Measurements, predicted
 from stereoservo.numerics.arrays import FloatArray
 
-TILTS = (("straight on", 0.0, 0.0), ("tilted 40° about the picture's x", 40.0, 0.0), ("tilted 40° about its y", 0.0, 40.0))
-PLACES = (("middle", 0.0, 0.0), ("left", -0.3, 0.0), ("right", 0.3, 0.0), ("top", 0.0, -0.3), ("bottom", 0.0, 0.3))
+TILTS = (
+    ("straight on", 0.0, 0.0),
+    ("tilted 40° about the picture's x", 40.0, 0.0),
+    ("tilted 40° about its y", 0.0, 40.0),
+)
+PLACES = (
+    ("middle", 0.0, 0.0),
+    ("left", -0.3, 0.0),
+    ("right", 0.3, 0.0),
+    ("top", 0.0, -0.3),
+    ("bottom", 0.0, 0.3),
+)
 DISTANCES = (("near", 0.6), ("as far", 1.0))
 INSIDE = 0.9
 """Share of the markers that a view must show."""
@@ -78,7 +88,12 @@ def _focal_slope(fit: RigFit, k: int) -> FloatArray:
 
 
 def _information(
-    fit: RigFit, result: RigCalibration, k: int, place: tuple[float, float], tilt: tuple[float, float], share: float
+    fit: RigFit,
+    result: RigCalibration,
+    k: int,
+    place: tuple[float, float],
+    tilt: tuple[float, float],
+    share: float,
 ) -> FloatArray | None:
     """Information (p, p) that one more view adds, its own pose eliminated; None where it does not show the body."""
     camera = result.cameras[k]
@@ -86,7 +101,9 @@ def _information(
     depths = fit.poses[:, 2, 3]
     depth = share * float(np.median(depths))
     middle = fit.points.mean(axis=0)
-    ray = np.array([place[0] * camera.width / camera.focal[0], place[1] * camera.height / camera.focal[1], 1.0])
+    ray = np.array(
+        [place[0] * camera.width / camera.focal[0], place[1] * camera.height / camera.focal[1], 1.0]
+    )
     turn = Rotation.from_euler("xy", tilt, degrees=True).as_matrix() @ _facing(fit, k)
     scale = float(np.linalg.norm(motions[k][:3, 3]))
     shift = motions[k][:3, 3] * (1.0 if fit.length_known or not scale else _unit(fit, k) / scale)

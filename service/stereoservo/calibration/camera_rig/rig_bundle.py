@@ -130,7 +130,9 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     """
     views, start = _placed(views, start)
     data, body_frame = _measurements(views, start)
-    fit = RigFit(views, None, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, start.reference is None)
+    fit = RigFit(
+        views, None, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, start.reference is None
+    )
     rig = _rig(start, body_frame)
     if start.reference is None:
         fit = replace(fit, data=_with_poses_settled(rig, data))

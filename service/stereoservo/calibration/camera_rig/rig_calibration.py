@@ -61,7 +61,9 @@ class RigCamera(msgspec.Struct, frozen=True):
     @property
     def matrix(self) -> FloatArray:
         """``K`` (3, 3)."""
-        return np.array([[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]]
+        )
 
     @property
     def motion(self) -> FloatArray:
@@ -149,7 +151,12 @@ def _best_fit(views: RigViews, begun: list[RigStart]) -> RigFit:
 
 def _open(why: str) -> CalibrationError:
     return refused(
-        "views_degenerate", f"the views leave the cameras open ({why}): places that determine them", 0, 1, " sets", WAVE
+        "views_degenerate",
+        f"the views leave the cameras open ({why}): places that determine them",
+        0,
+        1,
+        " sets",
+        WAVE,
     )
 
 
@@ -193,9 +200,7 @@ def _require_fit(fit: RigFit) -> None:
         )  # fmt: skip
     for camera, matrix in zip(fit.views.cameras, fit.rig.cameras, strict=True):
         K = decompose_camera(matrix)[0]
-        off = max(
-            abs(K[0, 2] / camera.width - 0.5), abs(K[1, 2] / fit.aspect / camera.height - 0.5)
-        )
+        off = max(abs(K[0, 2] / camera.width - 0.5), abs(K[1, 2] / fit.aspect / camera.height - 0.5))
         if not off <= OUTSIDE:
             raise refused(
                 "no_camera", f"the principal point of {camera.name!r} lies outside its picture: from the middle", off,
@@ -214,7 +219,9 @@ def _require_determined(result: RigCalibration) -> None:
             ("pair_open", "the rotation from the first camera", turn, PAIR_DEVIATION, "°"),
         ):
             if not value <= limit:
-                raise refused(code, f"{what} of {camera.name!r} stays open: deviation", value, limit, unit, WAVE)
+                raise refused(
+                    code, f"{what} of {camera.name!r} stays open: deviation", value, limit, unit, WAVE
+                )
 
 
 # -- the result ---------------------------------------------------------------------------------------------
@@ -228,7 +235,9 @@ class _Physical(NamedTuple):
     translations: FloatArray
 
 
-def _physical(rig: RigModel, aspect: float, known: KnownDistance | None, ids: tuple[int, ...], metric: bool) -> _Physical:
+def _physical(
+    rig: RigModel, aspect: float, known: KnownDistance | None, ids: tuple[int, ...], metric: bool
+) -> _Physical:
     intrinsics, rotations, translations = [], [], []
     for matrix, lens in zip(rig.cameras, rig.lenses, strict=True):
         K, R, t = decompose_camera(matrix)

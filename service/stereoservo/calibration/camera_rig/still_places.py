@@ -31,9 +31,7 @@ class _Still:
     empty: bool
 
 
-def still_places(
-    cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[CameraObservation]]
-) -> RigViews:
+def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[CameraObservation]]) -> RigViews:
     """The views of a body at the places at which it was held still for ``HELD_S`` before all cameras that saw it; each
     camera's pixels are the means over that time, with the detector's standard deviations.
     """
@@ -64,7 +62,11 @@ def still_places(
     shape = (0, len(cameras), len(ids))
     stacked = np.array(pixels).reshape(-1, *shape[1:], 2).transpose(1, 0, 2, 3)
     return RigViews(
-        tuple(cameras), ids, tuple(names), stacked, np.array(sigmas).reshape(-1, *shape[1:]).transpose(1, 0, 2)
+        tuple(cameras),
+        ids,
+        tuple(names),
+        stacked,
+        np.array(sigmas).reshape(-1, *shape[1:]).transpose(1, 0, 2),
     )
 
 

@@ -73,7 +73,9 @@ def usable_views(views: RigViews) -> RigViews:
     """
     c, s, m = views.sigmas.shape
     if views.pixels.shape != (c, s, m, 2) or len(views.cameras) != c or len(views.marker_ids) != m:
-        raise CalibrationError("bad_data", f"pixels {views.pixels.shape} and sigmas {views.sigmas.shape} do not fit")
+        raise CalibrationError(
+            "bad_data", f"pixels {views.pixels.shape} and sigmas {views.sigmas.shape} do not fit"
+        )
     if not (views.sigmas[views.seen] > 0.0).all():
         raise CalibrationError("bad_data", "sigmas must be positive where there is a pixel")
     rich = views.seen.sum(axis=2) >= LEAST_MARKERS

@@ -96,7 +96,8 @@ RigOption = Annotated[
     ),
 ]
 BoardOption = Annotated[
-    str, typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6.")
+    str,
+    typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6."),
 ]
 PitchOption = Annotated[
     float | None, typer.Option("--pitch", metavar="METRES", help="With --board: distance of its corners [m].")
@@ -104,13 +105,17 @@ PitchOption = Annotated[
 LayoutOption = Annotated[
     Path | None,
     typer.Option(
-        "--layout", metavar="FILE.csv", help="With --rig: id,x,y [m] of a flat body's markers, where measured."
+        "--layout",
+        metavar="FILE.csv",
+        help="With --rig: id,x,y [m] of a flat body's markers, where measured.",
     ),
 ]
 LengthOption = Annotated[
     str,
     typer.Option(
-        "--length", metavar="ID,ID=METRES", help="With --rig: distance of two markers of a body of unknown layout."
+        "--length",
+        metavar="ID,ID=METRES",
+        help="With --rig: distance of two markers of a body of unknown layout.",
     ),
 ]
 SecondsOption = Annotated[float, typer.Option("--seconds", help="With --rig, live: how long to watch [s].")]

@@ -175,11 +175,15 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
             if image is None:
                 raise CommandError("images", f"{path} is no picture that OpenCV reads")
             if size is not None and size != image.shape:
-                raise CommandError("images", f"{path} is {image.shape[1]}x{image.shape[0]}, others {size[1]}x{size[0]}")
+                raise CommandError(
+                    "images", f"{path} is {image.shape[1]}x{image.shape[0]}, others {size[1]}x{size[0]}"
+                )
             size = image.shape
             found[key] = detector.detect(Frame(name, len(found), 0, 0, image), None)
         assert size is not None
-        note(f"camera {name}: the body in {sum(o.ids.size > 0 for o in found.values())} of {len(files)} pictures")
+        note(
+            f"camera {name}: the body in {sum(o.ids.size > 0 for o in found.values())} of {len(files)} pictures"
+        )
         cameras.append(TrialCamera(name, size[1], size[0]))
         seen[name] = found
     return _stacked(cameras, keys, seen)
@@ -238,7 +242,9 @@ def _recorded(options: RigOptions) -> RigViews:
 
     assert options.images is not None
     if not options.cell:
-        raise CommandError("argument", f"{options.images} is a recording: its cell file is needed, for the detectors")
+        raise CommandError(
+            "argument", f"{options.images} is a recording: its cell file is needed, for the detectors"
+        )
     path = Path(options.cell)
     cell = load_cell_file(path)
     cameras, seen = [], {}
@@ -268,7 +274,8 @@ def _live(options: RigOptions) -> RigViews:
     pid = holder(directories.daemon_lock)
     if pid is not None:
         raise CommandError(
-            "daemon_runs", f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording"
+            "daemon_runs",
+            f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording",
         )
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("rig"))
     note(
@@ -304,7 +311,9 @@ def poorly_known(result: RigCalibration) -> list[str]:
             found.append(f"{camera.name}.k2 to {d['k2']:.2g}: the pictures' corners are not covered")
         length = float(np.linalg.norm(camera.translation))
         if length and max(d["tx"], d["ty"], d["tz"]) > 0.005 * length:
-            found.append(f"{camera.name}'s place to {100 * max(d['tx'], d['ty'], d['tz']) / length:.2g} % of the baseline")
+            found.append(
+                f"{camera.name}'s place to {100 * max(d['tx'], d['ty'], d['tz']) / length:.2g} % of the baseline"
+            )
     return found
 
 
@@ -328,11 +337,14 @@ def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
         ]
         if "tx" in d:
             first = result.cameras[0].name
-            angle = np.degrees(np.arccos(np.clip((np.trace(np.array(camera.rotation)) - 1.0) / 2.0, -1.0, 1.0)))
+            angle = np.degrees(
+                np.arccos(np.clip((np.trace(np.array(camera.rotation)) - 1.0) / 2.0, -1.0, 1.0))
+            )
             turn = np.degrees(max(d["rx"], d["ry"], d["rz"]))
             unit = " m" if result.unit == "m" else " baselines"
             place = ", ".join(
-                f"{value:.6f} ± {d[name]:.6f}" for name, value in zip(("tx", "ty", "tz"), camera.translation, strict=True)
+                f"{value:.6f} ± {d[name]:.6f}"
+                for name, value in zip(("tx", "ty", "tz"), camera.translation, strict=True)
             )
             lines += [
                 f"    from {first}: turned by {angle:.4f}° ± {turn:.4f}°, translation {place}{unit}",
@@ -340,7 +352,8 @@ def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
     if result.unit != "m":
         lines.append("  lengths are in baselines: state one (--length ID,ID=METRES) for metres")
     worst = ", ".join(
-        f"{view.name or '(unnamed)'} {view.rms_px:.3f} px" + (f", {view.left_out} left out" if view.left_out else "")
+        f"{view.name or '(unnamed)'} {view.rms_px:.3f} px"
+        + (f", {view.left_out} left out" if view.left_out else "")
         for view in result.views[:SHOWN_VIEWS]
     )
     lines.append(f"  worst places: {worst}")
