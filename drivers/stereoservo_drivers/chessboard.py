@@ -25,7 +25,7 @@ from stereoservo_drivers.detectors.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 
 SIGMA_PX = 0.1
-"""Standard deviation of a corner, an axis [px]: of sharp pictures; what a calibration finds from its residuals counts."""
+"""Standard deviation of a corner, an axis [px]: of sharp pictures; a calibration finds its own."""
 WINDOW_SHARE = 0.4
 """Half the side of the window of the refinement, as a share of the least distance of two corners."""
 LARGEST_WINDOW = 11
@@ -40,7 +40,8 @@ class ChessboardOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 class ChessboardDetector:
-    """Detects all inner corners of one board, or none; ids row by row from the corner inside and outside which the squares are dark.
+    """Detects all inner corners of one board, or none; ids row by row, from the corner inside and outside which the
+    squares are dark.
 
     One count must be odd and the other even: else half a turn of the board looks alike. Raises DriverError: ``option``
     at construction, ``image_format`` by :meth:`detect`; content never raises.

@@ -27,11 +27,11 @@ from pathlib import Path
 import pytest
 
 from documented import PAGES, ROOT, Documented, documented, snippets
+from oracles.waved_bodies import rendered_pictures
 from stereoservo.cli import main as cli
 from stereoservo.client import Client
 from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import DaemonProcess
-from stereoservo_sim.world.waved_bodies import rendered_pictures
 
 from .conftest import CELL, eventually, recover
 

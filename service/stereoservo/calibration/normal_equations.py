@@ -343,7 +343,7 @@ def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
             out[:, mine] = np.array([slopes[2], slopes[0] - slopes[1], slopes[3], slopes[4]])
             out[2:, lens_at : lens_at + len(lens_basis)] = -centre_slopes.T
             out[:, -1] = skew, fx - fy, cu - lens[1], cv - lens[2]
-            tied = np.isfinite(sigmas) & np.array([True, True, *centre_slopes.any(axis=0)])
+            tied = np.isfinite(sigmas) & np.array([True, True, *np.asarray(centre_slopes.any(axis=0))])
             rows.append(out[tied] / sigmas[tied, None])
         camera_at += len(basis)
         lens_at += len(lens_basis)

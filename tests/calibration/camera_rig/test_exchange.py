@@ -1,5 +1,5 @@
-"""Cameras in the files of OpenCV, ROS and Kalibr: exact there and back, as cv2.FileStorage and PyYAML read them, and from
-files as those projects' documentation and samples have them.
+"""Cameras in the files of OpenCV, ROS and Kalibr: exact there and back, as cv2.FileStorage and PyYAML read them, and
+from files as those projects' documentation and samples have them.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def test_the_rectification_of_a_pair_puts_points_on_one_row(tmp_path: Path) -> N
     cameras = rig(2)
     save_ros(cameras, tmp_path)
     trees = [yaml.safe_load((tmp_path / f"{camera.name}.yaml").read_text()) for camera in cameras]
-    X = np.random.default_rng(2).normal(size=(20, 3)) + [0.0, 0.0, 8.0]
+    X = np.random.default_rng(2).normal(size=(20, 3)) + np.array([0.0, 0.0, 8.0])
     rows = []
     for tree, camera in zip(trees, cameras, strict=True):
         R, P = (
@@ -151,9 +151,8 @@ def test_the_rectification_of_a_pair_puts_points_on_one_row(tmp_path: Path) -> N
         pixel = there @ P[:, :3].T
         rows.append(pixel[:, 1] / pixel[:, 2])
         if camera is cameras[1]:
-            first = (X @ np.array(trees[0]["rectification_matrix"]["data"]).reshape(3, 3).T) @ P[:, :3].T + P[
-                :, 3
-            ]
+            R_first = np.array(trees[0]["rectification_matrix"]["data"]).reshape(3, 3)
+            first = X @ R_first.T @ P[:, :3].T + P[:, 3]
             assert np.abs(first[:, :2] / first[:, 2:] - pixel[:, :2] / pixel[:, 2:]).max() < 1e-9
     assert np.abs(rows[0] - rows[1]).max() < 1e-9
 

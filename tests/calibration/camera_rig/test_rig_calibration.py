@@ -14,6 +14,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from oracles import waved_bodies
+from oracles.waved_bodies import DEGENERATE, degenerate, rendered_pictures, waved
 from stereoservo.calibration.camera_rig.initialization import starts
 from stereoservo.calibration.camera_rig.rig_bundle import fit_rig
 from stereoservo.calibration.camera_rig.rig_calibration import (
@@ -23,14 +25,12 @@ from stereoservo.calibration.camera_rig.rig_calibration import (
     save_rig,
 )
 from stereoservo.calibration.camera_rig.still_places import still_places
-from stereoservo.calibration.camera_rig.views import usable_views
+from stereoservo.calibration.camera_rig.views import RigViews, usable_views
 from stereoservo.calibration.normal_equations import prior_rows
 from stereoservo.calibration.rig_model import rig_at
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
 from stereoservo.cli import main as cli
 from stereoservo.ports.devices import CameraObservation
-from stereoservo_sim.world import waved_bodies
-from stereoservo_sim.world.waved_bodies import DEGENERATE, degenerate, rendered_pictures, waved
 
 CAUSES = {
     "board_parallel": {"flat_motion"},
@@ -96,17 +96,24 @@ def test_good_views_are_never_refused_and_their_covariance_holds(known: bool) ->
     assert low < total / freedoms < high
 
 
+def refusal(views: RigViews) -> str:
+    """The code of the views' refusal, ``accepted`` where there is none."""
+    try:
+        calibrate_rig(views)
+    except CalibrationError as refused:
+        error = refused
+    else:
+        return "accepted"
+    assert {"cause", "value", "limit", "remedy"} <= set(error.data), error
+    return error.code
+
+
 def refusals(first: int, last: int) -> dict[str, dict[str, int]]:
     """How often each kind of degenerate views was refused for which cause; ``accepted`` where it was not."""
     found: dict[str, dict[str, int]] = {kind: {} for kind in DEGENERATE}
     for seed in range(first, last):
         kind = DEGENERATE[seed % len(DEGENERATE)]
-        try:
-            calibrate_rig(degenerate(kind, seed, sigma_of(seed)).views)
-            code = "accepted"
-        except CalibrationError as error:
-            assert {"cause", "value", "limit", "remedy"} <= set(error.data), error
-            code = error.code
+        code = refusal(degenerate(kind, seed, sigma_of(seed)).views)
         found[kind][code] = found[kind].get(code, 0) + 1
     return found
 
@@ -132,7 +139,7 @@ def test_ties_have_the_derivatives_of_their_residuals() -> None:
     data = fit.solution.data
     rows = prior_rows(fit.rig, fit.solution.charts, data)
     assert rows.shape[0] == 8
-    step = 1e-6 / np.abs(rows[:, :-1]).max(axis=0, initial=1.0)
+    step = 1e-3 / np.abs(rows[:, :-1]).max(axis=0, initial=1.0)
     for j in np.flatnonzero(np.abs(rows[:, :-1]).max(axis=0)):
         x = np.zeros(fit.solution.charts.size)
         x[j] = step[j]

@@ -178,7 +178,8 @@ def save_kalibr(cameras: Sequence[RigCamera], path: Path) -> None:
 
 def load_kalibr(path: Path) -> tuple[RigCamera, ...]:
     """Cameras of a chain. Raises CalibrationError (``bad_file``)."""
-    tree, cameras, motion = _tree(path), [], np.eye(4)
+    cameras: list[RigCamera] = []
+    tree, motion = _tree(path), np.eye(4)
     while (one := tree.get(f"cam{len(cameras)}")) is not None:
         k = len(cameras)
         kind = one.get("camera_model"), one.get("distortion_model")
@@ -287,7 +288,7 @@ def _camera(
     R = np.eye(3) if R is None else R
     if not np.abs(R.T @ R - np.eye(3)).max() < ROTATION or np.linalg.det(R) < 0:
         raise _bad(path, f"camera {name!r}: {R.tolist()} is no rotation")
-    shift = (0.0, 0.0, 0.0) if t is None else tuple(t.ravel().tolist())
+    x, y, z = (0.0, 0.0, 0.0) if t is None else t.ravel().tolist()
     kept = (
         distortion[:5]
         if len(distortion) >= 5 and distortion[4] != 0.0
@@ -295,7 +296,7 @@ def _camera(
     )
     return RigCamera(
         name, *size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])), tuple(kept),
-        tuple(map(tuple, R.tolist())), shift,
+        tuple(map(tuple, R.tolist())), (x, y, z),
     )  # fmt: skip
 
 

@@ -183,9 +183,9 @@ def _plane_pose(H: FloatArray, focal: float, centre: FloatArray) -> FloatArray:
 
 
 def _extrinsics(poses: FloatArray) -> FloatArray:
-    """Motions (c, 4, 4) from the first camera's frame into each camera's, along the pairs with most places in common."""
+    """Motions (c, 4, 4) from the first camera's frame into each, along the pairs with most places in common."""
     c = len(poses)
-    there = np.isfinite(poses).all(axis=(2, 3))
+    there = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
     found = np.full((c, 4, 4), np.nan)
     found[0], done = np.eye(4), {0}
     while len(done) < c:
@@ -215,7 +215,7 @@ def _starts_of_body(views: RigViews) -> list[RigStart]:
     )  # fmt: skip
     lenses = epipolar_lenses(trials)
     cameras, points, _ = initial_reconstruction(undistorted(trials, lenses))
-    there = np.isfinite(points).all(axis=2)
+    there = np.asarray(np.isfinite(points).all(axis=2))
     reference = int(np.argmax((there[:, None] & there[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
     motions = _displacements(points, reference)
     plane, _, _ = planes_at_infinity(motions - np.eye(4), np.ones(len(motions)))
@@ -245,7 +245,7 @@ def _displacements(points: FloatArray, reference: int) -> FloatArray:
 
     Raises CalibrationError (``flat_body``, ``too_few_markers``).
     """
-    there, found, flat = np.isfinite(points).all(axis=2), [], 0
+    there, found, flat = np.asarray(np.isfinite(points).all(axis=2)), [], 0
     for stop in range(len(points)):
         common = there[stop] & there[reference]
         if stop == reference or int(common.sum()) < 6:
@@ -281,12 +281,12 @@ def _metric_start(
     matrices = cameras @ np.linalg.inv(upgrade)
     X = points @ upgrade.T
     X = X[..., :3] / X[..., 3:]
-    there = np.isfinite(X).all(axis=2)
+    there = np.asarray(np.isfinite(X).all(axis=2))
     poses = np.full((len(X), 4, 4), np.nan)
     poses[reference] = np.eye(4)
     body = X[reference].copy()
     for _ in range(len(X)):
-        known = np.isfinite(body).all(axis=1)
+        known = np.asarray(np.isfinite(body).all(axis=1))
         open_stops = np.flatnonzero(~np.isfinite(poses[:, 0, 0]))
         if not len(open_stops):
             break

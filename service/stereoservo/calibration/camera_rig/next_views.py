@@ -73,7 +73,7 @@ def _deviation(information: FloatArray, row: FloatArray) -> float:
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0.0] = 1.0
     half = np.linalg.solve(information / np.outer(sizes, sizes), row / sizes)
-    return float(np.sqrt(max((row / sizes) @ half, 0.0)))
+    return float(np.sqrt(max(float((row / sizes) @ half), 0.0)))
 
 
 def _focal_slope(fit: RigFit, k: int) -> FloatArray:
@@ -123,7 +123,7 @@ def _information(
     )  # fmt: skip
     pixels = predicted(fit.rig, one)
     size = np.array([(one.width, one.height * fit.aspect) for one in result.cameras])[cameras]
-    inside = np.isfinite(pixels).all(axis=1) & (pixels > 0.0).all(axis=1) & (pixels < size - 1.0).all(axis=1)
+    inside = np.asarray((np.isfinite(pixels) & (pixels > 0.0) & (pixels < size - 1.0)).all(axis=1))
     if inside[cameras == k].mean() < INSIDE:
         return None
     kept = replace(one, pixels=pixels).select(inside)

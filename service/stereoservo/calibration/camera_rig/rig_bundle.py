@@ -1,5 +1,6 @@
-"""The bundle of a camera rig: that of a cell (:mod:`stereoservo.calibration.bundle_adjustment`) with an arm of six joints
-that nobody has read, three along and three about the axes of the first camera, in the place of the hand that waves.
+"""The bundle of a camera rig: that of a cell (:mod:`stereoservo.calibration.bundle_adjustment`) with an arm of six
+joints that nobody has read, three along and three about the axes of the first camera, in the place of the hand that
+waves.
 
 The six joints' errors at each stop are estimated with the rest; their deviations are so wide that they say nothing.
 Cameras are tied to pixels without skew, of one focal length, and to a lens about the principal point.
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.camera_rig.initialization import RigStart
-from stereoservo.calibration.camera_rig.views import RigViews, refused
+from stereoservo.calibration.camera_rig.views import RigViews
 from stereoservo.calibration.joint_errors.joint_noise import joint_columns
 from stereoservo.calibration.rig_model import (
     JointNoise,
@@ -48,18 +49,24 @@ FRAMES = 60
 
 
 @dataclass(frozen=True)
-class RigFit:
-    """A bundle of ``views``: its ``solution``, which measurements ``kept`` (k,) of ``data``, the ``body_frame`` (3, 3) of
-    the hand's angles. ``aspect``: factor of the rows' coordinate that makes pixels square.
+class RigProblem:
+    """What a bundle of ``views`` begins from: which measurements ``kept`` (k,) of ``data``, the ``body_frame`` (3, 3)
+    of the hand's angles. ``aspect``: factor of the rows' coordinate that makes pixels square.
     """
 
     views: RigViews
-    solution: Solution
     data: Measurements
     kept: BoolArray
     body_frame: FloatArray
     aspect: float
     length_known: bool
+
+
+@dataclass(frozen=True)
+class RigFit(RigProblem):
+    """The bundle of a problem, with its ``solution``."""
+
+    solution: Solution
 
     @property
     def rig(self) -> RigModel:
@@ -94,15 +101,14 @@ class RigFit:
     def residuals(self) -> FloatArray:
         """Residuals (k, 2) [px] of all measurements, those left out included."""
         data = replace(self.data, offsets=self.solution.data.offsets)
-        return (predicted(self.rig, data) - data.pixels) / np.array([1.0, self.aspect])
+        return np.asarray((predicted(self.rig, data) - data.pixels) / np.array([1.0, self.aspect]))
 
     @cached_property
     def root(self) -> FloatArray:
         """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance that residuals show."""
         sizes = self.solution.sizes
-        return np.asarray(np.linalg.inv(self.solution.triangle / sizes) / sizes[:, None]) * np.sqrt(
-            self.variance
-        )
+        inverse = np.linalg.inv(self.solution.triangle / sizes) / sizes[:, None]
+        return np.asarray(inverse * np.sqrt(self.variance))
 
     def moved(self, x: FloatArray) -> RigModel:
         """The model at chart coordinates ``x`` (p,)."""
@@ -126,22 +132,28 @@ class RigFit:
 
 def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> RigFit:
     """The bundle from ``start``; measurements that stick out of the noise are left out in rounds, pixels that are not
-    square are found. Raises CalibrationError (``no_fit``), LinAlgError where the data leave the model open.
+    square are found. Where its ``solution`` has not converged, the data leave the cameras open. Raises GeometryError,
+    LinAlgError where they leave no model.
     """
     views, start = _placed(views, start)
     data, body_frame = _measurements(views, start)
-    fit = RigFit(
-        views, None, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, start.reference is None
-    )
     rig = _rig(start, body_frame)
-    if start.reference is None:
-        fit = replace(fit, data=_with_poses_settled(rig, data))
-    if start.reference is not None:
-        fit = _settled(fit, rig, lenses, PinholeTies(LOOSE, LOOSE, LOOSE))
-        rig = fit.rig
-    square = _settled(fit, rig, lenses, PinholeTies(TIED, TIED, TIED))
+    known = start.reference is None
+    if known:
+        data = _with_poses_settled(rig, data)
+    begun = RigProblem(views, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, known)
+    if not known:
+        loose = _settled(begun, rig, lenses, PinholeTies(LOOSE, LOOSE, LOOSE))
+        if not loose.solution.converged:
+            return loose
+        begun, rig = loose, loose.rig
+    square = _settled(begun, rig, lenses, PinholeTies(TIED, TIED, TIED))
+    if not square.solution.converged:
+        return square
     open_aspect = PinholeTies(TIED, np.inf, TIED)
     free = _settled(square, square.rig, lenses, open_aspect)
+    if not free.solution.converged:
+        return free
     # Pixels are square unless the chi-square of all cameras' aspects is beyond chance by far.
     gain = (square.solution.cost - free.solution.cost) / max(free.variance, 1e-300)
     if gain < ASPECT_GAIN + 2.0 * len(views.cameras):
@@ -149,6 +161,8 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     for _ in range(ASPECT_ROUNDS):
         ratio = np.mean([np.divide(*np.diag(decompose_camera(P)[0])[:2]) for P in free.rig.cameras])
         free = _settled(*_stretched(free, float(ratio)), lenses, open_aspect)
+        if not free.solution.converged:
+            break
     return free
 
 
@@ -175,16 +189,16 @@ def _placed(views: RigViews, start: RigStart) -> tuple[RigViews, RigStart]:
     )
 
 
-def _settled(begun: RigFit, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
+def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
     """The bundle from ``rig``, and from the places and the measurements kept of the fit that has ``begun``."""
-    data, kept, fit = replace(begun.data, pinhole_ties=ties), begun.kept, begun
+    data, kept = replace(begun.data, pinhole_ties=ties), begun.kept
     for _ in range(ROUNDS):
         solution = solve(
             rig, data.select(kept), "metric", generators=False, points=not begun.length_known, lenses=lenses,
             max_evaluations=EVALUATIONS,
         )  # fmt: skip
         data, rig = replace(data, offsets=solution.data.offsets), solution.rig
-        fit = replace(begun, solution=solution, data=data, kept=kept)
+        fit = RigFit(begun.views, data, kept, begun.body_frame, begun.aspect, begun.length_known, solution)
         sizes = np.linalg.norm(fit.residuals, axis=1) / data.sigmas
         # The median of a Rayleigh distribution is 1.1774 sigmas.
         noise = float(np.median(sizes[np.isfinite(sizes)])) / 1.1774
@@ -192,11 +206,6 @@ def _settled(begun: RigFit, rig: RigModel, lenses: LensModel, ties: PinholeTies)
         if (inside == kept).all():
             break
         kept = inside
-    if not fit.solution.converged:
-        raise refused(
-            "no_fit", "the fit did not converge: steps", fit.solution.evaluations, EVALUATIONS, "",
-            "The data leave the cameras open, or views are wrong: wave the body also tilted, near and far",
-        )  # fmt: skip
     return fit
 
 

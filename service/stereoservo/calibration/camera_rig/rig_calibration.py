@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.camera_rig.initialization import RigStart, starts
-from stereoservo.calibration.camera_rig.rig_bundle import RigFit, fit_rig
+from stereoservo.calibration.camera_rig.rig_bundle import EVALUATIONS, RigFit, fit_rig
 from stereoservo.calibration.camera_rig.views import RigViews, refused, usable_views
 from stereoservo.calibration.rig_model import RigModel
 from stereoservo.calibration.trial_data import CalibrationError
@@ -43,9 +43,9 @@ WAVE = "Wave the body also tilted, by 20 to 40 degrees about two axes, near and 
 
 
 class RigCamera(msgspec.Struct, frozen=True):
-    """A camera of a rig. ``focal`` (fx, fy) and ``centre`` (cx, cy) [px], integer = pixel centre; ``distortion`` (k1, k2,
-    p1, p2[, k3]) of Brown's model as OpenCV has it. ``rotation`` (3, 3), ``translation`` (3,): from the first camera's
-    frame into its own. ``deviations`` of all by name: lengths in the rig's unit, angles in rad.
+    """A camera of a rig. ``focal`` (fx, fy) and ``centre`` (cx, cy) [px], integer = pixel centre; ``distortion`` (k1,
+    k2, p1, p2[, k3]) of Brown's model as OpenCV has it. ``rotation`` (3, 3), ``translation`` (3,): from the first
+    camera's frame into its own. ``deviations`` of all by name: lengths in the rig's unit, angles in rad.
     """
 
     name: str
@@ -128,8 +128,7 @@ def calibrate_rig(views: RigViews, known: KnownDistance | None = None) -> tuple[
         raise _open(str(error)) from error
     _require_turns(begun[0].poses, np.zeros(len(begun[0].poses)), views)
     fit = _best_fit(views, begun)
-    turns = np.degrees(fit.pose_deviations()[:, 3:].max(axis=1))
-    _require_turns(fit.poses, turns, fit.views)
+    _require_turns(fit.poses, _turn_deviations(fit), fit.views)
     _require_fit(fit)
     result = rig_result(fit, known)
     _require_determined(result)
@@ -137,16 +136,35 @@ def calibrate_rig(views: RigViews, known: KnownDistance | None = None) -> tuple[
 
 
 def _best_fit(views: RigViews, begun: list[RigStart]) -> RigFit:
-    """The first bundle that converges. Raises the last refusal where none does."""
+    """The first bundle that converges. Raises CalibrationError where none does: of places without turns for that,
+    as the bundles' starts and ends show them.
+    """
     failure: Exception | None = None
+    ended: list[RigFit] = []
     for start in begun:
         try:
-            return fit_rig(views, start)
-        except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+            fit = fit_rig(views, start)
+        except (GeometryError, np.linalg.LinAlgError) as error:
             failure = error
-    if isinstance(failure, CalibrationError):
-        raise failure
-    raise _open(str(failure)) from failure
+            continue
+        if fit.solution.converged:
+            return fit
+        ended.append(fit)
+    for start in begun:
+        _require_turns(start.poses, np.zeros(len(start.poses)), views)
+    for fit in ended:
+        _require_turns(fit.poses, _turn_deviations(fit), fit.views)
+    if not ended:
+        raise _open(str(failure)) from failure
+    raise refused(
+        "no_fit", "the fit did not converge: steps", ended[-1].solution.evaluations, EVALUATIONS, "",
+        "The data leave the cameras open, or views are wrong: wave the body also tilted, near and far",
+    )  # fmt: skip
+
+
+def _turn_deviations(fit: RigFit) -> FloatArray:
+    """Deviations (s,) of the body's turns [°], cameras taken for exact."""
+    return np.asarray(np.degrees(fit.pose_deviations()[:, 3:].max(axis=1)))
 
 
 def _open(why: str) -> CalibrationError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -73,7 +74,7 @@ def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[Cam
 def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
     """When the body was still before one camera, or not seen by it."""
     found: list[_Still] = []
-    for before, after in zip(observations[:-1], observations[1:], strict=True):
+    for before, after in pairwise(observations):
         if after.t_shutter_ns - before.t_shutter_ns > GAP_S * 1e9:
             continue
         few = max(len(before.ids), len(after.ids)) < LEAST_MARKERS
@@ -115,5 +116,5 @@ def _elsewhere(place: FloatArray, before: FloatArray) -> bool:
         common = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
         if common.any() and float(np.median(np.linalg.norm((here - there)[common], axis=1))) > ELSEWHERE_PX:
             return True
-    seen = [np.isfinite(one).all(axis=2).any(axis=1) for one in (place, before)]
+    seen = [np.asarray(np.isfinite(one).all(axis=2)).any(axis=1) for one in (place, before)]
     return bool((seen[0] != seen[1]).any())

@@ -81,14 +81,14 @@ def usable_views(views: RigViews) -> RigViews:
     rich = views.seen.sum(axis=2) >= LEAST_MARKERS
     views = replace(views, pixels=np.where(rich[:, :, None, None], views.pixels, np.nan))
     seen = views.seen
-    views = views.select(seen.any(axis=(0, 2)), seen.sum(axis=(0, 1)) >= 2)
+    views = views.select(np.asarray(seen.any(axis=(0, 2))), seen.sum(axis=(0, 1)) >= 2)
     _require_stops(views)
     _require_layout(views)
     return views
 
 
 def _require_stops(views: RigViews) -> None:
-    by_camera = views.seen.any(axis=2)
+    by_camera = np.asarray(views.seen.any(axis=2))
     for camera, mine in zip(views.cameras, by_camera, strict=True):
         if int(mine.sum()) < LEAST_STOPS:
             raise refused(

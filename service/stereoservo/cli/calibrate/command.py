@@ -193,6 +193,14 @@ def calibrate(
         raise CommandError(
             "argument", "--lines and --output go with --trials FILE.npz, --output with --images too"
         )
+    _calibrate_live(cell, check, reset_zeros, unattended, enable, endpoint, operator, json)
+
+
+def _calibrate_live(
+    cell: str, check: bool, reset_zeros: bool, unattended: bool, enable: bool, endpoint: str | None,
+    operator: str | None, json: bool,
+) -> None:  # fmt: skip
+    """Calibrate or check the cell's model by motions of the arm, and print the result."""
     with ExitStack() as stack:
         if not unattended and endpoint is None and cell.endswith(".toml"):
             try:

@@ -166,10 +166,12 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
             f"and {options.images}/right/01.png, is valid ({', '.join(PICTURES)})",
         )
     keys = sorted({key for files in pictures.values() for key in files})
-    cameras, seen = [], {}
+    cameras: list[TrialCamera] = []
+    seen: dict[str, dict[str, CameraObservation]] = {}
     for name, files in pictures.items():
         detector = _detector(options, name, board)
-        found, size = {}, None
+        found: dict[str, CameraObservation] = {}
+        size: tuple[int, ...] | None = None
         for key, path in files.items():
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             if image is None:
@@ -247,7 +249,8 @@ def _recorded(options: RigOptions) -> RigViews:
         )
     path = Path(options.cell)
     cell = load_cell_file(path)
-    cameras, seen = [], {}
+    cameras: list[TrialCamera] = []
+    seen: dict[str, list[CameraObservation]] = {}
     for section in cell.camera:
         one = recorded_camera(cell, path, section.name, video_of(options.images, section.name))
         cameras.append(TrialCamera(section.name, one.description.width, one.description.height))
@@ -320,8 +323,9 @@ def poorly_known(result: RigCalibration) -> list[str]:
 def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
     places = len(result.views)
     lines = [
-        f"{len(result.cameras)} cameras, {places} places, {result.measurements} measurements ({result.left_out} left out): "
-        f"{result.rms_px:.4f} px rms, noise {result.sigma_px:.4f} px a coordinate; (±) standard deviations"
+        f"{len(result.cameras)} cameras, {places} places, {result.measurements} measurements "
+        f"({result.left_out} left out): {result.rms_px:.4f} px rms, noise {result.sigma_px:.4f} px a coordinate; "
+        "(±) standard deviations"
     ]
     for camera in result.cameras:
         d = camera.deviations

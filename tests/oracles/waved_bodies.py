@@ -35,8 +35,8 @@ DEGENERATE = (
 
 @dataclass(frozen=True)
 class WavedRig:
-    """The true cameras: ``K`` (c, 3, 3), ``distortion`` (c, 4), motions (c, 4, 4) from the first one's frame; the views;
-    ``body`` (m, 3) [m].
+    """The true cameras: ``K`` (c, 3, 3), ``distortion`` (c, 4), motions (c, 4, 4) from the first one's frame; the
+    views; ``body`` (m, 3) [m].
     """
 
     K: FloatArray
@@ -156,7 +156,7 @@ def _views(rng, cameras, places, sigma, body, known, turn, place) -> WavedRig:  
 
 
 def rendered_pictures(seed: int, folder: Path, *, places: int = 12, noise: float = 2.0) -> WavedRig:
-    """Write pictures of a board that is waved before two cameras, ``folder``/left/00.png and so on, and return the truth.
+    """Write pictures of a board that is waved before two cameras, ``folder``/left/00.png and so on; the truth.
 
     Pixels are means of 2x2 samples of the board's squares, with ``noise`` [grey levels].
     """
