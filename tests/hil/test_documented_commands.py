@@ -27,6 +27,7 @@ from pathlib import Path
 import pytest
 
 from documented import PAGES, ROOT, Documented, documented, snippets
+from oracles.waved_bodies import rendered_pictures
 from stereoservo.cli import main as cli
 from stereoservo.client import Client
 from stereoservo.messages.directories import cell_directories
@@ -120,6 +121,8 @@ class Desk:
             return self.served([sys.executable, "-m", "stereoservo.cli.main", *words])
         if words[0] == "init":
             (self.folder / words[1]).rename(self.folder / "kept")
+        if "--rig" in words and not (self.folder / "pictures").exists():
+            rendered_pictures(5, self.folder / "pictures", places=9)
         if "flight.mcap" in words and not (self.folder / "flight.mcap").exists():
             _, said = self.invoked(["record", "mycell", "--seconds", "1", "--json"])
             shutil.copy(json.loads(said.splitlines()[-1])["file"], self.folder / "flight.mcap")
@@ -129,7 +132,7 @@ class Desk:
         done = self.invoked(words)
         if words[0] == "init":
             (self.folder / "kept").replace(self.folder / words[1])
-        if words[0] == "calibrate" and done[0] == 0 and "--check" not in words:
+        if words[0] == "calibrate" and done[0] == 0 and not {"--check", "--rig"} & set(words):
             with Client(words[1]) as client:
                 self.taught(client, words[1])
         return done

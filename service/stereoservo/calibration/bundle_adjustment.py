@@ -131,6 +131,7 @@ def solve(
     data: Measurements,
     stratum: Stratum,
     *,
+    generators: bool = True,
     cameras: bool = True,
     points: bool = True,
     lenses: LensModel = "none",
@@ -151,7 +152,7 @@ def solve(
     weights = _weights(loss, loss_scale)
 
     def charts_at(rig: RigModel) -> Charts:
-        return full_charts(rig, stratum, cameras=cameras, points=points, lenses=lenses)
+        return full_charts(rig, stratum, generators=generators, cameras=cameras, points=points, lenses=lenses)
 
     def cost_at(rig: RigModel, charts: Charts, here: Measurements) -> float:
         pixels = _loss(residuals(rig, here), loss, loss_scale) + _cost_of_errors(here)

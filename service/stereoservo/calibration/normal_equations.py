@@ -15,7 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, partial_products
+from stereoservo.calibration.rig_model import (
+    Charts,
+    Measurements,
+    PinholeTies,
+    RigModel,
+    partial_products,
+)
+from stereoservo.geometry.strata import intrinsics_and_slopes
 from stereoservo.kinematics.parameterization import LENS_PARAMETERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
@@ -293,8 +300,12 @@ def _starts(bases: tuple[FloatArray, ...]) -> IntArray:
 
 
 def prior_rows(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
-    """Rows (r, p + 1) of the lens priors on those lenses that are free; the last column is the residual."""
+    """Rows (r, p + 1) of the lens priors on those lenses that are free, and of the ties of free cameras to a pinhole's
+    form; the last column is the residual.
+    """
     out = np.zeros((0, charts.size + 1))
+    if data.pinhole_ties is not None:
+        out = _tie_rows(rig, charts, data.pinhole_ties)
     if data.lens_priors is None:
         return out
     at = charts.start(2)
@@ -314,6 +325,29 @@ def prior_rows(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
             out = np.vstack([out, rows])
         at += len(basis)
     return out
+
+
+def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
+    """Rows (r, p + 1) of skew, fx - fy and the lens centre's distance from the principal point, in their sigmas."""
+    rows = []
+    camera_at, lens_at = charts.start(1), charts.start(2)
+    sigmas = np.array([ties.skew, ties.aspect, ties.centre, ties.centre])
+    for matrix, basis, lens, lens_basis in zip(
+        rig.cameras, charts.cameras, rig.lenses, charts.lenses, strict=True
+    ):
+        if len(basis):
+            (fx, fy, skew, cu, cv), slopes = intrinsics_and_slopes(matrix, basis)
+            centre_slopes = lens_basis[:, 1:3]
+            out = np.zeros((4, charts.size + 1))
+            mine = slice(camera_at, camera_at + len(basis))
+            out[:, mine] = np.array([slopes[2], slopes[0] - slopes[1], slopes[3], slopes[4]])
+            out[2:, lens_at : lens_at + len(lens_basis)] = -centre_slopes.T
+            out[:, -1] = skew, fx - fy, cu - lens[1], cv - lens[2]
+            tied = np.isfinite(sigmas) & np.array([True, True, *np.asarray(centre_slopes.any(axis=0))])
+            rows.append(out[tied] / sigmas[tied, None])
+        camera_at += len(basis)
+        lens_at += len(lens_basis)
+    return np.vstack([np.zeros((0, charts.size + 1)), *rows])
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ where the data determine the model.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -68,6 +69,17 @@ class LensPriors:
 
     mean: FloatArray
     information: FloatArray
+
+
+@dataclass(frozen=True)
+class PinholeTies:
+    """Standard deviations [px] of what ties cameras to their lenses and to a pinhole's form, of each camera: ``skew``,
+    ``aspect`` (of fx - fy) and ``centre`` (of the lens centre about the principal point); infinite where it is free.
+    """
+
+    skew: float
+    aspect: float
+    centre: float
 
 
 @dataclass(frozen=True)
@@ -139,7 +151,8 @@ class Measurements:
     """Raw pixels in a flat list: camera, stop and marker of each (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px].
 
     ``offsets`` (s, n): joint positions of each stop minus the zero, ``joint_errors`` included. ``lens_priors`` count as
-    measurements of those lenses that are free. ``joint_noise``: of the readings; None where they are exact.
+    measurements of those lenses that are free, ``pinhole_ties`` of a metric rig's cameras that are free.
+    ``joint_noise``: of the readings; None where they are exact.
     """
 
     offsets: FloatArray
@@ -151,6 +164,7 @@ class Measurements:
     lens_priors: LensPriors | None = None
     joint_noise: JointNoise | None = None
     joint_errors: JointErrors | None = None
+    pinhole_ties: PinholeTies | None = None
 
     @property
     def corrections(self) -> FloatArray:
@@ -221,13 +235,22 @@ class Charts:
 
 
 def full_charts(
-    rig: RigModel, stratum: Stratum, *, cameras: bool = True, points: bool = True, lenses: LensModel = "none"
+    rig: RigModel,
+    stratum: Stratum,
+    *,
+    generators: bool = True,
+    cameras: bool = True,
+    points: bool = True,
+    lenses: LensModel = "none",
 ) -> Charts:
-    """Minimal charts around ``rig``; cameras or points may be kept fixed, ``lenses`` selects their free parameters.
+    """Minimal charts around ``rig``; generators, cameras or points may be kept fixed, ``lenses`` selects their free
+    parameters.
 
     With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
-    loses the remaining gauge, further ones are free. Known generators are kept fixed, and leave no gauge.
+    loses the remaining gauge, further ones are free. Known generators are kept fixed, and leave no gauge; nor is one
+    left where neither generators nor points are free.
     """
+    gauge: Literal["right", "other"] = "right" if generators or points else "other"
     none = np.zeros((0, 3, 4))
     matrices: tuple[FloatArray, ...] = tuple(none for _ in rig.cameras)
     if cameras and rig.known:
@@ -237,13 +260,13 @@ def full_charts(
         matrices = (
             left,
             *(
-                camera_basis(matrix, "right" if c == 0 else "other", stratum)
+                camera_basis(matrix, gauge if c == 0 else "other", stratum)
                 for c, matrix in enumerate(rig.cameras[1:])
             ),
         )
     return Charts(
         tuple(
-            np.zeros((0, 4, 4)) if rig.known else generator_basis(h, kind, stratum)
+            np.zeros((0, 4, 4)) if rig.known or not generators else generator_basis(h, kind, stratum)
             for h, kind in zip(rig.generators, rig.kinds, strict=True)
         ),
         matrices,

@@ -1,4 +1,6 @@
-"""Command ``stereoservo export``: writes a flight recording for Foxglove and Rerun, or a calibrated model as URDF."""
+"""Command ``stereoservo export``: writes a flight recording for Foxglove and Rerun, a calibrated model as URDF, or the
+cameras of a rig for OpenCV, ROS and Kalibr.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,11 @@ SAME = 1e-9
 def export(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="A flight recording (*.mcap), or a model (*.json)."),
+        typer.Argument(
+            metavar="FILE",
+            help="A flight recording (*.mcap), a model (*.json); or cameras: a rig of `calibrate --rig`, or a "
+            "file of OpenCV, ROS (or a folder of these) or Kalibr.",
+        ),
     ],
     output: Annotated[
         Path | None,
@@ -60,12 +66,27 @@ def export(
             help="Cell file: calibration.known_length, and safety.limit for the URDF.",
         ),
     ] = None,
+    opencv: Annotated[
+        Path | None,
+        typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write."),
+    ] = None,
+    ros: Annotated[
+        Path | None,
+        typer.Option("--ros", metavar="DIR", help="Of cameras: folder for a camera_info YAML of each."),
+    ] = None,
+    kalibr: Annotated[
+        Path | None, typer.Option("--kalibr", metavar="FILE.yaml", help="Of cameras: Kalibr's camera chain.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a recording for Foxglove and Rerun, which still replays bit for bit; or a model's dimensions, or its URDF.
+    """Write a recording for Foxglove and Rerun, which still replays bit for bit; a model's dimensions, or its URDF; or
+    cameras for OpenCV, ROS and Kalibr.
 
     Pictures in NAME.images beside a recording go with it. A URDF has the joints, and markers and cameras as links.
     """
+    if opencv is not None or ros is not None or kalibr is not None:
+        _export_cameras(file, opencv, ros, kalibr, json)
+        return
     if file.suffix == ".json":
         if urdf is None and not dh:
             raise CommandError(
@@ -76,6 +97,37 @@ def export(
         raise CommandError("usage", f"--urdf and --dh are for a model (*.json); {file} is none")
     else:
         _export_flight(file, output if output is not None else file.with_suffix(".foxglove.mcap"), json)
+
+
+def _export_cameras(
+    file: Path, opencv: Path | None, ros: Path | None, kalibr: Path | None, json: bool
+) -> None:
+    from stereoservo.calibration.camera_rig import exchange  # OpenCV and YAML: for this alone
+    from stereoservo.calibration.camera_rig.rig_calibration import load_rig
+
+    cameras, unit = exchange.load_cameras(file) if file.suffix != ".json" else (), "m"
+    if file.suffix == ".json":
+        rig = load_rig(file)
+        cameras, unit = rig.cameras, rig.unit
+    if unit != "m":
+        note(f"{file} holds no length in metres: translations are in baselines")
+    written: list[str] = []
+    if opencv is not None:
+        exchange.save_opencv(cameras, opencv)
+        written.append(str(opencv))
+    if ros is not None:
+        written += [str(path) for path in exchange.save_ros(cameras, ros)]
+        if len(cameras) > 2:
+            note("camera_info has no place for the poses of more than two cameras: they are left out")
+    if kalibr is not None:
+        exchange.save_kalibr(cameras, kalibr)
+        written.append(str(kalibr))
+    names = [camera.name for camera in cameras]
+    emit(
+        {"written": written, "cameras": names, "unit": unit},
+        f"{', '.join(names)}: {', '.join(written)}",
+        json,
+    )
 
 
 def _export_flight(file: Path, target: Path, json: bool) -> None:

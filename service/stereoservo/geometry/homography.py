@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.geometry.cameras import projection_jacobian_many
-from stereoservo.geometry.homogeneous import GeometryError, whitener
+from stereoservo.geometry.cameras import isotropic_normaliser, projection_jacobian_many
+from stereoservo.geometry.homogeneous import GeometryError, to_homogeneous, whitener
 from stereoservo.numerics.arrays import FloatArray
 
 COPLANAR_TAIL = 1e-3
@@ -85,6 +85,24 @@ def _least_squares_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray,
     H: FloatArray = np.linalg.solve(W_B, v[15].reshape(4, 4)) @ W_A
     agreement = (np.sign(((A @ H.T) * B).sum(axis=1))).sum()
     return (-H if agreement < 0 else H), len(A), singular
+
+
+def plane_homography(plane: FloatArray, pixels: FloatArray) -> FloatArray:
+    """``H`` (3, 3) from points of a plane ``(n, 2)`` to pixels ``(n, 2)``, n >= 4, linear in normalised coordinates.
+
+    The sign gives the points a positive depth. Raises GeometryError where they leave it open (on one line).
+    """
+    if len(plane) < 4:
+        raise GeometryError("too_few", f"{len(plane)} points; a plane's homography needs at least 4")
+    T, S = isotropic_normaliser(pixels), isotropic_normaliser(plane)
+    x, X = to_homogeneous(pixels) @ T.T, to_homogeneous(plane) @ S.T
+    zero = np.zeros_like(X)
+    system = np.vstack([np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:2] * X])])
+    _, values, rows = np.linalg.svd(system)
+    if not values[7] > 1e-6 * values[0]:
+        raise GeometryError("degenerate", "the points do not determine a plane's homography (on one line?)")
+    H: FloatArray = np.linalg.solve(T, rows[8].reshape(3, 3)) @ S
+    return -H if float(np.median(to_homogeneous(plane) @ H[2])) < 0.0 else H
 
 
 def unit_determinant(H: FloatArray, what: str) -> FloatArray:

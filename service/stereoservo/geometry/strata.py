@@ -100,6 +100,28 @@ def decompose_camera(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]
     return K, R, t
 
 
+def intrinsics_and_slopes(P: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``(fx, fy, skew, cu, cv)`` (5,) [px] of a Euclidean camera ``P`` (3, 4), and their derivatives (5, p) along
+    ``directions`` (p, 3, 4): by ``A Aᵀ ~ K Kᵀ`` of its left block.
+    """
+    A, dA = P[:, :3], directions[:, :, :3]
+    omega = A @ A.T
+    change = dA @ A.T
+    change = change + change.transpose(0, 2, 1)
+    last = omega[2, 2]
+    W = omega / last
+    dW = (change - W * change[:, 2, 2, None, None]) / last
+    cu, cv = W[0, 2], W[1, 2]
+    fy = np.sqrt(W[1, 1] - cv * cv)
+    d_fy = (dW[:, 1, 1] - 2.0 * cv * dW[:, 1, 2]) / (2.0 * fy)
+    skew = (W[0, 1] - cu * cv) / fy
+    d_skew = (dW[:, 0, 1] - dW[:, 0, 2] * cv - cu * dW[:, 1, 2] - skew * d_fy) / fy
+    fx = np.sqrt(W[0, 0] - cu * cu - skew * skew)
+    d_fx = (dW[:, 0, 0] - 2.0 * cu * dW[:, 0, 2] - 2.0 * skew * d_skew) / (2.0 * fx)
+    values: FloatArray = np.array([fx, fy, skew, cu, cv])
+    return values, np.array([d_fx, d_fy, d_skew, dW[:, 0, 2], dW[:, 1, 2]])
+
+
 def triangular_root(omega: FloatArray) -> FloatArray:
     """Upper triangular ``K`` (3, 3), positive diagonal, ``K₃₃ = 1``, with ``K Kᵀ ~ ω*`` (3, 3).
 

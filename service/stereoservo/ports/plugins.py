@@ -30,6 +30,7 @@ EXTRAS = {
         "zstandard",
         "foxglove",
         "matplotlib",
+        "yaml",
     ),
     "sim": ("pybullet", "pybullet_data"),
     "web": ("websockets",),

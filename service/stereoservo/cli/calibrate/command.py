@@ -18,11 +18,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from stereoservo.cli import interruption
 from stereoservo.cli.output import (
     EXIT_FAILED,
-    CellArgument,
     CommandError,
     EndpointOption,
     JsonOption,
     OperatorOption,
+    cells_beginning,
     emit,
     note,
     note_hold,
@@ -82,12 +82,56 @@ EnableOption = Annotated[
 ]
 OutputOption = Annotated[
     Path | None,
-    typer.Option("--output", metavar="FILE.json", help="With --trials, --images: where the model goes."),
+    typer.Option(
+        "--output",
+        metavar="FILE.json",
+        help="With --trials, --images: where the model goes; with --rig: the cameras (default: rig.json).",
+    ),
+]
+RigOption = Annotated[
+    bool,
+    typer.Option(
+        "--rig",
+        help="Calibrate the cameras without an arm, by a body that is waved by hand: CELL.toml's cameras live, or "
+        "--images of a recording, or of a folder a camera with pictures of one name for one place.",
+    ),
+]
+BoardOption = Annotated[
+    str,
+    typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6."),
+]
+PitchOption = Annotated[
+    float | None, typer.Option("--pitch", metavar="METRES", help="With --board: distance of its corners [m].")
+]
+LayoutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--layout",
+        metavar="FILE.csv",
+        help="With --rig: id,x,y [m] of a flat body's markers, where measured.",
+    ),
+]
+LengthOption = Annotated[
+    str,
+    typer.Option(
+        "--length",
+        metavar="ID,ID=METRES",
+        help="With --rig: distance of two markers of a body of unknown layout.",
+    ),
+]
+SecondsOption = Annotated[float, typer.Option("--seconds", help="With --rig, live: how long to watch [s].")]
+RigCellArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="CELL",
+        help="Name of a live cell, or path of a cell file (*.toml); none with --rig and --board.",
+        autocompletion=cells_beginning,
+    ),
 ]
 
 
 def calibrate(
-    cell: CellArgument,
+    cell: RigCellArgument = "",
     check: CheckOption = False,
     reset_zeros: ResetZerosOption = False,
     unattended: UnattendedOption = False,
@@ -97,6 +141,12 @@ def calibrate(
     lines_sigma: LinesSigmaOption = 0.3,
     output: OutputOption = None,
     enable: EnableOption = False,
+    rig: RigOption = False,
+    board: BoardOption = "",
+    pitch: PitchOption = None,
+    layout: LayoutOption = None,
+    length: LengthOption = "",
+    seconds: SecondsOption = 60.0,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
@@ -104,8 +154,19 @@ def calibrate(
     """Move each joint alone, watch the markers, fit the cell's model. Ctrl-C stops the arm.
 
     With the path of a cell file and no daemon running, one is started for the time of it, and its drives are switched
-    on. Of a daemon that runs, a person has enabled the drives before, or gives ``--enable``.
+    on. Of a daemon that runs, a person has enabled the drives before, or gives ``--enable``. With ``--rig`` no arm is
+    needed, and nothing moves.
     """
+    if rig:
+        from stereoservo.cli.calibrate.rig import RigOptions, calibrate_cameras  # OpenCV and more
+
+        report, text = calibrate_cameras(
+            RigOptions(cell, images, board, pitch, layout, length, seconds, output)
+        )
+        emit(report, text, json)
+        return
+    if not cell:
+        raise typer.BadParameter("CELL is needed, but for --rig with pictures of a board", param_hint="CELL")
     if (reset_zeros or unattended) and not check:
         raise CommandError("argument", "--reset-zeros and --unattended go with --check")
     if (trials is not None or images is not None) and check:
@@ -132,6 +193,14 @@ def calibrate(
         raise CommandError(
             "argument", "--lines and --output go with --trials FILE.npz, --output with --images too"
         )
+    _calibrate_live(cell, check, reset_zeros, unattended, enable, endpoint, operator, json)
+
+
+def _calibrate_live(
+    cell: str, check: bool, reset_zeros: bool, unattended: bool, enable: bool, endpoint: str | None,
+    operator: str | None, json: bool,
+) -> None:  # fmt: skip
+    """Calibrate or check the cell's model by motions of the arm, and print the result."""
     with ExitStack() as stack:
         if not unattended and endpoint is None and cell.endswith(".toml"):
             try:

@@ -1,0 +1,105 @@
+"""Detector of the inner corners of a chessboard, for cameras that are calibrated with one: OpenCV's search, refined to
+the saddle points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from stereoservo.numerics.arrays import FloatArray, ImageArray
+from stereoservo.ports.devices import (
+    CameraObservation,
+    DetectorDescription,
+    DriverContext,
+    DriverError,
+    Frame,
+    Prior,
+)
+from stereoservo_drivers.detectors.frame_images import gray_image
+from stereoservo_drivers.options import decode_options
+
+SIGMA_PX = 0.1
+"""Standard deviation of a corner, an axis [px]: of sharp pictures; a calibration finds its own."""
+WINDOW_SHARE = 0.4
+"""Half the side of the window of the refinement, as a share of the least distance of two corners."""
+LARGEST_WINDOW = 11
+ITERATIONS, CONVERGED = 60, 1e-4
+
+
+class ChessboardOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[camera.detector_options]`` of the detector ``chessboard``: numbers of inner corners."""
+
+    columns: Annotated[int, Meta(ge=3, le=64)]
+    rows: Annotated[int, Meta(ge=3, le=64)]
+
+
+class ChessboardDetector:
+    """Detects all inner corners of one board, or none; ids row by row, from the corner inside and outside which the
+    squares are dark.
+
+    One count must be odd and the other even: else half a turn of the board looks alike. Raises DriverError: ``option``
+    at construction, ``image_format`` by :meth:`detect`; content never raises.
+    """
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self.options = decode_options(ChessboardOptions, options, f"detector of camera {context.camera!r}")
+        self.camera = context.camera
+        if (self.options.columns + self.options.rows) % 2 == 0:
+            raise DriverError(
+                "option",
+                f"a board of {self.options.columns}x{self.options.rows} inner corners looks alike after half a turn; "
+                "an odd and an even count are valid, such as 9x6",
+            )
+
+    def describe(self) -> DetectorDescription:
+        """The ids of all corners."""
+        return DetectorDescription(
+            "chessboard", tuple(range(self.options.columns * self.options.rows)), SIGMA_PX
+        )
+
+    def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+        """The corners in ``frame``; a prior is not used."""
+        pixels = find_corners(gray_image(frame, self.camera), self.options.columns, self.options.rows)
+        count = 0 if pixels is None else len(pixels)
+        return CameraObservation(
+            self.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, np.arange(count),
+            np.zeros((0, 2)) if pixels is None else pixels, np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1)),
+        )  # fmt: skip
+
+
+def find_corners(image: ImageArray, columns: int, rows: int) -> FloatArray | None:
+    """Inner corners (rows * columns, 2) [px] of the board in ``image``, row by row; None where it is not seen whole."""
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, corners = cv2.findChessboardCorners(image, (columns, rows), flags=flags)
+    if not found:
+        return None
+    grid = np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)
+    nearest = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min()) for axis in (0, 1))
+    half = int(np.clip(WINDOW_SHARE * nearest, 2, LARGEST_WINDOW))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, CONVERGED)
+    refined = cv2.cornerSubPix(
+        image, grid.reshape(-1, 1, 2).astype(np.float32), (half, half), (-1, -1), criteria
+    )
+    grid = np.asarray(refined, dtype=np.float64).reshape(rows, columns, 2)
+    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if along[0] * down[1] - along[1] * down[0] < 0.0:
+        grid = grid[::-1]  # counted against the clock: the board is seen from its front
+    if _first_is_bright(image, grid):
+        grid = grid[::-1, ::-1]
+    return np.ascontiguousarray(grid.reshape(-1, 2))
+
+
+def _first_is_bright(image: ImageArray, grid: FloatArray) -> bool:
+    """Whether the square inside the first corner is one of the bright ones: by all squares, since one may glare."""
+    middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    smooth = cv2.blur(image, (3, 3))
+    u, v = np.clip(np.round(middles), 0, np.array(image.shape[::-1]) - 1).astype(int).transpose(2, 0, 1)
+    levels = smooth[v, u].astype(np.float64)
+    signs = 1.0 - 2.0 * (np.add(*np.indices(levels.shape)) % 2)
+    return bool((signs * levels).sum() > 0.0)

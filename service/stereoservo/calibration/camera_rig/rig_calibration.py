@@ -1,0 +1,364 @@
+"""Calibration of cameras without an arm: the bundle's cameras with their covariance, or the refusal of views that leave
+them open; and the model's file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stereoservo.calibration.camera_rig.initialization import RigStart, starts
+from stereoservo.calibration.camera_rig.rig_bundle import EVALUATIONS, RigFit, fit_rig
+from stereoservo.calibration.camera_rig.views import RigViews, refused, usable_views
+from stereoservo.calibration.rig_model import RigModel
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.strata import decompose_camera
+from stereoservo.numerics.arrays import FloatArray
+
+SCHEMA = 1
+LEAST_TURN = 8.0
+"""Angle [°] from the mean direction that a tenth of the places must reach: a board's normals, or a body's turns."""
+TURN_SIGMAS = 5.0
+"""That angle in deviations of a place's own, below which it is noise."""
+FOCAL_DEVIATION = 0.02
+"""Deviation of a focal length, relative to it, above which it counts as open."""
+CENTRE_DEVIATION = 0.03
+"""Deviation of a principal point [image widths] above which it counts as open."""
+PAIR_DEVIATION = 1.0
+"""Deviation of the rotation between two cameras [°] above which it counts as open."""
+OUTSIDE = 0.5
+"""Distance of a principal point from the middle [image sizes] beyond which the model is no camera's."""
+MOST_LEFT_OUT = 0.2
+"""Share of measurements that may stick out of the noise."""
+MOST_NOISE = 2.0
+"""Noise of the pixels [px] above which the views do not fit a pinhole with radial and tangential distortion."""
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+EXTRINSICS = ("rx", "ry", "rz", "tx", "ty", "tz")
+WAVE = "Wave the body also tilted, by 20 to 40 degrees about two axes, near and far, and into the pictures' corners"
+
+
+class RigCamera(msgspec.Struct, frozen=True):
+    """A camera of a rig. ``focal`` (fx, fy) and ``centre`` (cx, cy) [px], integer = pixel centre; ``distortion`` (k1,
+    k2, p1, p2[, k3]) of Brown's model as OpenCV has it. ``rotation`` (3, 3), ``translation`` (3,): from the first
+    camera's frame into its own. ``deviations`` of all by name: lengths in the rig's unit, angles in rad.
+    """
+
+    name: str
+    width: int
+    height: int
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, ...]
+    rotation: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    deviations: dict[str, float] = {}
+
+    @property
+    def matrix(self) -> FloatArray:
+        """``K`` (3, 3)."""
+        return np.array(
+            [[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]]
+        )
+
+    @property
+    def motion(self) -> FloatArray:
+        """``[R t; 0 1]`` (4, 4) from the first camera's frame."""
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.rotation, self.translation
+        return T
+
+
+class ViewResidual(msgspec.Struct, frozen=True):
+    """A place of the body: rms residual [px] over all cameras, markers seen, measurements left out."""
+
+    name: str
+    rms_px: float
+    markers: int
+    left_out: int
+
+
+class RigCalibration(msgspec.Struct, frozen=True):
+    """A calibrated rig. ``unit``: of its lengths, ``m`` where one was known, else ``baseline`` (of the second camera).
+
+    ``parameters`` name the rows of ``covariance``: ``CAMERA.NAME``. ``sigma_px``: noise of a pixel coordinate that the
+    residuals show. ``views`` worst first.
+    """
+
+    cameras: tuple[RigCamera, ...]
+    unit: str
+    rms_px: float
+    sigma_px: float
+    measurements: int
+    left_out: int
+    freedoms: int
+    parameters: tuple[str, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    marker_ids: tuple[int, ...]
+    points: tuple[tuple[float, float, float], ...]
+    views: tuple[ViewResidual, ...]
+    schema: int = SCHEMA
+
+    def camera(self, name: str) -> RigCamera:
+        """The camera of that name. Raises KeyError."""
+        return {camera.name: camera for camera in self.cameras}[name]
+
+
+class KnownDistance(NamedTuple):
+    """Distance [m] of two markers of the body by their ids."""
+
+    first: int
+    second: int
+    metres: float
+
+
+def calibrate_rig(views: RigViews, known: KnownDistance | None = None) -> tuple[RigCalibration, RigFit]:
+    """Calibrate the cameras of ``views``; ``known``: of a body that nobody has measured.
+
+    Raises CalibrationError where the views leave the cameras open: cause, value, limit and what to do.
+    """
+    views = usable_views(views)
+    try:
+        begun = starts(views)
+    except (GeometryError, np.linalg.LinAlgError) as error:
+        raise _open(str(error)) from error
+    _require_turns(begun[0].poses, np.zeros(len(begun[0].poses)), views)
+    fit = _best_fit(views, begun)
+    _require_turns(fit.poses, _turn_deviations(fit), fit.views)
+    _require_fit(fit)
+    result = rig_result(fit, known)
+    _require_determined(result)
+    return result, fit
+
+
+def _best_fit(views: RigViews, begun: list[RigStart]) -> RigFit:
+    """The first bundle that converges. Raises CalibrationError where none does: of places without turns for that,
+    as the bundles' starts and ends show them.
+    """
+    failure: Exception | None = None
+    ended: list[RigFit] = []
+    for start in begun:
+        try:
+            fit = fit_rig(views, start)
+        except (GeometryError, np.linalg.LinAlgError) as error:
+            failure = error
+            continue
+        if fit.solution.converged:
+            return fit
+        ended.append(fit)
+    for start in begun:
+        _require_turns(start.poses, np.zeros(len(start.poses)), views)
+    for fit in ended:
+        _require_turns(fit.poses, _turn_deviations(fit), fit.views)
+    if not ended:
+        raise _open(str(failure)) from failure
+    raise refused(
+        "no_fit", "the fit did not converge: steps", ended[-1].solution.evaluations, EVALUATIONS, "",
+        "The data leave the cameras open, or views are wrong: wave the body also tilted, near and far",
+    )  # fmt: skip
+
+
+def _turn_deviations(fit: RigFit) -> FloatArray:
+    """Deviations (s,) of the body's turns [°], cameras taken for exact."""
+    return np.asarray(np.degrees(fit.pose_deviations()[:, 3:].max(axis=1)))
+
+
+def _open(why: str) -> CalibrationError:
+    return refused(
+        "views_degenerate",
+        f"the views leave the cameras open ({why}): places that determine them",
+        0,
+        1,
+        " sets",
+        WAVE,
+    )
+
+
+def _require_turns(poses: FloatArray, deviations: FloatArray, views: RigViews) -> None:
+    """Refuse places (s, 4, 4) between which the board was not tilted, the body not turned; ``deviations`` (s,) [°].
+
+    A plane's normal is ``Kᵀ l`` of its vanishing line, so that parallel boards show one normal whatever the camera is
+    taken for; and turns of an unknown body are those of its projective displacements' eigenvalues.
+    """
+    there = np.isfinite(poses[:, 0, 0])
+    if views.layout is not None:
+        normal = np.linalg.svd(views.layout - views.layout.mean(axis=0))[2][2]
+        directions = poses[there, :3, :3] @ normal
+        mean = np.linalg.svd(directions)[2][0]
+        angles = np.degrees(np.arccos(np.clip(np.abs(directions @ mean), 0.0, 1.0)))
+        cause, what = "flat_motion", "the board stayed parallel to itself: tilt about the mean"
+    else:
+        turns = Rotation.from_matrix(poses[there, :3, :3])
+        angles = np.degrees((turns.mean().inv() * turns).magnitude())
+        cause, what = "no_turns", "the body was hardly turned: turn about the mean"
+    reached = float(np.quantile(angles, 0.9))
+    limit = max(LEAST_TURN, TURN_SIGMAS * float(np.median(deviations[there])))
+    if not reached >= limit:
+        raise refused(cause, what, reached, limit, "°", WAVE)
+
+
+def _require_fit(fit: RigFit) -> None:
+    share = 1.0 - float(fit.kept.mean())
+    if share > MOST_LEFT_OUT:
+        raise refused(
+            "views_disagree", "measurements that fit no rigid body before cameras at rest", 100 * share,
+            100 * MOST_LEFT_OUT, " %",
+            "Look for a camera that moved, markers that were mixed up, pictures not taken at one instant",
+        )  # fmt: skip
+    noise = float(np.sqrt(fit.variance * np.mean(fit.data.sigmas[fit.kept] ** 2)))
+    if noise > MOST_NOISE:
+        raise refused(
+            "misfit", "the views do not fit cameras with radial and tangential distortion: noise", noise, MOST_NOISE,
+            " px",
+            "Check the board's size, that pictures of one place are of one instant, and the lens: a fisheye is none",
+        )  # fmt: skip
+    for camera, matrix in zip(fit.views.cameras, fit.rig.cameras, strict=True):
+        K = decompose_camera(matrix)[0]
+        off = max(abs(K[0, 2] / camera.width - 0.5), abs(K[1, 2] / fit.aspect / camera.height - 0.5))
+        if not off <= OUTSIDE:
+            raise refused(
+                "no_camera", f"the principal point of {camera.name!r} lies outside its picture: from the middle", off,
+                OUTSIDE, " image sizes", WAVE,
+            )  # fmt: skip
+
+
+def _require_determined(result: RigCalibration) -> None:
+    for camera in result.cameras:
+        relative = max(camera.deviations["fx"] / camera.focal[0], camera.deviations["fy"] / camera.focal[1])
+        centre = max(camera.deviations["cx"], camera.deviations["cy"]) / camera.width
+        turn = np.degrees(max(camera.deviations.get(name, 0.0) for name in EXTRINSICS[:3]))
+        for code, what, value, limit, unit in (
+            ("focal_open", "the focal length", 100 * relative, 100 * FOCAL_DEVIATION, " %"),
+            ("centre_open", "the principal point", 100 * centre, 100 * CENTRE_DEVIATION, " % of the width"),
+            ("pair_open", "the rotation from the first camera", turn, PAIR_DEVIATION, "°"),
+        ):
+            if not value <= limit:
+                raise refused(
+                    code, f"{what} of {camera.name!r} stays open: deviation", value, limit, unit, WAVE
+                )
+
+
+# -- the result ---------------------------------------------------------------------------------------------
+
+
+class _Physical(NamedTuple):
+    """Intrinsics (c, 8) as of ``INTRINSICS``, rotations (c, 3, 3) and translations (c, 3) in the rig's unit."""
+
+    intrinsics: FloatArray
+    rotations: FloatArray
+    translations: FloatArray
+
+
+def _physical(
+    rig: RigModel, aspect: float, known: KnownDistance | None, ids: tuple[int, ...], metric: bool
+) -> _Physical:
+    intrinsics, rotations, translations = [], [], []
+    for matrix, lens in zip(rig.cameras, rig.lenses, strict=True):
+        K, R, t = decompose_camera(matrix)
+        q = K[0, 0] / lens[3]
+        intrinsics.append([
+            K[0, 0], K[1, 1] / aspect, K[0, 2], K[1, 2] / aspect,
+            lens[0] * q**2, lens[4] * q**4, lens[5] * q, lens[6] * q,
+        ])  # fmt: skip
+        rotations.append(R)
+        translations.append(t)
+    shifts = np.array(translations)
+    if known is not None:
+        a, b = (rig.points[ids.index(one), :3] for one in (known.first, known.second))
+        shifts = shifts * known.metres / np.linalg.norm(a - b)
+    elif not metric:
+        shifts = shifts / np.linalg.norm(shifts[1])
+    return _Physical(np.array(intrinsics), np.array(rotations), shifts)
+
+
+def rig_result(fit: RigFit, known: KnownDistance | None) -> RigCalibration:
+    """The cameras of a fit with their covariance. Raises CalibrationError where ``known`` names no two markers."""
+    ids, metric = fit.views.marker_ids, fit.length_known
+    if known is not None:
+        missing = [one for one in (known.first, known.second) if one not in ids]
+        if missing or known.first == known.second or not known.metres > 0.0:
+            raise CalibrationError(
+                "length",
+                f"the known length is of markers {known.first} and {known.second}, {known.metres:g} m; two of the seen "
+                f"markers {', '.join(map(str, ids))} and a positive length are needed",
+            )
+    here = _physical(fit.rig, fit.aspect, known, ids, metric)
+
+    def vector(x: FloatArray) -> FloatArray:
+        there = _physical(fit.moved(x), fit.aspect, known, ids, metric)
+        turns = Rotation.from_matrix(there.rotations @ here.rotations.transpose(0, 2, 1)).as_rotvec()
+        return np.concatenate([there.intrinsics.ravel(), np.hstack([turns, there.translations])[1:].ravel()])
+
+    root = fit.root
+    slopes = np.zeros((len(vector(np.zeros(len(root)))), len(root)))
+    for j, deviation in enumerate(np.linalg.norm(root, axis=1)):
+        step = np.zeros(len(root))
+        step[j] = 1e-3 * deviation
+        slopes[:, j] = (vector(step) - vector(-step)) / (2e-3 * deviation)
+    half = slopes @ root
+    covariance = half @ half.T
+    names = [f"{camera.name}.{name}" for camera in fit.views.cameras for name in INTRINSICS]
+    names += [f"{camera.name}.{name}" for camera in fit.views.cameras[1:] for name in EXTRINSICS]
+    deviation = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    cameras = []
+    for k, camera in enumerate(fit.views.cameras):
+        fx, fy, cx, cy, *distortion = here.intrinsics[k].tolist()
+        if fit.aspect == 1.0:
+            fx = fy = 0.5 * (fx + fy)
+        cameras.append(
+            RigCamera(
+                camera.name, camera.width, camera.height, (fx, fy), (cx, cy), tuple(distortion),
+                tuple(map(tuple, here.rotations[k].tolist())), tuple(here.translations[k].tolist()),
+                {n.rpartition(".")[2]: v for n, v in deviation.items() if n.rpartition(".")[0] == camera.name},
+            )
+        )  # fmt: skip
+    kept = fit.residuals[fit.kept]
+    scale = _scale(fit, known, ids)
+    return RigCalibration(
+        tuple(cameras), "m" if metric or known is not None else "baseline",
+        float(np.sqrt((kept**2).sum(axis=1).mean())),
+        float(np.sqrt(fit.variance * np.mean(fit.data.sigmas[fit.kept] ** 2))),
+        int(fit.kept.sum()), int((~fit.kept).sum()), fit.freedoms, tuple(names),
+        tuple(map(tuple, covariance.tolist())), ids, tuple(map(tuple, (scale * fit.points).tolist())), _views(fit),
+    )  # fmt: skip
+
+
+def _scale(fit: RigFit, known: KnownDistance | None, ids: tuple[int, ...]) -> float:
+    """Factor from the fit's unit of length to the result's."""
+    if known is not None:
+        a, b = (fit.rig.points[ids.index(one), :3] for one in (known.first, known.second))
+        return float(known.metres / np.linalg.norm(a - b))
+    return 1.0 if fit.length_known else float(1.0 / np.linalg.norm(decompose_camera(fit.rig.cameras[1])[2]))
+
+
+def _views(fit: RigFit) -> tuple[ViewResidual, ...]:
+    squares = (fit.residuals**2).sum(axis=1)
+    found = []
+    for stop, name in enumerate(fit.views.names):
+        mine = fit.data.stop == stop
+        kept = mine & fit.kept
+        rms = float(np.sqrt(squares[kept].mean())) if kept.any() else float("inf")
+        found.append(ViewResidual(name, rms, int(mine.sum()), int((mine & ~fit.kept).sum())))
+    return tuple(sorted(found, key=lambda view: -view.rms_px))
+
+
+def save_rig(result: RigCalibration, path: Path) -> None:
+    """Write the calibration as JSON."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(result), indent=1) + b"\n")
+
+
+def load_rig(path: Path) -> RigCalibration:
+    """Read a calibration. Raises CalibrationError (``bad_file``)."""
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=RigCalibration)
+    except (OSError, msgspec.DecodeError) as error:
+        raise CalibrationError(
+            "bad_file", f"{path} is no camera rig, as `stereoservo calibrate --rig` writes one: {error}"
+        ) from error
+    if found.schema != SCHEMA:
+        raise CalibrationError("bad_file", f"{path} has schema {found.schema}; {SCHEMA} is valid")
+    return found

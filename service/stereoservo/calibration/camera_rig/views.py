@@ -1,0 +1,133 @@
+"""Views of a rigid marker body, waved before the cameras of a rig: the data of a calibration without an arm, and its
+refusals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+LEAST_MARKERS = 4
+"""Markers of a view below which it shows no plane's homography, and no pose that can be checked."""
+LEAST_STOPS = 3
+"""Places of the body below which nothing is left to check a lens by."""
+STRAIGHT = 0.02
+"""Second singular value of a layout, relative to the first, below which its markers are on one line."""
+FLAT = 1e-6
+"""Third singular value of a layout, relative to the first, above which it is no plane."""
+
+
+@dataclass(frozen=True)
+class RigViews:
+    """Raw ``pixels`` (c, s, m, 2) [px] of m markers at s places of the body, NaN where one was not seen, with
+    ``sigmas`` (c, s, m) [px] an axis; all cameras saw it at the same instant. ``names`` (s,) of the places.
+
+    ``layout`` (m, 3) [m]: where the markers are on the body, a plane; None where nobody has measured them.
+    """
+
+    cameras: tuple[TrialCamera, ...]
+    marker_ids: tuple[int, ...]
+    names: tuple[str, ...]
+    pixels: FloatArray
+    sigmas: FloatArray
+    layout: FloatArray | None = None
+
+    @property
+    def seen(self) -> BoolArray:
+        """(c, s, m): which pixels there are."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=-1))
+
+    def select(self, stops: BoolArray, markers: BoolArray) -> RigViews:
+        """The views at some ``stops`` (s,) of some ``markers`` (m,)."""
+        return replace(
+            self,
+            marker_ids=tuple(i for i, keep in zip(self.marker_ids, markers, strict=True) if keep),
+            names=tuple(n for n, keep in zip(self.names, stops, strict=True) if keep),
+            pixels=self.pixels[:, stops][:, :, markers],
+            sigmas=self.sigmas[:, stops][:, :, markers],
+            layout=None if self.layout is None else self.layout[markers],
+        )
+
+
+def refused(code: str, cause: str, value: float, limit: float, unit: str, remedy: str) -> CalibrationError:
+    """The refusal of data: what is wrong, its value and limit, and what to do."""
+    return CalibrationError(
+        code,
+        f"{cause}: {value:.3g}{unit}, the limit is {limit:.3g}{unit}. {remedy}",
+        cause=cause,
+        value=float(value),
+        limit=float(limit),
+        unit=unit.strip(),
+        remedy=remedy,
+    )
+
+
+def usable_views(views: RigViews) -> RigViews:
+    """The views without pictures of too few markers, places that no camera saw and markers that were seen but once.
+
+    Raises CalibrationError: ``bad_data``, ``too_few_views``, ``camera_apart``, ``markers_on_a_line``.
+    """
+    c, s, m = views.sigmas.shape
+    if views.pixels.shape != (c, s, m, 2) or len(views.cameras) != c or len(views.marker_ids) != m:
+        raise CalibrationError(
+            "bad_data", f"pixels {views.pixels.shape} and sigmas {views.sigmas.shape} do not fit"
+        )
+    if not (views.sigmas[views.seen] > 0.0).all():
+        raise CalibrationError("bad_data", "sigmas must be positive where there is a pixel")
+    rich = views.seen.sum(axis=2) >= LEAST_MARKERS
+    views = replace(views, pixels=np.where(rich[:, :, None, None], views.pixels, np.nan))
+    seen = views.seen
+    views = views.select(np.asarray(seen.any(axis=(0, 2))), seen.sum(axis=(0, 1)) >= 2)
+    _require_stops(views)
+    _require_layout(views)
+    return views
+
+
+def _require_stops(views: RigViews) -> None:
+    by_camera = np.asarray(views.seen.any(axis=2))
+    for camera, mine in zip(views.cameras, by_camera, strict=True):
+        if int(mine.sum()) < LEAST_STOPS:
+            raise refused(
+                "too_few_views", f"camera {camera.name!r} saw the body at too few places", int(mine.sum()),
+                LEAST_STOPS, " places",
+                "Wave it before every camera, at ten places or more, at least four markers in the picture",
+            )  # fmt: skip
+    reached = {0}
+    for _ in views.cameras:
+        reached |= {
+            k for k in range(len(views.cameras)) if any((by_camera[k] & by_camera[j]).any() for j in reached)
+        }
+    apart = [camera.name for k, camera in enumerate(views.cameras) if k not in reached]
+    if apart:
+        raise refused(
+            "camera_apart",
+            f"camera(s) {', '.join(apart)} never saw the body together with {views.cameras[0].name!r} or a camera "
+            "that did",
+            0, 1, " places in common", "Hold it where two cameras at a time see it; a chain of pairs will do",
+        )  # fmt: skip
+
+
+def _require_layout(views: RigViews) -> None:
+    if views.layout is None:
+        if len(views.cameras) < 2:
+            raise refused(
+                "one_camera", "one camera alone cannot find where the markers of the body are", 1, 2, " cameras",
+                "State the layout (--board with --pitch, or --layout), or use a second camera",
+            )  # fmt: skip
+        return
+    spread = np.linalg.svd(views.layout - views.layout.mean(axis=0), compute_uv=False)
+    if not spread[1] > STRAIGHT * spread[0]:
+        raise refused(
+            "markers_on_a_line", "the markers lie on one line: width of the layout, relative to its length",
+            float(spread[1] / spread[0]), STRAIGHT, "", "Use a board, or a body with markers beside that line",
+        )  # fmt: skip
+    if len(spread) > 2 and spread[2] > FLAT * spread[0]:
+        raise refused(
+            "layout_not_flat", "the stated layout is no plane: its depth, relative to its length",
+            float(spread[2] / spread[0]), FLAT, "",
+            "Leave the layout out, for a body in space is found with the cameras, and state one length (--length)",
+        )  # fmt: skip
