@@ -33,8 +33,8 @@ from stereoservo.kinematics.parameterization import Kind, LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 HAND: tuple[Kind, ...] = ("prismatic",) * 3 + ("revolute",) * 3
-TIED = 1e-3
-"""Standard deviation of a tie [px]: far below what any data show, so that it holds."""
+TIED = 1e-2
+"""Standard deviation of a tie [px]: below what data show, so that it holds, and not so stiff that steps stall."""
 LOOSE = 10.0
 """Ties [px] with which the bundle of an unknown body begins, whose cameras have any pixels yet."""
 WIDE = 100.0
