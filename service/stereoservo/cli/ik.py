@@ -105,8 +105,9 @@ def learnt_arm(cell: str, operator: str | None) -> LearntArm:
 
     live = not cell.endswith(".toml")
     described = load_cell_file(Path(find_daemon(cell).cell_path) if live else Path(cell))
-    models = ModelStore(cell_directories(described.cell.name).models)
-    epochs, now = models.epochs(), None
+    directory, now = cell_directories(described.cell.name).models, None
+    models = ModelStore(directory)
+    epochs = models.epochs() if directory.is_dir() else []
     if live:
         with Client(cell, operator=operator) as client:
             status = client.status()

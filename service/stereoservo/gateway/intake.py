@@ -167,7 +167,8 @@ class Intake:
             if not isinstance(goal.target, TaughtTarget):
                 return goal
             resolved = self._teaching.resolve(goal.target)
-            seen = self._teaching.seen_when_taught(goal.target, goal.follow_markers)
+            ids = goal.follow_markers
+            seen = self._teaching.seen_when_taught(goal.target, ids) if ids else {}
         except TransferError as error:
             raise _Answered(
                 self._refused("the goal cannot be placed now", f"target: {error}", goal=goal.id)

@@ -78,7 +78,7 @@ class ModelStore:
 
     def _epochs(self, pattern: re.Pattern[str]) -> list[int]:
         return sorted(
-            int(match[1]) for path in self._directory.glob("*") if (match := pattern.fullmatch(path.name))
+            int(match[1]) for path in self._directory.iterdir() if (match := pattern.fullmatch(path.name))
         )
 
     def next_epoch(self) -> int:
