@@ -13,9 +13,13 @@ from stereoservo.client.errors import RefusedError
 from stereoservo.messages.discovery import DaemonProcess
 from third_party.wheel import LAW, install_law
 
-from .conftest import CELL, moved_away
+from .conftest import CELL, eventually, moved_away
 
 pytestmark = pytest.mark.process
+
+
+def compiling(client: Client) -> bool:
+    return any(reason.code == "COMPILING" for reason in client.status().reasons)
 
 
 def test_a_goal_is_reached_by_an_installed_law(
@@ -27,6 +31,7 @@ def test_a_goal_is_reached_by_an_installed_law(
         assert LAW in client.info().laws
         law, _ = json.loads(client.schema("goal"))["$defs"]["Goal"]["properties"]["law"]["anyOf"]
         assert LAW in law["enum"]
+        eventually("its kernels are compiled", lambda: not compiling(client), 240.0)
         client.enable()
         moved_away(client)
         result = client.goal("park", law=LAW, tolerance_px=0.5, hold_frames=3).reached(60.0)
