@@ -16,8 +16,9 @@ from stereoservo.calibration.trial_data import CalibrationError, TrialData, load
 from stereoservo.core.sources.trial_stops import combined_offsets
 from stereoservo.daemon.jobs.calibration_report import floors, residuals_of, write_report
 from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
-from stereoservo.kinematics.denavit_hartenberg import denavit_hartenberg, known_length_of
+from stereoservo.kinematics.denavit_hartenberg import denavit_hartenberg
 from stereoservo.kinematics.model import CellModel, FitStatistics, JointStatistics, load_model
+from stereoservo.messages.known_length import known_length_of
 from stereoservo_sim.world.synthetic import RX90_ROWS, SyntheticCell, parallel, rx90
 
 SIGMA = 0.05

@@ -7,7 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, ReadOutError, denavit_hartenberg
+from stereoservo.kinematics.denavit_hartenberg import COLUMNS, ReadOutError, denavit_hartenberg
+from stereoservo.messages.known_length import KnownLength
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 

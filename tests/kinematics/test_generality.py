@@ -11,8 +11,9 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import propagated
-from stereoservo.kinematics.denavit_hartenberg import COLUMNS, KnownLength, ReadOutError, denavit_hartenberg
+from stereoservo.kinematics.denavit_hartenberg import COLUMNS, ReadOutError, denavit_hartenberg
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
+from stereoservo.messages.known_length import KnownLength
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 

@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 
 from stereoservo.cli.main import invoke
-from stereoservo.kinematics.denavit_hartenberg import (
-    KnownLength,
-    ReadOutError,
-    denavit_hartenberg,
-    known_length_of,
-)
+from stereoservo.kinematics.denavit_hartenberg import ReadOutError, denavit_hartenberg
 from stereoservo.kinematics.model import save_model
 from stereoservo.kinematics.urdf import metric_arm, urdf_text
 from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.known_length import KnownLength, known_length_of
 from stereoservo_drivers.twist import seen_as_joints
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.truth import true_cell

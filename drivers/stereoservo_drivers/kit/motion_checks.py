@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -448,41 +449,48 @@ def answers_in_time(bench: JointBench) -> str:
 def tells_faults_of_the_device(bench: JointBench) -> str:
     """A fault of the device is told by DriverError; once it is mended, the driver is configured and activated again."""
     driver = bench.active()
-    velocity, period = bench.slow(driver), 1.0 / driver.describe().rate_hz
-    bench.drive(driver, velocity, 0.1)
-    if not bench.setup.break_down(driver):
-        raise CheckNotRunError("nobody makes the device fail (protective stop, hardware error): break_down()")
-    start_ns = bench.now_ns()
-    try:
-        code = _await_fault(bench, driver, velocity, period, "the device has a fault")
-        waited = (bench.now_ns() - start_ns) * 1e-9
+    missing = "nobody makes the device fail (protective stop, hardware error): break_down()"
+    setup = bench.setup
+    with _failed(bench, driver, setup.break_down, setup.mend, missing, "the device has a fault") as told:
         call_stop(driver, "with a fault of the device")
         driver.deactivate()
-    finally:
-        bench.setup.mend(driver)
-    bench.setup.configure(driver)  # as the command `reset` does
+    setup.configure(driver)  # as the command `reset` does
     driver.activate()
     bench.drive(driver, zero(driver), 0.05)
-    return f"{code} after {waited:.2f} s; mended, it is configured and activated again"
+    return f"{told}; mended, it is configured and activated again"
 
 
 def reports_a_lost_device(bench: JointBench) -> str:
     """A device that has gone is told by DriverError, and stop() and close() raise nothing then."""
     driver = bench.active()
-    velocity, period = bench.slow(driver), 1.0 / driver.describe().rate_hz
-    bench.drive(driver, velocity, 0.1)
-    if not bench.setup.unplug(driver):
-        raise CheckNotRunError("nobody pulls the cable: override unplug(), or `--pull`")
-    start_ns = bench.now_ns()
-    try:
-        code = _await_fault(bench, driver, velocity, period, "the device has gone")
-        waited = (bench.now_ns() - start_ns) * 1e-9
+    missing = "nobody pulls the cable: override unplug(), or `--pull`"
+    setup = bench.setup
+    with _failed(bench, driver, setup.unplug, setup.plug_in, missing, "the device has gone") as told:
         call_stop(driver, "with the device gone")
         call_stop(driver, "with the device gone, a second time")
         driver.close()
+    return f"{told}; stop() and close() raise nothing"
+
+
+@contextmanager
+def _failed(
+    bench: JointBench, driver: JointDriver, fail: Callable[[JointDriver], bool], undo: Callable[[JointDriver], None],
+    missing: str, since: str,
+) -> Iterator[str]:  # fmt: skip
+    """The arm in motion while its device fails, until the failure is undone; gives what the driver told, and when.
+
+    Raises CheckNotRunError with what is ``missing``, CheckFailedError.
+    """
+    velocity, period = bench.slow(driver), 1.0 / driver.describe().rate_hz
+    bench.drive(driver, velocity, 0.1)
+    if not fail(driver):
+        raise CheckNotRunError(missing)
+    start_ns = bench.now_ns()
+    try:
+        code = _await_fault(bench, driver, velocity, period, since)
+        yield f"{code} after {(bench.now_ns() - start_ns) * 1e-9:.2f} s"
     finally:
-        bench.setup.plug_in(driver)
-    return f"{code} after {waited:.2f} s; stop() and close() raise nothing"
+        undo(driver)
 
 
 def _await_fault(bench: JointBench, driver: JointDriver, velocity: Any, period: float, since: str) -> str:

@@ -12,17 +12,11 @@ import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit, note
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.denavit_hartenberg import (
-    DH_HEAD,
-    KnownLength,
-    ReadOutError,
-    denavit_hartenberg,
-    dh_cells,
-    known_length_of,
-)
+from stereoservo.kinematics.denavit_hartenberg import DH_HEAD, ReadOutError, denavit_hartenberg, dh_cells
 from stereoservo.kinematics.model import CellModel, load_model
 from stereoservo.kinematics.urdf import metric_arm, urdf_text
 from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.known_length import KnownLength, known_length_of
 from stereoservo.recording.flight_export import export_flight
 
 SAME = 1e-9
@@ -206,5 +200,5 @@ def _known_length(text: str, model: CellModel, cell: CellFile | None) -> KnownLe
         )
     try:
         return known_length_of(text)
-    except ReadOutError as error:
-        raise CommandError(error.code, str(error)) from error
+    except ValueError as error:
+        raise CommandError("length", str(error)) from error

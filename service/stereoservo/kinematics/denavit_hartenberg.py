@@ -44,6 +44,7 @@ from stereoservo.kinematics.axes import (
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import standard_deviations
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.known_length import KnownLength
 from stereoservo.numerics.arrays import FloatArray
 
 LinkKind = Literal["skew", "meeting", "parallel", "to_prismatic", "last"]
@@ -70,35 +71,6 @@ class ReadOutError(ValueError):
         super().__init__(message)
         self.code = code
         self.data = data
-
-
-class KnownLength(msgspec.Struct, frozen=True):
-    """The known length that fixes the scale of a metric model: ``metres`` of a quantity named by ``what`` and
-    ``of``.
-
-    ``a`` or ``d`` of a joint's row, ``prismatic`` (one unit of that joint), ``markers`` (two ids), ``baseline``
-    (two cameras' names).
-    """
-
-    what: Literal["a", "d", "prismatic", "markers", "baseline"]
-    of: tuple[str | int, ...]
-    metres: float
-
-
-def known_length_of(text: str) -> KnownLength:
-    """The known length that ``text`` states as ``WHAT:OF=METRES``. Raises ReadOutError (``length``)."""
-    what, _, rest = text.partition(":")
-    of, _, metres = rest.rpartition("=")
-    names = [int(name) if what == "markers" and name.isdecimal() else name for name in of.split(",")]
-    try:
-        return msgspec.convert({"what": what, "of": names, "metres": float(metres)}, KnownLength)
-    except (ValueError, msgspec.ValidationError) as error:
-        raise ReadOutError(
-            "length",
-            f"known length {text!r}: WHAT:OF=METRES is needed, one length of the model in metres, WHAT of markers, "
-            "baseline, prismatic, a, d: markers:10,11=0.05, baseline:left,right=0.2, a:j2=0.4",
-            text=text,
-        ) from error
 
 
 class DhRow(msgspec.Struct, frozen=True):

@@ -11,13 +11,9 @@ import numpy as np
 from stereoservo.geometry.strata import decompose_camera
 from stereoservo.kinematics.axes import Axes, framed, unit
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.denavit_hartenberg import (
-    KnownLength,
-    axes_at_origin,
-    base_origin,
-    metres_per_length,
-)
+from stereoservo.kinematics.denavit_hartenberg import axes_at_origin, base_origin, metres_per_length
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.known_length import KnownLength
 from stereoservo.numerics.arrays import FloatArray
 
 SQUARE = np.radians(2.0)

@@ -5,7 +5,6 @@ calibration, zenoh), strictly decoded and validated.
 from __future__ import annotations
 
 import math
-import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +14,7 @@ import msgspec.inspect
 from msgspec import Meta
 
 from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
+from stereoservo.messages.known_length import known_length_of
 
 SCHEMA = 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
@@ -300,21 +300,16 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
 
 
 def _check_known_length(text: str, cameras: list[str], path: Path | str) -> None:
-    """Check the form of a known length, as far as a cell file tells; which markers there are, the model knows."""
-    found = re.fullmatch(r"(markers|baseline|prismatic|a|d):([^=]+)=([0-9.eE+-]+)", text)
-    what, of, number = found.groups() if found else ("", "", "")
-    names = of.split(",")
+    """Check a known length, as far as a cell file tells; which markers and joints there are, the model knows."""
     try:
-        valid = float(number) > 0.0 and len(set(names)) == (2 if what in ("markers", "baseline") else 1)
-        valid = valid and (what != "markers" or all(name.isdecimal() for name in names))
-    except ValueError:
-        valid = False
-    if not valid or (what == "baseline" and not set(names) <= set(cameras)):
+        known = known_length_of(text)
+    except ValueError as error:
+        raise CellFileError(path, "calibration.known_length", str(error)) from error
+    if known.what == "baseline" and not set(known.of) <= set(cameras):
         raise CellFileError(
             path,
             "calibration.known_length",
-            f"is {text!r}; WHAT:OF=METRES is valid, markers:10,11=0.05 (two ids), prismatic:j1=1, a:j2=0.4, d:j3=0.1 "
-            f"(a joint) or baseline:A,B=0.2 (two cameras of {', '.join(cameras)})",
+            f"{text!r} names no two cameras of {', '.join(cameras)}",
         )
 
 

@@ -59,9 +59,6 @@ class LiveDemonstrator:
         return Calibrated(load_model(Path(result.model)), seconds)
 
     def _hear(self, event: EventMessage) -> None:
-        """Pass progress on. Raises ClientError where the cell is held, since nobody would resume it."""
-        if event.kind == "held":
-            raise ClientError(f"the cell was held and nobody resumed it: {event.message}")
         if event.progress is not None:
             self._progress(event.progress)
 

@@ -104,6 +104,12 @@ def rig(count: int, seed: int = 1) -> tuple[RigCamera, ...]:
     return tuple(cameras)
 
 
+def assert_alike(there: RigCamera, camera: RigCamera) -> None:
+    """The same intrinsics to the bit, and the same pose but for the rounding of products."""
+    assert (there.focal, there.centre, there.distortion) == (camera.focal, camera.centre, camera.distortion)
+    assert np.abs(there.motion - camera.motion).max() < 1e-14
+
+
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_opencv_and_kalibr_give_back_what_they_got(count: int, tmp_path: Path) -> None:
     cameras = rig(count)
@@ -113,12 +119,7 @@ def test_opencv_and_kalibr_give_back_what_they_got(count: int, tmp_path: Path) -
     found = load_cameras(tmp_path / "chain.yaml")
     assert found[:2] == cameras[:2]
     for there, camera in zip(found, cameras, strict=True):  # poses of a chain are products, but for the first
-        assert (there.focal, there.centre, there.distortion) == (
-            camera.focal,
-            camera.centre,
-            camera.distortion,
-        )
-        assert np.abs(there.motion - camera.motion).max() < 1e-14
+        assert_alike(there, camera)
 
 
 def test_ros_gives_back_the_cameras_and_of_a_pair_the_pose(tmp_path: Path) -> None:
@@ -127,12 +128,7 @@ def test_ros_gives_back_the_cameras_and_of_a_pair_the_pose(tmp_path: Path) -> No
     found = load_cameras(tmp_path / "ros")
     for there, camera in zip(found, cameras, strict=True):
         assert (there.name, there.width, there.height) == (camera.name, camera.width, camera.height)
-        assert (there.focal, there.centre, there.distortion) == (
-            camera.focal,
-            camera.centre,
-            camera.distortion,
-        )
-        assert np.abs(there.motion - camera.motion).max() < 1e-14
+        assert_alike(there, camera)
 
 
 def test_the_rectification_of_a_pair_puts_points_on_one_row(tmp_path: Path) -> None:

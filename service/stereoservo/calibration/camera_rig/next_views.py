@@ -14,6 +14,7 @@ from stereoservo.calibration.camera_rig.rig_calibration import RigCalibration
 from stereoservo.calibration.joint_errors.joint_noise import stop_rows
 from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import Measurements, predicted
+from stereoservo.geometry.strata import decompose_camera, intrinsics_and_slopes
 from stereoservo.numerics.arrays import FloatArray
 
 TILTS = (
@@ -78,8 +79,6 @@ def _deviation(information: FloatArray, row: FloatArray) -> float:
 
 def _focal_slope(fit: RigFit, k: int) -> FloatArray:
     """Derivative (p,) of camera k's focal length by the parameters."""
-    from stereoservo.geometry.strata import intrinsics_and_slopes
-
     charts = fit.solution.charts
     row = np.zeros(charts.size)
     at = charts.start(1) + sum(len(basis) for basis in charts.cameras[:k])
@@ -151,6 +150,4 @@ def _facing(fit: RigFit, k: int) -> FloatArray:
 
 def _unit(fit: RigFit, k: int) -> float:
     """Distance of camera k from the first one in the fit's unit of length."""
-    from stereoservo.geometry.strata import decompose_camera
-
     return float(np.linalg.norm(decompose_camera(fit.rig.cameras[k])[2]))

@@ -28,6 +28,7 @@ from stereoservo.calibration.rig_model import (
     residuals,
     rig_at,
 )
+from stereoservo.geometry.screws import twist_matrix
 from stereoservo.geometry.strata import decompose_camera
 from stereoservo.kinematics.parameterization import Kind, LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
@@ -42,6 +43,9 @@ WIDE = 100.0
 OUTLIER = 5.0
 """Residual, in estimated standard deviations of the noise, beyond which a measurement is left out."""
 ROUNDS = 3
+ASPECT_GAIN = 25.0
+"""Chi-square that pixels which are not square must gain to be believed, beside 2 for each camera."""
+ASPECT_ROUNDS = 3
 EVALUATIONS = 150
 POSE_STEPS = 30
 FRAMES = 60
@@ -175,11 +179,6 @@ def _stretched(fit: RigFit, ratio: float) -> tuple[RigFit, RigModel]:
     return replace(fit, data=data, aspect=fit.aspect * ratio), rig
 
 
-ASPECT_GAIN = 25.0
-"""Chi-square that pixels which are not square must gain to be believed, beside 2 for each camera."""
-ASPECT_ROUNDS = 3
-
-
 def _placed(views: RigViews, start: RigStart) -> tuple[RigViews, RigStart]:
     """Views and start of those stops and markers that have a place in it."""
     stops, markers = np.isfinite(start.poses[:, 0, 0]), np.isfinite(start.points[:, 0])
@@ -245,10 +244,8 @@ def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
 
 
 def _rig(start: RigStart, body_frame: FloatArray) -> RigModel:
-    generators = np.zeros((6, 4, 4))
-    for axis in range(3):
-        generators[axis, axis, 3] = 1.0
-        generators[3 + axis, :3, :3] = np.cross(np.eye(3), np.eye(3)[axis])
+    none, axes = np.zeros(3), np.eye(3)
+    generators = np.concatenate([twist_matrix(none, axes), twist_matrix(axes, none)])
     lenses = np.hstack([start.lenses, np.zeros((len(start.lenses), 3))])
     points = np.hstack([start.points @ body_frame, np.ones((len(start.points), 1))])
     return RigModel(HAND, generators, start.cameras, points, lenses)

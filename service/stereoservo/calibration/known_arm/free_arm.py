@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData
+from stereoservo.geometry.screws import screw_twist
 from stereoservo.kinematics.parameterization import Kind
 from stereoservo.numerics.arrays import FloatArray
 
@@ -36,10 +37,7 @@ def free_arm(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     positions = np.hstack([D[:, :3, 3] - zero[:3, 3], turns.as_euler("ZYX")])
     generators = np.zeros((6, 4, 4))
     generators[[0, 1, 2], [0, 1, 2], 3] = 1.0
-    for joint, axis in zip((3, 4, 5), np.eye(3)[::-1], strict=True):
-        turn = np.cross(np.eye(3), axis)
-        generators[joint, :3, :3] = -turn.T
-        generators[joint, :3, 3] = turn.T @ zero[:3, 3]
+    generators[3:] = [screw_twist(axis, zero[:3, 3]) for axis in np.eye(3)[::-1]]
     return positions, generators, zero
 
 

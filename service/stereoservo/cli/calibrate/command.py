@@ -165,6 +165,8 @@ def calibrate(
         )
         emit(report, text, json)
         return
+    if board or pitch is not None or layout is not None or length:
+        raise CommandError("argument", "--board, --pitch, --layout and --length go with --rig")
     if not cell:
         raise typer.BadParameter("CELL is needed, but for --rig with pictures of a board", param_hint="CELL")
     if (reset_zeros or unattended) and not check:

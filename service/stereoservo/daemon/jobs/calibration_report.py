@@ -39,10 +39,10 @@ from stereoservo.kinematics.denavit_hartenberg import (
     decimals,
     denavit_hartenberg,
     dh_cells,
-    known_length_of,
 )
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.known_length import known_length_of
 
 DPI = 90
 HISTOGRAM = np.linspace(-5.0, 5.0, 41)

@@ -20,8 +20,9 @@ from stereoservo.geometry.distortion import undistort
 from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, framed, joint_axes
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.covariance import propagated
-from stereoservo.kinematics.denavit_hartenberg import KnownLength, conventions, dh_values
+from stereoservo.kinematics.denavit_hartenberg import conventions, dh_values
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.known_length import KnownLength
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.arms.thesis_robot import BASELINE, SIGMA, thesis_cell, trial_motions
 from stereoservo_sim.progress import ProgressCall
