@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +25,13 @@ from stereoservo.calibration.camera_rig.rig_calibration import (
 from stereoservo.calibration.camera_rig.still_places import still_places
 from stereoservo.calibration.camera_rig.views import RigViews
 from stereoservo.calibration.trial_data import TrialCamera
+from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
 from stereoservo.cli.output import CommandError, note, shipped_or_path
+from stereoservo.daemon.camera_setup import recorded_camera, video_of
+from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.locks import AlreadyRunningError, holder
 from stereoservo.messages.recording_request import IMAGES_SUFFIX
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import plugins
@@ -222,8 +229,6 @@ def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -
             "--images of a folder a camera needs --board COLUMNSxROWS and --pitch METRES, or a cell file whose "
             "detectors see the body",
         )
-    from stereoservo.messages.cell_file import load_cell_file
-
     path = Path(options.cell)
     sections = {section.name: section for section in load_cell_file(path).camera}
     if camera not in sections or not sections[camera].detector:
@@ -239,9 +244,6 @@ def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -
 
 def _recorded(options: RigOptions) -> RigViews:
     """Views of a recording of ``record --images``, where the body was held still."""
-    from stereoservo.daemon.camera_setup import recorded_camera, video_of
-    from stereoservo.messages.cell_file import load_cell_file
-
     assert options.images is not None
     if not options.cell:
         raise CommandError(
@@ -261,12 +263,6 @@ def _recorded(options: RigOptions) -> RigViews:
 
 def _live(options: RigOptions) -> RigViews:
     """Views of a cell file's cameras, watched for some seconds while the body is held here and there."""
-    from stereoservo.cli.doctor.cameras import watch_cameras
-    from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
-    from stereoservo.messages.cell_file import load_cell_file
-    from stereoservo.messages.directories import cell_directories, create_directories
-    from stereoservo.messages.locks import holder
-
     if not options.cell:
         raise CommandError(
             "argument", "--rig needs a cell file with the cameras, or --images DIR with a folder a camera"
@@ -286,7 +282,14 @@ def _live(options: RigOptions) -> RigViews:
         "and far, in the pictures' corners"
     )
     began = time.monotonic()
-    records = watch_cameras(plan, options.seconds)
+    with ExitStack() as locks:
+        try:
+            same = lock_cameras(plan, locks)
+        except AlreadyRunningError as error:
+            raise CommandError("cameras", str(error)) from error
+        if same:
+            raise CommandError("cameras", f"{same}: {SAME_REMEDY}")
+        records = watch_cameras(plan, options.seconds)
     failed = [f"{r.description.name}: {r.error}" for r in records if r.error]
     if failed:
         raise CommandError("cameras", "; ".join(failed))

@@ -34,6 +34,7 @@ from stereoservo.ports.devices import (
     Frame,
 )
 
+SAME_REMEDY = "camera.options of one of them: each camera has its own"
 FIRST_FRAME_S = 6.0
 """How long a camera may take to deliver its first frame."""
 POLL_S = 0.002
@@ -116,22 +117,13 @@ def examine_cameras(
         )
         return
     with ExitStack() as locks:
-        owners: dict[Path, str] = {}
         try:
-            for section in plan.cell.camera:
-                path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
-                if path is None:
-                    continue
-                if path in owners:
-                    yield ExaminationFinding(
-                        "cameras", False, f"{owners[path]!r} and {section.name!r} are one and the same camera",
-                        "camera.options of one of them: each camera has its own",
-                    )  # fmt: skip
-                    return
-                locks.enter_context(ChannelLock(path, f"camera {section.name!r}"))
-                owners[path] = section.name
+            twice = lock_cameras(plan, locks)
         except AlreadyRunningError as error:
             yield ExaminationFinding("cameras", None, f"not examined: {error}")
+            return
+        if twice:
+            yield ExaminationFinding("cameras", False, twice, SAME_REMEDY)
             return
         records = watch_cameras(plan, seconds)
     min_markers = DEFAULT_MARKERS if settings.trials is None else settings.trials.min_markers
@@ -148,6 +140,23 @@ def examine_cameras(
     if model is not None and settings.trials is not None:
         yield from examine_coverage(model, settings.trials, records)
     yield from _save_pictures(records, pictures)
+
+
+def lock_cameras(plan: RunPlan, locks: ExitStack) -> str:
+    """Take the locks of the cell's cameras for as long as ``locks`` lasts; which two are one and the same, else ''.
+
+    Raises AlreadyRunningError where another process has one.
+    """
+    owners: dict[Path, str] = {}
+    for section in plan.cell.camera:
+        path = hardware_lock_path(plan.directories.runtime.parent, section.driver, section.options)
+        if path is None:
+            continue
+        if path in owners:
+            return f"{owners[path]!r} and {section.name!r} are one and the same camera"
+        locks.enter_context(ChannelLock(path, f"camera {section.name!r}"))
+        owners[path] = section.name
+    return ""
 
 
 def watch_cameras(plan: RunPlan, seconds: float) -> list[CameraRecord]:
