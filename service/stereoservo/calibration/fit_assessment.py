@@ -49,6 +49,8 @@ REMEDIES = {
     "not_explained": "did markers slip, did a joint's zero or another camera move as well? Calibrate, or check, anew",
     "too_uncertain": "let the moved camera see more: more markers, static ones ([scene] static), another pose",
     "bad_data": "the data are damaged or not of this cell: look at the text, record anew",
+    "bad_file": "the file holds no cameras, or what the wished format cannot hold: look at the text",
+    "length": "state the distance of two markers that were seen, in metres",
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
     "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
     "another calibration.base",

@@ -1,6 +1,6 @@
 """The demonstration as the command line gives it, of every shipped cell: in lockstep, and as real processes where a
-cell has no lockstep (a bus or streams in real time). The plain cell in the suite, all with three seeds in ``-m slow``,
-and there those of other arms.
+cell has no lockstep (a bus or streams in real time). The plain cell in the suite (its real processes:
+test_demo_live.py), all with three seeds in ``-m slow``, and there those of other arms.
 """
 
 from __future__ import annotations
@@ -224,15 +224,3 @@ def test_every_cell_without_a_lockstep_does_likewise_in_real_processes(
     result = run_demo(tmp_path, "--cell", cell, "--seed", str(seed))
     check(result)
     assert result["lockstep"] is False
-
-
-@pytest.mark.process
-@pytest.mark.timeout(TIMEOUT_S)
-def test_demo_as_real_processes(tmp_path: Path) -> None:
-    result = run_demo(tmp_path)
-    check(result)
-    assert result["lockstep"] is False
-    assert result["loop"]["rate_hz"] == 250.0
-    assert "skipped" in result["loop"]
-    left = subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, text=True, check=False)
-    assert left.stdout == ""
