@@ -11,7 +11,7 @@ import pytest
 from stereoservo.core import monitor
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.estimate import workspace
-from stereoservo.core.ingest import _has_shape
+from stereoservo.core.ingest import fill_sample
 from stereoservo.core.monitors import collision
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings, CoreSettings
@@ -65,7 +65,7 @@ def fly(
             k, state.block.numbers.loads_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
         )  # fmt: skip
-        _has_shape(sample, room.sample)
+        fill_sample(sample, room.sample)
         reason = monitor.detect_collision(state, settings, room, sample)
         if reason is not None:
             found.append((k, reason))

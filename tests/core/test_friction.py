@@ -58,8 +58,8 @@ def test_a_drive_without_friction_is_not_pushed(bench: Any, resolution: float) -
     most = 0.0
     for _ in range(round(15.0 * bench.settings.rate_hz)):
         bench.step()
-        if (friction := bench.core.state.friction) is not None:
-            most = max(most, float(np.abs(friction.velocity).max()))
+        if bench.core.state.friction_of:
+            most = max(most, float(np.abs(bench.core.state.block.friction).max()))
     assert most <= (0.1 if resolution < STEP else 0.4) * MOST["revolute"]
 
 
@@ -76,7 +76,7 @@ def test_nothing_hunts_while_a_goal_is_held_against_friction(bench: Any, resolut
     for _ in range(6):
         bench.run(0.5)
         stood.append(bench.q.copy())
-    assert bench.core.state.friction is not None
+    assert bench.core.state.friction_of != ""
     assert np.ptp(stood, axis=0).max() < 3e-4
     one_step = max(true_error(bench, bench.q + resolution * joint) for joint in np.eye(6))
     assert true_error(bench, target) < 2.0 * bench.settings.tolerance_px + one_step
@@ -99,7 +99,7 @@ def test_play_before_a_coarse_encoder_is_not_taken_for_friction(
         bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)
     ).accepted
     bench.run(3.0)
-    assert bool(bench.core.state.friction.velocity.any()) is added
+    assert bool(bench.core.state.block.friction.any()) is added
 
 
 def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> None:
@@ -110,8 +110,8 @@ def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> Non
     ).accepted
     bench.run(3.0)
     most = MOST["revolute"]
-    assert 0.9 * most < np.abs(bench.core.state.friction.velocity).max() <= most
+    assert 0.9 * most < np.abs(bench.core.state.block.friction).max() <= most
     bench.ended()
     bench.run(0.1)
-    assert bench.core.state.friction is None
+    assert bench.core.state.friction_of == ""
     assert np.abs(bench.core.state.block.command).max() == 0.0

@@ -16,7 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.core.camera_state import NOTHING_KNOWN, NOTHING_SEEN, CameraEstimate, CameraMonitor
+from stereoservo.core.camera_state import (
+    KINDS,
+    NOTHING_KNOWN,
+    NOTHING_SEEN,
+    CameraEstimate,
+    CameraMonitor,
+    Kept,
+)
 from stereoservo.core.monitor_state import DriveDelays
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -49,6 +56,36 @@ the watch on contact; steps of the ``past``.
 """
 
 
+class RunProgress(Kept):
+    """How the law at work has got on since its goal began.
+
+    ``moved_s``: how long it has been allowed to move. ``newest_px``: the largest error over markers and cameras, where
+    one was ``measured`` in the last step; ``held``: frames that it has been inside its tolerance, the last ones being
+    counted when the cameras had ``last_frames`` in all. ``first_px``: the largest so far; ``mean_px`` of late;
+    ``least_px``: the smallest such mean, improved for the last time after ``least_s`` of motion.
+    """
+
+    moved_s: float
+    held: int
+    last_frames: int
+    measured: bool
+    newest_px: float
+    first_px: float
+    mean_px: float
+    least_px: float
+    least_s: float
+    _fields_ = tuple((name, KINDS[kind]) for name, kind in __annotations__.items())
+
+    @property
+    def error_px(self) -> float | None:
+        """The error of the last step; None where none was measured."""
+        return self.newest_px if self.measured else None
+
+    def begin(self, frames: int) -> None:
+        """A law begins, when the cameras have had so many ``frames`` in all."""
+        self.count_as(RunProgress(last_frames=frames))
+
+
 class Numbers(ctypes.Structure):
     """The numbers at the head of a record: the counts, and what is no array. Read and written like attributes."""
 
@@ -70,8 +107,9 @@ class Numbers(ctypes.Structure):
     tells_efforts: int
     tells_following: int
     rows: int
+    run: RunProgress
     _fields_ = [
-        (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
+        (name, {"float": ctypes.c_double, "RunProgress": RunProgress}.get(kind, ctypes.c_int64))
         for name, kind in __annotations__.items()
     ]
 
@@ -86,6 +124,7 @@ ARRAYS: Shapes = {
     "delay_s": JOINTS, "delay_samples": (DELAY_SAMPLES, "joints"), "delay_onset": (7, "joints"),
     "delay_sent": JOINTS, "delay_past": ("past", "joints"), "delay_velocity": JOINTS, "delay_under_way": JOINTS,
     "delay_accounted": JOINTS, "delay_missing": JOINTS,
+    "friction": JOINTS, "friction_from": JOINTS, "friction_sent": JOINTS, "friction_s": JOINTS,
     "mean_efforts": JOINTS, "effort_excess": ("window", "joints"), "following_excess": ("window", "joints"),
     "contact_low": (2, "joints"), "contact_high": (2, "joints"), "efforts": JOINTS, "following_errors": JOINTS,
     "innovation": ("cameras", "markers", 2), "sigma": ("cameras", "markers"), "seen_ns": ("cameras", "markers"),
@@ -153,6 +192,10 @@ class Block:
     friction may hold back, and for how long, ``silent_s``. ``delay_…``: the arrays of `monitor_state.DriveDelays`,
     after ``delay_steps`` steps.
 
+    Friction, while something works on a goal (see `core.move`): ``friction`` (n,) [rad/s or m/s], the velocity that is
+    added for it; ``friction_from`` (n,): readings from which travel is compared; ``friction_sent`` (n,): commanded
+    since [rad or m], in the time ``friction_s`` (n,). ``run``: how the law at work gets on.
+
     Loads (see `core.monitors.collision`): ``mean_efforts`` (n,), moving mean; ``effort_excess``, ``following_excess``
     (samples, n), newest last: how far the last samples lay beyond what is expected; ``contact_low``, ``contact_high``
     (2, n), of efforts and following errors: what a contact has brought, and what it may take away again in the next
@@ -186,6 +229,10 @@ class Block:
     delay_under_way: FloatArray
     delay_accounted: FloatArray
     delay_missing: FloatArray
+    friction: FloatArray
+    friction_from: FloatArray
+    friction_sent: FloatArray
+    friction_s: FloatArray
     mean_efforts: FloatArray
     effort_excess: FloatArray
     following_excess: FloatArray
@@ -276,7 +323,10 @@ def restored(kept: Mapping[str, Any]) -> Block:
         raise ValueError(f"a block with counts {counts}")
     block = Block(counts)  # type: ignore[arg-type]
     for name, *_ in Numbers._fields_:
-        if name in kept:
+        if name == "run":
+            for number, told in kept.get(name, {}).items():
+                setattr(block.numbers.run, number, told)
+        elif name in kept:
             setattr(block.numbers, name, kept[name])
     for name in ARRAYS:
         if name not in kept:

@@ -12,10 +12,10 @@ import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
-_KINDS: Mapping[str, Any] = {"int": ctypes.c_int64, "float": ctypes.c_double, "bool": ctypes.c_bool}
+KINDS: Mapping[str, Any] = {"int": ctypes.c_int64, "float": ctypes.c_double, "bool": ctypes.c_bool}
 
 
-class _Kept(ctypes.Structure):
+class Kept(ctypes.Structure):
     """Numbers with their arrays, all of which are written out by name, in the order of the class."""
 
     def kept(self) -> dict[str, Any]:
@@ -33,7 +33,7 @@ class _Kept(ctypes.Structure):
             array[:] = getattr(other, name)
 
 
-class CameraEstimate(_Kept):
+class CameraEstimate(Kept):
     """What one camera said, per marker of the model.
 
     ``innovation`` (m, 2) [px]: filtered difference observed - predicted; ``sigma`` (m,) [px] of one observation;
@@ -55,7 +55,7 @@ class CameraEstimate(_Kept):
     rms_px: float
     offset_ns: int
     """By which its shutter opens later than its stamps tell, as far as known."""
-    _fields_ = [(name, _KINDS[kind]) for name, kind in __annotations__.items() if kind in _KINDS]
+    _fields_ = [(name, KINDS[kind]) for name, kind in __annotations__.items() if kind in KINDS]
 
     def __init__(self, markers: int, offset_ns: int = 0) -> None:
         """Nothing seen, with ``markers`` markers; ``offset_ns``: of the shutter stamps."""
@@ -64,16 +64,16 @@ class CameraEstimate(_Kept):
         self.seen_ns = np.zeros(markers, np.int64)
 
 
-class CameraTiming(_Kept):
+class CameraTiming(Kept):
     """Sums over frames of one camera: ``product`` of velocities and innovations, ``square`` of velocities, weighted."""
 
     product: float
     square: float
     seen_ns: int
-    _fields_ = [(name, _KINDS[kind]) for name, kind in __annotations__.items()]
+    _fields_ = [(name, KINDS[kind]) for name, kind in __annotations__.items()]
 
 
-class CameraMonitor(_Kept):
+class CameraMonitor(Kept):
     """The newest frame of one camera against the prediction at its shutter: markers of the model, then static points.
 
     ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0, ``velocity`` (k, 2)
@@ -96,7 +96,7 @@ class CameraMonitor(_Kept):
     worst: int
     worst_px: float
     _fields_ = [
-        *((name, _KINDS[kind]) for name, kind in __annotations__.items() if kind in _KINDS),
+        *((name, KINDS[kind]) for name, kind in __annotations__.items() if kind in KINDS),
         ("timing", CameraTiming),
     ]
 

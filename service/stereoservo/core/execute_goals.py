@@ -274,15 +274,11 @@ def _blend_into_next(context: StepContext) -> None:
     if not state.queue or state.queue[0].id != following.goal.id:
         state.ahead = None
         return
-    if (
-        state.held
-        or state.reanchoring is not None
-        or source.error_px is None
-        or source.error_px > source.goal.blend_px
-    ):
+    error_px = state.block.numbers.run.error_px
+    if state.held or state.reanchoring is not None or error_px is None or error_px > source.goal.blend_px:
         return
     state.queue.pop(0)
     state.queued_until_ns.pop(following.goal.id, None)
-    message = f"handed over to goal {following.goal.id} at {source.error_px:.2f} px"
-    context.emit("goal_reached", id=source.goal.id, message=message, error_px=source.error_px)
+    message = f"handed over to goal {following.goal.id} at {error_px:.2f} px"
+    context.emit("goal_reached", id=source.goal.id, message=message, error_px=error_px)
     begin(following, context)

@@ -269,25 +269,25 @@ def _take_joints(context: StepContext) -> tuple[JointState | None, Reason | None
         return None, None
     age_s = (context.now_ns - sample.t_ns) * 1e-9
     in_time = 0.0 <= age_s <= context.settings.limits.joint_timeout_s
-    told = in_time and _has_shape(sample, room.sample)
+    told = in_time and fill_sample(sample, room.sample)
     active = state.lifecycle == Lifecycle.ACTIVE
     if take_sample(block.record, room.record, told, sample.t_ns, sample.seq, active, q) and told:
         return sample, None
     return None, _late(sample, age_s, context) if not in_time else _wrong(sample, context)
 
 
-def _has_shape(sample: JointState, values: FloatArray) -> bool:
+def fill_sample(sample: JointState, values: FloatArray) -> bool:
     """Whether all that a sample tells is of every joint; into ``values`` (4, n), what it does not tell being zero."""
-    shape = values.shape[1:]
-    for row, given in enumerate(
-        (sample.positions, sample.velocities, sample.efforts, sample.following_errors)
+    shape, efforts, following = values.shape[1:], sample.efforts, sample.following_errors
+    if (
+        sample.positions.shape != shape
+        or sample.velocities.shape != shape
+        or (efforts is not None and efforts.shape != shape)
+        or (following is not None and following.shape != shape)
     ):
-        if given is None:
-            values[row] = 0.0
-            continue
-        if given.shape != shape:
-            return False
-        values[row] = given
+        return False
+    values[0], values[1] = sample.positions, sample.velocities
+    values[2], values[3] = 0.0 if efforts is None else efforts, 0.0 if following is None else following
     return True
 
 

@@ -35,6 +35,8 @@ BRAKING = "BRAKING"
 
 TOUCHED = 1e-9
 """Relative change of a command that is worth a reason."""
+MARGIN, TIMEOUT, FRESH, COAST = range(4)
+"""Of `SafetyLimits.bounds`."""
 TINY = 1e-300
 """Share of a command's step that is none."""
 
@@ -518,7 +520,7 @@ def limit_velocity(
     that holds; velocity scale, its joint, acceleration share, its joint, -1 for none; and who has acted on each joint:
     0 nobody, 1 position limit, 2 + k keep-out k.
     """
-    margin, timeout, fresh, coast = bounds[0], bounds[1], bounds[2], bounds[3]
+    margin, timeout, fresh, coast = bounds[MARGIN], bounds[TIMEOUT], bounds[FRESH], bounds[COAST]
     limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)
     told, sample_age = brake, joint_age
     if not 0.0 <= joint_age <= timeout:

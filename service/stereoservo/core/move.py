@@ -45,7 +45,6 @@ from stereoservo.core.state import (
     CalibrationMotion,
     CheckMotion,
     CoreState,
-    FrictionCompensation,
     Holding,
     IncidenceGoal,
     Jogging,
@@ -53,7 +52,6 @@ from stereoservo.core.state import (
     ServoGoal,
     Source,
 )
-from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
@@ -181,7 +179,7 @@ def move(context: StepContext) -> SourceOutput:
         newest_ns = max(newest_ns, estimate.accepted_ns)
     context.features_ns, context.paused = newest_ns, paused(state)
     if context.paused or state.lifecycle != Lifecycle.ACTIVE:
-        state.friction = None
+        state.friction_of = ""
         return _foreseen(SourceOutput(np.zeros_like(context.q)), context)
     kind = MOTION_SOURCES[type(state.source)]
     goal = kind.goal(state.source)
@@ -190,14 +188,25 @@ def move(context: StepContext) -> SourceOutput:
 
 def _foreseen(output: SourceOutput, context: StepContext) -> SourceOutput:
     """The output; the safety stage is told where late drives will have their joints before they obey it."""
-    delays = context.state.block.delays
-    if any(delays.delay_s.tolist()):
-        towards = np.where(output.velocity != 0.0, output.velocity, context.state.block.command)
-        ahead = context.q + delays.under_way
-        context.outermost = np.where(
-            towards > 0.0, np.maximum(context.q, ahead), np.minimum(context.q, ahead)
-        )
+    positions = np.empty(context.q.size)
+    foresee(context.state.block.record, output.velocity, context.q, positions)
+    context.outermost = positions
     return output
+
+
+@kernel
+def foresee(block: Record, velocity: FloatArray, q: FloatArray, positions: FloatArray) -> None:
+    """Into ``positions`` (n,), where joints at ``q`` (n,) are, or will be before they obey ``velocity`` (n,), farthest
+    towards where they go.
+    """
+    memory = block[0]
+    for j in range(q.size):
+        positions[j] = q[j]
+        if memory.delay_s[j] == 0.0:
+            continue
+        ahead = q[j] + memory.delay_under_way[j]
+        towards = velocity[j] if velocity[j] != 0.0 else memory.command[j]
+        positions[j] = max(q[j], ahead) if towards > 0.0 else min(q[j], ahead)
 
 
 # -- friction ---------------------------------------------------------------------------------------------------
@@ -241,26 +250,21 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
     """
     state, settings = context.state, context.settings
     if not subject:
-        state.friction = None
+        state.friction_of = ""
         return output
-    known = state.friction
-    if known is None or known.subject != subject:
-        nothing = np.zeros_like(context.q)
-        known = state.friction = FrictionCompensation(
-            subject, nothing, context.q.copy(), nothing.copy(), nothing.copy()
-        )
-    bounds = context.derived.friction_bounds
-    if bounds is None or bounds[0] is not state.model:
-        bounds = context.derived.friction_bounds = _friction_bounds(context)
-    _, most, travel = bounds
+    if state.friction_of != subject:
+        state.friction_of, block = subject, state.block
+        block.friction[:] = block.friction_sent[:] = block.friction_s[:] = 0.0
+        block.friction_from[:] = context.q
+    most, travel = friction_bounds(context)
     looks = context.ingested.joints is not None and (
         not output.needs_features
         or (context.now_ns - context.features_ns) * 1e-9 <= context.derived.features_fresh_s
     )
     velocity = np.empty(context.q.size)
     if not add_friction(
-        state.block.record, output.velocity, context.q, known.velocity, known.stood_at, known.sent, known.sent_s, most,
-        travel, context.dt_s, looks, settings.watch_following, velocity,
+        state.block.record, output.velocity, context.q, most, travel, context.dt_s, looks, settings.watch_following,
+        velocity,
     ):  # fmt: skip
         return output
     return SourceOutput(
@@ -269,25 +273,28 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
     )  # fmt: skip
 
 
-def _friction_bounds(context: StepContext) -> tuple[CellModel | None, FloatArray, FloatArray]:
-    """The model in use, and `_bounds` by it."""
-    model, settings = context.state.model, context.settings
-    inexact = model is not None and model.joint_accuracy is not None
-    return model, *_bounds(settings.joint_kinds, settings.resolution, inexact)
+def friction_bounds(context: StepContext) -> tuple[FloatArray, FloatArray]:
+    """`_bounds` by the settings and the model in use."""
+    model, settings, known = context.state.model, context.settings, context.derived.friction_bounds
+    if known is None or known[0] is not model:
+        inexact = model is not None and model.joint_accuracy is not None
+        found = _bounds(settings.joint_kinds, settings.resolution, inexact)
+        known = context.derived.friction_bounds = model, *found
+    return known[1], known[2]
 
 
 @kernel
 def add_friction(
-    block: Record, wanted: FloatArray, q: FloatArray, friction: FloatArray, stood_at: FloatArray, sent: FloatArray,
-    sent_s: FloatArray, most: FloatArray, travel: FloatArray, dt_s: float, looks: bool, late: bool,
-    velocity: FloatArray,
+    block: Record, wanted: FloatArray, q: FloatArray, most: FloatArray, travel: FloatArray, dt_s: float, looks: bool,
+    late: bool, velocity: FloatArray,
 ) -> bool:  # fmt: skip
     """`_compensated` with what the drives obey now: the last command, or, where drives may be ``late``, another."""
-    memory = block[0]
-    arrives = memory.delay_velocity[: q.size] if late else memory.command[: q.size]
+    memory, n = block[0], q.size
+    arrives = memory.delay_velocity[:n] if late else memory.command[:n]
     return _compensated(
-        wanted, arrives, q, friction, stood_at, sent, sent_s, most, travel, dt_s, looks, velocity
-    )
+        wanted, arrives, q, memory.friction[:n], memory.friction_from[:n], memory.friction_sent[:n],
+        memory.friction_s[:n], most, travel, dt_s, looks, velocity,
+    )  # fmt: skip
 
 
 @kernel

@@ -86,6 +86,8 @@ def _model_health(context: StepContext) -> tuple[ModelDiagnosis, Health]:
     frame has come and nothing else that they follow from is another.
     """
     state, derived, watching = context.state, context.derived, context.state.watching
+    if context.plain and derived.model_health is not None:
+        return derived.model_health[2]
     told = state.model, state.readiness, watching, watching.verdict
     marks, known = watching.masked.tobytes(), derived.model_health
     quiet = state.reanchoring is None and not any(state.mobile)
@@ -108,7 +110,10 @@ def _reasons(
     context: StepContext, motion: SourceOutput, limited: SafetyResult, diagnosis: ModelDiagnosis
 ) -> tuple[Reason, ...]:
     """Why the arm does not do what its source wants, or may not soon."""
-    state = context.state
+    state, explain = context.state, MOTION_SOURCES[type(context.state.source)].progress_reasons
+    if context.plain:
+        told = (*limited.reasons, *motion.reasons)
+        return told if explain is None else told + explain(state.source, context, told)
     found = [*state.fault, *limited.reasons, *motion.reasons]
     for refused in (state.refused_joints, *state.refused_frames):
         if refused.reason is not None and not _latched(refused.reason, state):
@@ -121,7 +126,6 @@ def _reasons(
         reason = diagnosis_reason(diagnosis)
         if reason is not None:
             found.append(reason)
-    explain = MOTION_SOURCES[type(state.source)].progress_reasons
     if explain is not None and not context.paused:
         found.extend(explain(state.source, context, tuple(found)))
     if state.planning is not None:

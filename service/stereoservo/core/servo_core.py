@@ -27,6 +27,7 @@ from stereoservo.core.context import Derived, Ingested, StepContext
 from stereoservo.core.cycle import Event, StepInputs, StepOutputs
 from stereoservo.core.estimate import estimate, load_limits, workspace
 from stereoservo.core.execute_goals import execute_goals
+from stereoservo.core.fast_path import fast_path
 from stereoservo.core.ingest import (
     features_fresh_s,
     frame_timeout_s,
@@ -47,10 +48,12 @@ NOTHING = Ingested(None, (), 0.0, None, (), None, ())
 
 
 class ServoCore:
-    """The servo loop's algorithm. ``state`` is all that it remembers."""
+    """The servo loop's algorithm. ``state`` is all that it remembers; ``fast``: whether ordinary steps go by
+    `core.fast_path`, with the same bits.
+    """
 
-    def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
-        self.settings = settings
+    def __init__(self, settings: CoreSettings, state: CoreState | None = None, *, fast: bool = True) -> None:
+        self.settings, self._fast = settings, fast
         self.state = initial_state(settings) if state is None else state
         block, past = self.state.block, steps_of_delay(settings.rate_hz)
         if block.numbers.past != past:  # of a state that was written before drives were known to be late
@@ -75,12 +78,16 @@ class ServoCore:
         """One cycle: the seven stages, in their order."""
         events: list[Event] = []
         context = self._context(inputs, events)
-        ingest(context)
-        context = estimate(context)
-        monitor(context)
-        execute_goals(context)
-        motion = move(context)
-        limited = limit(context, motion, self._limits)
+        done = fast_path(context, self._limits) if self._fast else None
+        if done is not None:
+            motion, limited = done
+        else:
+            ingest(context)
+            context = estimate(context)
+            monitor(context)
+            execute_goals(context)
+            motion = move(context)
+            limited = limit(context, motion, self._limits)
         return report(context, motion, limited, events)
 
     def _context(self, inputs: StepInputs, events: list[Event]) -> StepContext:

@@ -31,7 +31,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
-STATE_VERSION = 11
+STATE_VERSION = 12
 LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
 
 
@@ -104,20 +104,6 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
     settled: int = 0
 
 
-class ProgressHistory(msgspec.Struct, eq=False):
-    """What of a law's run tells whether it gets on; see `core.sources.law`.
-
-    ``first_px``: the largest error so far; ``mean_px`` of late; ``least_px``: the smallest such mean, improved for the
-    last time after ``least_s`` of motion. ``reasons``: what was found when it was last looked at.
-    """
-
-    first_px: float = 0.0
-    mean_px: float = 0.0
-    least_px: float = 0.0
-    least_s: float = 0.0
-    reasons: list[Reason] = []
-
-
 class Stream(msgspec.Struct, eq=False):
     """A goal that a client moves: its filtered set-points, in the client's time, and what it said last, when.
 
@@ -133,8 +119,8 @@ class Stream(msgspec.Struct, eq=False):
 class LawRun(Leased, eq=False, kw_only=True):
     """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
 
-    Gains [1/s] as in `messages.goals.AdaptiveGain`. ``moved_s``: how long it has been allowed to move; ``held``: frames
-    that the error has been inside its tolerance.
+    Gains [1/s] as in `messages.goals.AdaptiveGain`. ``reasons``: what was found when its progress, which is in the
+    block (`core.block.RunProgress`), was last looked at.
     """
 
     goal: Goal
@@ -147,11 +133,7 @@ class LawRun(Leased, eq=False, kw_only=True):
     time_limit_s: float
     started_ns: int
     used: FloatArray
-    moved_s: float = 0.0
-    held: int = 0
-    last_frames: int = 0
-    error_px: float | None = None
-    watch: ProgressHistory = msgspec.field(default_factory=ProgressHistory)
+    reasons: list[Reason] = []
 
 
 class Followed(msgspec.Struct, eq=False, kw_only=True):
@@ -356,20 +338,6 @@ Source = (
 )
 
 
-class FrictionCompensation(msgspec.Struct, eq=False):
-    """What is added to the velocities that a source wants, because of friction; see `core.move`.
-
-    ``subject``: what the source works on. ``velocity`` (n,) [rad/s or m/s]. ``stood_at`` (n,): readings from which
-    travel is compared; ``sent`` (n,): commanded since [rad or m], ``sent_s`` (n,): in what time.
-    """
-
-    subject: str
-    velocity: FloatArray
-    stood_at: FloatArray
-    sent: FloatArray
-    sent_s: FloatArray
-
-
 class CoreState(msgspec.Struct, eq=False):
     """All state of the core: the numbers that kernels work on in a ``block``, and the rest."""
 
@@ -413,7 +381,8 @@ class CoreState(msgspec.Struct, eq=False):
     """By camera; None for those that stand for good."""
     adjusted: tuple[str, ...]
     """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
-    friction: FrictionCompensation | None = None  # while nothing works on a goal
+    friction_of: str = ""
+    """The goal for which friction is compensated; empty: for none."""
     target: TargetBody | None = None
     """What moves by itself and is followed; None before a goal has named it."""
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
 
-from stereoservo.core.block import Block, restored
+from stereoservo.core.block import Block, RunProgress, restored
 from stereoservo.core.camera_state import CameraEstimate, CameraMonitor, CameraTiming, camera_read
 from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_sights
@@ -32,7 +33,7 @@ class _Versioned(msgspec.Struct):
     version: int
 
 
-KEPT = (Block, CameraEstimate, CameraMonitor, CameraTiming)
+KEPT = (Block, CameraEstimate, CameraMonitor, CameraTiming, RunProgress)
 """What is written out by its ``kept``."""
 
 
@@ -137,12 +138,42 @@ def _block_of(state: dict[str, Any]) -> dict[str, Any]:
     return block | {"joints": joints, "cameras": cameras, "markers": markers, "window": window, "past": past}
 
 
+RUN_BEFORE_VERSION_12 = ("moved_s", "held", "last_frames")
+WATCH_BEFORE_VERSION_12 = ("first_px", "mean_px", "least_px", "least_s")
+FRICTION_BEFORE_VERSION_12 = {
+    "friction": "velocity", "friction_from": "stood_at", "friction_sent": "sent", "friction_s": "sent_s",
+}  # fmt: skip
+
+
+def _with_run(state: dict[str, Any]) -> dict[str, Any]:
+    """A state of before version 12, which had how a law gets on with its goal, and friction beside the block."""
+    source, friction = state["source"], state.get("friction")
+    block = dict(state["block"])
+    if "moved_s" in source:
+        error, watch = source["error_px"], source["watch"]
+        block["run"] = {
+            **{name: source[name] for name in RUN_BEFORE_VERSION_12},
+            **{name: watch[name] for name in WATCH_BEFORE_VERSION_12},
+            "measured": error is not None, "newest_px": math.nan if error is None else error,
+        }  # fmt: skip
+        source = {**source, "reasons": watch["reasons"]}
+    if friction is not None:
+        block |= {name: friction[place] for name, place in FRICTION_BEFORE_VERSION_12.items()}
+    return state | {
+        "block": block,
+        "source": source,
+        "friction_of": "" if friction is None else friction["subject"],
+    }
+
+
 def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
     midst of trial motions, whose course is another one now.
     """
-    if version >= 10:
+    if version >= 12:
         return state | {"version": STATE_VERSION}
+    if version >= 10:
+        return _with_run(state) | {"version": STATE_VERSION}
     if version < 9 and state["source"]["type"] == "trials":
         raise StateVersionError(version)
     if version == 6:  # before stamps and gaps of the loop were checked
@@ -151,8 +182,7 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
         state["refused_frames"] = [nothing for _ in state["cameras"]]
     if version < 8 and (planning := state.get("planning")) is not None:  # large bodies are planned in parts
         planning["goal"] = planning["source"]["goal"]
-    return state | {
+    return _with_run(state | {"block": _block_of(state)}) | {
         "version": STATE_VERSION,
-        "block": _block_of(state),
         "loads": state["contact"].get("loads"),
     }

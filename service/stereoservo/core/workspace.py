@@ -11,7 +11,7 @@ import numpy as np
 
 from stereoservo.control.face_choice import FaceChoice
 from stereoservo.control.law import Scene, Task
-from stereoservo.core.block import JOINTS, Shapes, packed_type, views
+from stereoservo.core.block import BLOCK, JOINTS, Shapes, packed_type, views
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitors.following import LAG_S, of_kinds
 from stereoservo.core.prediction import (
@@ -49,6 +49,15 @@ class Numbers(ctypes.Structure):
     measured: int
     error_px: float
     conditioning: float
+    gain: float
+    gain_near: float
+    gain_far: float
+    gain_slope: float
+    tolerance_px: float
+    time_limit_s: float
+    hold_frames: int
+    told: int
+    features_ns: int
     _fields_ = [
         (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
         for name, kind in __annotations__.items()
@@ -100,12 +109,15 @@ class Workspace:
     Of the goal that a law works on, as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are ``wanted``
     (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres ``eyes`` of the
     ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and ``centre`` now,
-    and whether an ``error_px`` was ``measured``. What a law finds: see `control.law.Law`. ``arrays``: all of these by
-    name; ``scene`` and ``task``: those that laws take; ``aim`` and ``faced``: of which goal and face they are.
+    and whether an ``error_px`` was ``measured``. Its ``gain`` now, and the goal's gains, tolerance and limits, as in
+    `state.LawRun`. What a law finds: see `control.law.Law`. ``arrays``: all of these by name; ``scene`` and ``task``:
+    those that laws take; ``aim`` and ``faced``: of which goal and face they are. Of `core.fast_path`: ``spare``, room
+    for what the block was before; whether joints were ``told``; ``features_ns``, the stamp of the newest features.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
         self.record: np.ndarray[Any, Any] = np.zeros(1, WORKSPACE)
+        self.spare: np.ndarray[Any, Any] = np.zeros(1, BLOCK)
         self._counts = {
             "joints": len(settings.joint_names),
             "cameras": len(settings.cameras),

@@ -87,7 +87,6 @@ def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, 
         "lease_s": goal.lease_s,
         "lease_until_ns": context.now_ns + int((goal.lease_s or 0.0) * 1e9),
         "used": used,
-        "last_frames": sum(e.frames for e in context.state.cameras),
     }
 
 

@@ -451,8 +451,8 @@ def taken(run: Relocalization, state: CoreState, now_ns: int) -> None:
     """The new model is in use: laws begin to count frames anew, and fresh frames must agree with it."""
     run.phase, run.phase_ns = "verify", now_ns
     if isinstance(state.source, LawRun):
-        state.source.last_frames = sum(estimate.frames for estimate in state.cameras)
-        state.source.held = 0
+        law = state.block.numbers.run
+        law.last_frames, law.held = sum(estimate.frames for estimate in state.cameras), 0
 
 
 def _verify(run: Relocalization, context: StepContext) -> None:

@@ -240,7 +240,7 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     usable = weights * source.used[:, None]
     points = points_now(arrays, context.q, pixels, usable, context.state.block.correction, source.points)
     scene = scene_of(prediction, pixels, arrays, points, usable)
-    task, how = _task(source), options(source, context, source.error_px)
+    task, how = _task(source), options(source, context, context.state.block.numbers.run.error_px)
     second = _second(source, context, scene, how.gain)
     step = incidence_step(scene, task, how, second)
     error_px = float(step.error_px.max())
@@ -253,8 +253,9 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
         return ended
     still = bool((step.status == int(IncidenceStatus.NOT_FINITE)).any())
     return SourceOutput(
-        np.zeros_like(context.q) if still else step.velocity, True, source.goal.speed_scale, error_px=source.error_px,
-        task_error=step.error_px, reasons=incidence_reasons(step, task, source.names),
+        np.zeros_like(context.q) if still else step.velocity, True, source.goal.speed_scale,
+        error_px=error_px if isfinite(error_px) else None, task_error=step.error_px,
+        reasons=incidence_reasons(step, task, source.names),
     )  # fmt: skip
 
 

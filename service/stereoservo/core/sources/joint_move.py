@@ -172,10 +172,11 @@ def approach_velocity(
 
 def joints_ahead(context: StepContext) -> FloatArray:
     """Where the joints (n,) will be when late drives have made what they were sent, less what friction takes of it."""
-    delays, friction = context.state.block.delays, context.state.friction
+    block = context.state.block
+    delays = block.delays
     if not delays.delay_s.any():
         return context.q
-    lost = 0.0 if friction is None else np.abs(friction.velocity) * delays.delay_s
+    lost = np.abs(block.friction) * delays.delay_s if context.state.friction_of else 0.0
     return context.q + delays.under_way - np.clip(delays.under_way, -lost, lost)
 
 

@@ -19,7 +19,15 @@ from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
-from stereoservo.core.sources.progress import Traits, examine_progress
+from stereoservo.core.sources.progress import (
+    OUT_OF_TIME,
+    SETTLED,
+    Traits,
+    account_run,
+    decay_of_error,
+    examine_progress,
+    follow_error,
+)
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import LawRun, ServoGoal
 from stereoservo.core.target.follow import follow_target, stands, start_following
@@ -93,7 +101,7 @@ def _compiled_step(
 ) -> SourceOutput:
     """`servo_step` of a goal that stands, by the ``kernel`` of its law."""
     room = context.derived.room
-    _aim(room, source)
+    aim_at(room, source)
     seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
     error_px = numbers.error_px if numbers.measured else None
     may_end = source.followed is None or stands(context.state.target)
@@ -103,13 +111,18 @@ def _compiled_step(
     if source.pose_known and (context.observations or source.choice.cameras == 0):
         scene, task = choose(source, context, room.scene, room.task)
         _face(room, task.face, scene.camera_centres)
-    elif room.faced is not source.choice:
-        eyes = law_scene(room.scene, source.choice).camera_centres
-        _face(room, source.choice.triple, eyes, source.choice)
+    else:
+        show_face(room, source)
     try:
         kernel(room.record, gain_now(source, error_px), context.dt_s, source.jacobian)
     except Exception as error:  # as any law: it ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
+    return output_of(source, context, law, error_px)
+
+
+def output_of(source: ServoGoal, context: StepContext, law: Law, error_px: float | None) -> SourceOutput:
+    """The motion that the kernel of a law has found."""
+    room = context.derived.room
     step = _found_step(room, len(law.components))
     velocity = step.velocity
     if source.followed is not None:
@@ -121,11 +134,12 @@ def _compiled_step(
     )
 
 
-def _aim(room: Workspace, goal: ServoGoal) -> None:
+def aim_at(room: Workspace, goal: ServoGoal) -> None:
     """The law works on a ``goal``, whose arrays are replaced where it moves, and not written into."""
     aim = (
         goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
-        goal.centre_target, goal.pose_known,
+        goal.centre_target, goal.pose_known, goal.gain_near, goal.gain_far, goal.gain_slope, goal.tolerance_px,
+        goal.hold_frames, goal.time_limit_s,
     )  # fmt: skip
     if len(room.aim) == len(aim) and all(map(is_, aim, room.aim)):
         return
@@ -133,6 +147,17 @@ def _aim(room: Workspace, goal: ServoGoal) -> None:
     for name in AIM:
         given[name][:] = getattr(goal, name)
     given["target_known"][:] = goal.pose_known
+    numbers = room.numbers
+    numbers.gain_near, numbers.gain_far, numbers.gain_slope = goal.gain_near, goal.gain_far, goal.gain_slope
+    numbers.tolerance_px, numbers.time_limit_s = goal.tolerance_px, goal.time_limit_s
+    numbers.hold_frames = goal.hold_frames
+
+
+def show_face(room: Workspace, goal: ServoGoal) -> None:
+    """The law works on the face that was chosen for a ``goal``."""
+    if room.faced is not goal.choice:
+        eyes = law_scene(room.scene, goal.choice).camera_centres
+        _face(room, goal.choice.triple, eyes, goal.choice)
 
 
 def _face(room: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
@@ -226,7 +251,7 @@ def measure_goal(block: Record, room: Record, q: FloatArray) -> int:
 def activate_run(source: LawRun, context: StepContext) -> None:
     """Start the clock, the frame count and the lease of a law that begins now."""
     source.started_ns = context.now_ns
-    source.last_frames = sum(e.frames for e in context.state.cameras)
+    context.state.block.numbers.run.begin(sum(e.frames for e in context.state.cameras))
     source.renew_lease(context.now_ns)
     if isinstance(source, ServoGoal) and source.goal.follow_markers:
         start_following(source, context)
@@ -256,11 +281,13 @@ def run_ended(
     ``seen``: markers of the goal that are seen, of those ``wanted`` (c, m); None: of more than are needed. ``may_end``:
     off for a goal that moves still.
     """
-    source.moved_s += context.dt_s
-    source.error_px = error_px
-    if source.moved_s > source.time_limit_s:
-        return _out_of_time(source, context, error_px)
     needed = MIN_MARKERS if seen >= MIN_MARKERS or wanted is None else markers_needed(wanted)
+    found = account_run(
+        context.state.block.record, error_px is not None, math.nan if error_px is None else error_px, seen >= needed,
+        context.dt_s, source.tolerance_px, source.hold_frames, source.time_limit_s,
+    )  # fmt: skip
+    if found == OUT_OF_TIME:
+        return _out_of_time(source, context, error_px)
     if seen < needed:
         reason = Reason(
             "TOO_FEW_MARKERS", "hold", "", float(seen), float(needed), "markers",
@@ -269,7 +296,7 @@ def run_ended(
         return SourceOutput(
             np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,)
         )
-    if _settled(source, context, error_px) and may_end:
+    if found == SETTLED and may_end:
         context.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
         return SourceOutput(np.zeros_like(context.q), finished=True, reached=True, error_px=error_px)
     return None
@@ -396,28 +423,15 @@ def _law_failed(
 
 def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -> SourceOutput:
     reason = Reason(
-        "TIME_LIMIT", "hold", "", source.moved_s, source.time_limit_s, "s",
+        "TIME_LIMIT", "hold", "", context.state.block.numbers.run.moved_s, source.time_limit_s, "s",
         "no error was measured" if error_px is None
         else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
     )  # fmt: skip
     context.emit(
         "goal_aborted", id=source.goal.id, message="not reached in time", error_px=error_px,
-        reasons=(reason, *source.watch.reasons),
+        reasons=(reason, *source.reasons),
     )  # fmt: skip
     return SourceOutput(np.zeros_like(context.q), finished=True, error_px=error_px)
-
-
-def _settled(source: LawRun, context: StepContext, error_px: float | None) -> bool:
-    """Whether the error stayed below the tolerance for ``hold_frames`` frames of every camera on average."""
-    frames = 0
-    for estimate in context.state.cameras:
-        frames += estimate.frames
-    new, cameras = frames - source.last_frames, len(context.state.cameras)
-    if new >= cameras:
-        source.last_frames = frames
-        inside = error_px is not None and error_px <= source.tolerance_px
-        source.held = source.held + new // cameras if inside else 0
-    return source.held >= source.hold_frames
 
 
 LARGEST_LAG_PX = 20.0
@@ -463,17 +477,13 @@ def _planned_set_points(source: ServoGoal, scene: Scene) -> tuple[FloatArray, fl
     return pixels + share * np.where(given, source.set_points - goal_pixels, 0.0), share
 
 
-AVERAGED_S = 0.5
-"""Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
-SMALLER = 0.95
-"""Of the least mean error so far, below which it counts as smaller."""
 LOOK_EVERY_S = 0.2
 Progress = tuple[float | None, float | None]
 
 
 def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
     """Share [0, 1] of the goal's path that is done, and the seconds left; None where that is not known."""
-    if source.error_px is None:
+    if context.state.block.numbers.run.error_px is None:
         return None, None
     if context.derived.laws[source.law].planned:
         if source.plan is None:
@@ -488,16 +498,9 @@ def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
 
 def run_progress(source: LawRun, context: StepContext) -> Progress:
     """The same of any law, by the exponential decay of its error."""
-    if source.error_px is None:
-        return None, None
-    left_s = _decay_s(source, source.error_px)
-    whole_s = _decay_s(source, max(source.watch.first_px, source.error_px))
-    return (1.0 if whole_s <= 0.0 else 1.0 - left_s / whole_s), left_s
-
-
-def _decay_s(source: LawRun, error_px: float) -> float:
-    """Time in which an error decays to the tolerance at the slower of the goal's gains."""
-    return math.log(max(error_px / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+    record = context.state.block.record
+    known, done, left_s = decay_of_error(record, source.tolerance_px, source.gain_near, source.gain_far)
+    return (done, left_s) if known else (None, None)
 
 
 def servo_progress_reasons(
@@ -515,8 +518,11 @@ def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
 
 
 def _plain_traits(source: LawRun, context: StepContext) -> Traits:
-    error = source.error_px
-    return Traits(gain_now(source, error), 0.0 if error is None else _decay_s(source, error))
+    gain, left_s = (
+        gain_now(source, context.state.block.numbers.run.error_px),
+        run_progress(source, context)[1],
+    )
+    return Traits(gain, left_s or 0.0)
 
 
 def progress_reasons(
@@ -526,18 +532,20 @@ def progress_reasons(
     traits: Callable[[Any, StepContext], Traits] = _plain_traits,
 ) -> tuple[Reason, ...]:
     """What a law's run shows over time beside the reasons ``told`` in this step; kept between two examinations."""
-    seen = source.watch
-    error = source.error_px
-    if error is not None:
-        seen.first_px = max(seen.first_px, error)
-        share = context.dt_s / (context.dt_s + AVERAGED_S)
-        seen.mean_px = error if seen.mean_px == 0.0 else seen.mean_px + share * (error - seen.mean_px)
-        if seen.least_px == 0.0 or seen.mean_px < SMALLER * seen.least_px or error <= source.tolerance_px:
-            seen.least_px, seen.least_s = max(seen.mean_px, 1e-9), source.moved_s
-    every = max(1, round(LOOK_EVERY_S / context.dt_s))
-    if context.state.step % every == 0:
-        seen.reasons = examine_progress(source, context, told, traits(source, context))
-    if not seen.reasons:
+    follow_error(context.state.block.record, source.tolerance_px, context.dt_s)
+    if looks_at_progress(context.state.step, context.dt_s):
+        source.reasons = examine_progress(source, context, told, traits(source, context))
+    return found_before(source, told)
+
+
+def looks_at_progress(step: int, dt_s: float) -> bool:
+    """Whether a run's progress is examined in this step."""
+    return step % max(1, round(LOOK_EVERY_S / dt_s)) == 0
+
+
+def found_before(source: LawRun, told: tuple[Reason, ...]) -> tuple[Reason, ...]:
+    """What was found when the progress was last examined, but for what is ``told`` anyway."""
+    if not source.reasons:
         return ()
     codes = {reason.code for reason in told}
-    return tuple(reason for reason in seen.reasons if reason.code not in codes)
+    return tuple(reason for reason in source.reasons if reason.code not in codes)

@@ -1,7 +1,10 @@
-"""Why a law's run is slow or stuck: what is found when its progress is looked at, a few times a second."""
+"""The progress of a law's run: what every step adds to it, and why it is slow or stuck: what is found when it is looked
+at, a few times a second.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +14,80 @@ from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.core.context import StepContext
 from stereoservo.core.state import LawRun
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, Record
+from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
+
+AVERAGED_S = 0.5
+"""Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
+SMALLER = 0.95
+"""Of the least mean error so far, below which it counts as smaller."""
+GOES_ON, OUT_OF_TIME, SETTLED = range(3)
+"""What `account_run` has found."""
+
+
+@kernel
+def account_run(
+    block: Record, measured: bool, error_px: float, enough: bool, dt_s: float, tolerance_px: float, hold_frames: int,
+    time_limit_s: float,
+) -> int:  # fmt: skip
+    """Account for a step of ``dt_s`` with this error; whether the run is out of time, or, where ``enough`` markers are
+    seen, has stayed below its tolerance for ``hold_frames`` frames of every camera on average.
+    """
+    memory = block[0]
+    run = memory.run
+    run.moved_s += dt_s
+    run.measured, run.newest_px = measured, error_px
+    if run.moved_s > time_limit_s:
+        return OUT_OF_TIME
+    if not enough:
+        return GOES_ON
+    frames = 0
+    for c in range(memory.cameras):
+        frames += memory.estimates[c].frames
+    new = frames - run.last_frames
+    if new >= memory.cameras:
+        run.last_frames = frames
+        run.held = run.held + new // memory.cameras if measured and error_px <= tolerance_px else 0
+    return SETTLED if run.held >= hold_frames else GOES_ON
+
+
+@kernel
+def follow_error(block: Record, tolerance_px: float, dt_s: float) -> None:
+    """Take the error of this step into the means by which a run is judged."""
+    run = block[0].run
+    if not run.measured:
+        return
+    error = run.newest_px
+    if error > run.first_px:
+        run.first_px = error
+    share = dt_s / (dt_s + AVERAGED_S)
+    run.mean_px = error if run.mean_px == 0.0 else run.mean_px + share * (error - run.mean_px)
+    if run.least_px == 0.0 or run.mean_px < SMALLER * run.least_px or error <= tolerance_px:
+        run.least_px, run.least_s = run.mean_px if not run.mean_px < 1e-9 else 1e-9, run.moved_s
+
+
+@kernel
+def decay_of_error(
+    block: Record, tolerance_px: float, gain_near: float, gain_far: float
+) -> tuple[bool, float, float]:
+    """Whether there is an error, the share [0, 1] of its way that is done, and the seconds that are left, at the slower
+    of the gains.
+    """
+    run = block[0].run
+    gain = min(gain_near, gain_far)
+    left_s = _decay_s(run.newest_px, tolerance_px, gain)
+    first = run.newest_px if run.newest_px > run.first_px else run.first_px
+    whole_s = _decay_s(first, tolerance_px, gain)
+    return run.measured, 1.0 if whole_s <= 0.0 else 1.0 - left_s / whole_s, left_s
+
+
+@kernel
+def _decay_s(error_px: float, tolerance_px: float, gain: float) -> float:
+    """Time in which an error decays to the tolerance."""
+    times = error_px / tolerance_px
+    return math.log(1.0 if times < 1.0 else times) / gain
+
 
 STUCK_S = 3.0
 """Time of motion without a smaller error after which a law is said to be stuck."""
@@ -51,7 +126,7 @@ def examine_progress(
 ) -> list[Reason]:
     """The reasons beside those that are ``told`` in this step, the gravest first."""
     found = [*_near_limits(context), *_near_singular(source, context), *_few_markers(source, context, traits)]
-    tail = _tail(source, traits)
+    tail = _tail(source, context, traits)
     if tail is not None:
         found.append(tail)
     if not traits.moves:
@@ -109,8 +184,8 @@ def _few_markers(source: LawRun, context: StepContext, traits: Traits) -> list[R
     return [Reason("FEW_MARKERS", "info", "", float(seen), float(FEW_MARKERS), "markers", hint)]
 
 
-def _tail(source: LawRun, traits: Traits) -> Reason | None:
-    error = source.error_px
+def _tail(source: LawRun, context: StepContext, traits: Traits) -> Reason | None:
+    error = context.state.block.numbers.run.error_px
     if error is None or not source.tolerance_px < error < TAIL * source.tolerance_px:
         return None
     gain, left_s = traits.gain, traits.left_s
@@ -126,7 +201,8 @@ def _tail(source: LawRun, traits: Traits) -> Reason | None:
 def _stall_reason(
     source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
 ) -> Reason | None:
-    error, since_s = source.error_px, source.moved_s - source.watch.least_s
+    run = context.state.block.numbers.run
+    error, since_s = run.error_px, run.moved_s - run.least_s
     if error is None or error <= source.tolerance_px or since_s < STUCK_S:
         return None
     codes = {reason.code: reason for reason in reversed(told)}

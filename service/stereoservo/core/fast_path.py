@@ -1,0 +1,334 @@
+"""The first six stages of a step in which nothing but the ordinary happens, as two kernel calls around the law's own:
+the arm rests, or a law with a kernel drives it, between two images.
+
+The kernels call those of the stages, in their order, so that a step has the same bits by either way. Where one of them
+finds anything that is to be told or decided, the block is put back as it was, and the stages do the step.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereoservo.core.block import HISTORY
+from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.goals.marker_body import MIN_MARKERS
+from stereoservo.core.ingest import fill_sample, take_sample
+from stereoservo.core.limit import FRESH, SafetyLimits, SafetyResult, limit, limit_velocity
+from stereoservo.core.monitor import FOLLOWS, account_following, account_loads
+from stereoservo.core.move import add_friction, foresee, friction_bounds
+from stereoservo.core.prediction import SUSPECT_FRAMES, present
+from stereoservo.core.sources.law import adaptive_gain, aim_at, measure_goal, output_of, show_face
+from stereoservo.core.sources.progress import GOES_ON, account_run
+from stereoservo.core.state import Holding, ServoGoal
+from stereoservo.messages.status import Lifecycle, ModelReadiness
+from stereoservo.numerics.arrays import FloatArray, Record
+from stereoservo.numerics.compilation import kernel
+
+READY = (ModelReadiness.VALID, ModelReadiness.CANDIDATE)
+
+
+def fast_path(context: StepContext, limits: SafetyLimits) -> tuple[SourceOutput, SafetyResult] | None:
+    """What the stages up to `limit` come to, or None, and nothing has happened."""
+    if not (_plain_inputs(context) and _plain_state(context)):
+        return None
+    source = context.state.source
+    if type(source) is ServoGoal:
+        return _servo(source, context, limits)
+    if type(source) is Holding and not context.state.friction_of:
+        return _rest(context, limits)
+    return None
+
+
+def _plain_inputs(context: StepContext) -> bool:
+    """Whether the inputs hold joints at most, in time; these are in the workspace then."""
+    inputs, numbers, sample = context.inputs, context.state.block.numbers, context.inputs.joints
+    if (
+        inputs.observations
+        or inputs.requests
+        or inputs.stop
+        or inputs.compiling
+        or inputs.sent is not None
+        or inputs.model_update is not None
+        or inputs.driver_fault is not None
+        or not inputs.driver_configured
+        or not 0 <= (context.now_ns - numbers.last_step_ns) * 1e-9 <= context.derived.longest_gap_s
+        or context.state.lifecycle is not (Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE)
+    ):
+        return False
+    if sample is None:
+        return True
+    age_s = (context.now_ns - sample.t_ns) * 1e-9
+    in_time = 0.0 <= age_s <= context.settings.limits.joint_timeout_s
+    return in_time and fill_sample(sample, context.derived.room.sample)
+
+
+def _plain_state(context: StepContext) -> bool:
+    """Whether there is nothing that a stage would have to look after in this step."""
+    state, derived = context.state, context.derived
+    told, watching = derived.model_health, state.watching
+    return (
+        derived.arrays is not None
+        and told is not None
+        and told[2][0].kind == "ok"
+        and watching.verdict.kind == "ok"
+        and state.readiness in READY
+        and not (
+            watching.due
+            or state.held
+            or state.stopped
+            or state.queue
+            or state.waiting
+            or state.queued_until_ns
+            or state.fault
+        )
+        and state.pending_model is None
+        and state.planning is None
+        and state.ahead is None
+        and state.teaching is None
+        and state.reanchoring is None
+        and state.target is None
+        and state.refused_joints.reason is None
+        and not any(state.mobile)
+        and state.block.numbers.history_count > 0
+        and not any(refused.reason for refused in state.refused_frames)
+    )
+
+
+def _servo(
+    source: ServoGoal, context: StepContext, limits: SafetyLimits
+) -> tuple[SourceOutput, SafetyResult] | None:
+    """A step of a law to a goal that stands."""
+    state, room = context.state, context.derived.room
+    law = context.derived.laws[source.law]
+    if (
+        law.kernel is None
+        or source.stream is not None
+        or source.followed is not None
+        or source.points != "predicted"
+        or (source.pose_known and source.choice.cameras == 0)
+        or state.friction_of != source.goal.id
+        or (source.lease_s is not None and context.now_ns > source.lease_until_ns)
+        or state.lifecycle is not Lifecycle.ACTIVE
+    ):
+        return None
+    aim_at(room, source)
+    if not _look(context, True):
+        return None
+    show_face(room, source)
+    try:
+        law.kernel(room.record, room.numbers.gain, context.dt_s, source.jacobian)
+    except Exception:  # the stages end its goal, with what it raises again
+        _copy_changing(room.spare, state.block.record)
+        return None
+    error_px = state.block.numbers.run.error_px
+    return _command(output_of(source, context, law, error_px), context, limits, True)
+
+
+def _rest(context: StepContext, limits: SafetyLimits) -> tuple[SourceOutput, SafetyResult] | None:
+    """A step without motion."""
+    if not _look(context, False):
+        return None
+    return _command(SourceOutput(np.zeros(context.q.size)), context, limits, False)
+
+
+def _look(context: StepContext, aims: bool) -> bool:
+    """Whether the stages before the motion found nothing; then the ``context`` has what they know."""
+    state, room, sample, numbers = (
+        context.state,
+        context.derived.room,
+        context.inputs.joints,
+        context.state.block.numbers,
+    )
+    told = (
+        sample is not None and sample.seq != numbers.last_joints_seq and sample.t_ns > numbers.last_joints_ns
+    )
+    t_ns, seq, efforts, following = (0, 0, False, False)
+    if told:
+        assert sample is not None
+        t_ns, seq = sample.t_ns, sample.seq
+        efforts, following = sample.efforts is not None, sample.following_errors is not None
+    if not look(
+        state.block.record, room.spare, room.record, told, t_ns, seq, efforts, following, context.now_ns, context.dt_s,
+        state.lifecycle is Lifecycle.ACTIVE, context.settings.watch_following, room.watches_loads, aims, context.q,
+    ):  # fmt: skip
+        return False
+    context.arrays, context.prediction = context.derived.arrays, room.prediction
+    context.weights, context.pixels, context.features_ns = room.weights, room.pixels, room.numbers.features_ns
+    context.plain = True
+    return True
+
+
+def _command(
+    motion: SourceOutput, context: StepContext, limits: SafetyLimits, compensates: bool
+) -> tuple[SourceOutput, SafetyResult]:
+    """The motion with its friction, and the command within all limits."""
+    state, settings, n = context.state, context.settings, context.q.size
+    most, travel = friction_bounds(context)
+    velocity, positions, limited = np.empty(n), np.empty(n), np.empty(n)
+    added, quiet = command_within(
+        state.block.record, context.derived.room.record, motion.velocity, context.q, compensates, most, travel,
+        context.dt_s, settings.watch_following, context.now_ns, motion.needs_features,
+        motion.speed_scale * settings.limits.speed_scale, limits.table, limits.bounds, limits.keep_outs,
+        state.lifecycle is Lifecycle.ACTIVE, velocity, positions, limited, limits.found,
+    )  # fmt: skip
+    if added:
+        motion = SourceOutput(
+            velocity, motion.needs_features, motion.speed_scale, False, False, motion.error_px, motion.task_error,
+            motion.reasons,
+        )  # fmt: skip
+    if quiet:
+        return motion, SafetyResult(motion.velocity, limited)
+    context.outermost = positions
+    return motion, limit(context, motion, limits)
+
+
+@kernel
+def look(
+    block: Record, spare: Record, room: Record, told: bool, t_ns: int, seq: int, efforts: bool, following: bool,
+    now_ns: int, dt_s: float, active: bool, watches_following: bool, watches_loads: bool, aims: bool, q: FloatArray,
+) -> bool:  # fmt: skip
+    """The stages before the motion, with a joint sample in the ``room`` where one is ``told``, for a goal there where a
+    law ``aims`` at one; False: there is something for them to do, and the ``block`` is as before.
+    """
+    memory, work = block[0], room[0]
+    newest_ns, unseen = 0, True
+    for c in range(memory.cameras):
+        unseen = unseen and not memory.sightings[c].looked
+        if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
+            return False
+        newest_ns = max(newest_ns, memory.estimates[c].accepted_ns)
+    if unseen:  # a round is complete
+        return False
+    _copy_changing(block, spare)
+    if not _looked(
+        block,
+        room,
+        told,
+        t_ns,
+        seq,
+        efforts,
+        following,
+        now_ns,
+        dt_s,
+        active,
+        watches_following,
+        watches_loads,
+        aims,
+        q,
+    ):
+        _copy_changing(spare, block)
+        return False
+    for c in range(memory.cameras):
+        memory.sightings[c].fresh = False
+    memory.last_step_ns, work.features_ns, work.told = now_ns, newest_ns, told
+    return True
+
+
+@kernel
+def _looked(
+    block: Record, room: Record, told: bool, t_ns: int, seq: int, efforts: bool, following: bool, now_ns: int,
+    dt_s: float, active: bool, watches_following: bool, watches_loads: bool, aims: bool, q: FloatArray,
+) -> bool:  # fmt: skip
+    """Whether none of the stages finds anything."""
+    memory, work = block[0], room[0]
+    elapsed_s = (now_ns - memory.last_step_ns) * 1e-9
+    if not take_sample(block, room, told, t_ns, seq, active, q):
+        return False
+    present(block, room, q, now_ns)
+    if told and t_ns > memory.loads_ns:
+        _, beyond = account_loads(block, room, t_ns, efforts, following, active, False, False)
+        if beyond and watches_loads:
+            return False
+    if watches_following:
+        if account_following(block, room, q, elapsed_s) != FOLLOWS:
+            return False
+        if not active:
+            memory.silence_known = 0
+    if not aims:
+        return True
+    seen = measure_goal(block, room, q)
+    if seen < MIN_MARKERS:
+        return False
+    measured, error_px = work.measured != 0, work.error_px
+    found = account_run(
+        block, measured, error_px, True, dt_s, work.tolerance_px, work.hold_frames, work.time_limit_s
+    )
+    work.gain = adaptive_gain(
+        work.gain_near, work.gain_far, work.gain_slope, error_px if measured else math.nan
+    )
+    return found == GOES_ON
+
+
+@kernel
+def command_within(
+    block: Record, room: Record, wanted: FloatArray, q: FloatArray, compensates: bool, most: FloatArray,
+    travel: FloatArray, dt_s: float, late: bool, now_ns: int, needs_features: bool, speed_scale: float,
+    table: FloatArray, bounds: FloatArray, keep_outs: FloatArray, active: bool, velocity: FloatArray,
+    positions: FloatArray, limited: FloatArray, found: FloatArray,
+) -> tuple[bool, bool]:  # fmt: skip
+    """`add_friction` where it ``compensates``, `foresee`, `limit_velocity`; whether friction was added, and whether
+    nothing is to be told: then ``limited`` is the command.
+    """
+    memory, work = block[0], room[0]
+    feature_age_s = (now_ns - work.features_ns) * 1e-9
+    added = False
+    if compensates:
+        looks = work.told != 0 and (not needs_features or feature_age_s <= bounds[FRESH])
+        added = add_friction(block, wanted, q, most, travel, dt_s, looks, late, velocity)
+    if not added:
+        velocity[:] = wanted
+    foresee(block, velocity, q, positions)
+    command, joint_age_s = memory.command[: q.size], (now_ns - memory.last_joints_ns) * 1e-9
+    if limit_velocity(
+        velocity, positions, command, False, dt_s, joint_age_s, feature_age_s, needs_features, speed_scale, table,
+        bounds, keep_outs, limited, found,
+    ):  # fmt: skip
+        return added, False
+    for j in range(q.size):
+        command[j] = limited[j] if active else 0.0
+    return added, True
+
+
+@kernel
+def _copy_changing(block: Record, into: Record) -> None:
+    """Copy what `_looked` changes of a ``block``."""
+    memory, other = block[0], into[0]
+    n, window = memory.joints, memory.window
+    other.joints, other.window, other.past, other.delay_steps = n, window, memory.past, memory.delay_steps
+    other.last_step_ns, other.last_joints_ns = memory.last_step_ns, memory.last_joints_ns
+    other.last_joints_seq, other.last_followed_ns = memory.last_joints_seq, memory.last_followed_ns
+    other.history_count, other.followed = memory.history_count, memory.followed
+    other.silence_known, other.loads_ns, other.leave_s = memory.silence_known, memory.loads_ns, memory.leave_s
+    other.tells_efforts, other.tells_following = memory.tells_efforts, memory.tells_following
+    run, there = memory.run, other.run
+    there.moved_s, there.held, there.last_frames = run.moved_s, run.held, run.last_frames
+    there.measured, there.newest_px = run.measured, run.newest_px
+    other.history_ns[:] = memory.history_ns
+    other.history_positions[: HISTORY * n] = memory.history_positions[: HISTORY * n]
+    past = memory.past * n
+    other.delay_past[:past] = memory.delay_past[:past]
+    other.delay_onset[: 7 * n], other.delay_samples[: 5 * n] = (
+        memory.delay_onset[: 7 * n],
+        memory.delay_samples[: 5 * n],
+    )
+    other.effort_excess[: window * n] = memory.effort_excess[: window * n]
+    other.following_excess[: window * n] = memory.following_excess[: window * n]
+    other.contact_low[: 2 * n], other.contact_high[: 2 * n] = (
+        memory.contact_low[: 2 * n],
+        memory.contact_high[: 2 * n],
+    )
+    for j in range(n):
+        other.velocities[j], other.correction[j] = memory.velocities[j], memory.correction[j]
+        other.missing_travel[j], other.untold_travel[j] = memory.missing_travel[j], memory.untold_travel[j]
+        other.last_positions[j], other.silent_from[j] = memory.last_positions[j], memory.silent_from[j]
+        other.silent_travel[j], other.silent_s[j] = memory.silent_travel[j], memory.silent_s[j]
+        other.delay_s[j], other.delay_sent[j] = memory.delay_s[j], memory.delay_sent[j]
+        other.delay_velocity[j], other.delay_under_way[j] = (
+            memory.delay_velocity[j],
+            memory.delay_under_way[j],
+        )
+        other.delay_accounted[j], other.delay_missing[j] = memory.delay_accounted[j], memory.delay_missing[j]
+        other.mean_efforts[j], other.efforts[j] = memory.mean_efforts[j], memory.efforts[j]
+        other.following_errors[j] = memory.following_errors[j]
