@@ -34,7 +34,7 @@ class Twins:
         self._step, fast_path, look = (
             core.step,
             servo_core.fast_path,
-            servo_core.fast_path.__globals__["look"],
+            servo_core.fast_path.__globals__["begin_step"],
         )
         looked: list[bool] = []
 
@@ -51,14 +51,26 @@ class Twins:
             return found
 
         monkeypatch.setattr(servo_core, "fast_path", watched)
-        monkeypatch.setitem(fast_path.__globals__, "look", watched_look)
+        monkeypatch.setitem(fast_path.__globals__, "begin_step", watched_look)
         core.step = self.step  # type: ignore[method-assign]
 
     def step(self, inputs: StepInputs) -> StepOutputs:
         outputs, other = self._step(inputs), self.twin.step(inputs)
-        assert encode(outputs) == encode(other)
-        assert encode_state(self.core.state) == encode_state(self.twin.state)
+        for name, one, beside in (
+            ("outputs", encode(outputs), encode(other)),
+            ("state", encode_state(self.core.state), encode_state(self.twin.state)),
+        ):
+            assert one == beside, (
+                f"{name}: {differing(msgspec.msgpack.decode(one), msgspec.msgpack.decode(beside))}"
+            )
         return outputs
+
+
+def differing(one: Any, beside: Any) -> Any:
+    """What is not the same in two values made of dictionaries."""
+    if not isinstance(one, dict):
+        return (one, beside)
+    return {name: differing(one[name], beside.get(name)) for name in one if one[name] != beside.get(name)}
 
 
 @pytest.fixture
@@ -120,13 +132,15 @@ def slipped(bench: Any) -> None:
     bench.bias_px[3] = 4.0
 
 
+WATCHED = ContactSettings(
+    True, np.array([np.nan, 10.0, *[np.nan] * 4]), np.full(6, np.nan), 1.5, 5, ("N m",) * 6
+)
 EVENTS = [contact, nan, blind, dark, stuck, jump, silent, late, slipped]
 
 
 @pytest.mark.parametrize("event", EVENTS, ids=[event.__name__ for event in EVENTS])
 def test_whatever_happens_on_the_way_is_found_by_both(bench: Any, twins: Any, event: Any) -> None:
-    watched = ContactSettings(samples=5, effort={1: 10.0}) if event in (contact, nan) else None
-    found = twins(contact=watched) if watched else twins()
+    found = twins(contact=WATCHED) if event in (contact, nan) else twins()
     goal = bench.goal(FeatureTarget(bench.features(bench.q + WAY)), law="stereo", gain=0.5)
     assert bench.reply(goal).accepted
     bench.run(0.8)
@@ -161,6 +175,8 @@ def test_a_law_whose_kernel_raises_ends_its_goal_as_by_the_stages(bench: Any, tw
     found = twins()
     assert bench.reply(bench.goal(FeatureTarget(bench.features(bench.q + WAY)), law="stereo")).accepted
     bench.run(0.5)
+    while bench.seq % 4 != 3:  # the next step has no frame
+        bench.step()
 
     def raises(*arguments: Any) -> None:
         raise RuntimeError("no answer")

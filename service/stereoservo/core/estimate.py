@@ -61,7 +61,7 @@ def estimate(context: StepContext) -> StepContext:
     for camera, observation in context.ingested.observations:
         if context.state.target is not None:
             track.take_frame(camera, observation, context)
-        _fold_frame(camera, observation, context)
+        fold_frame(camera, observation, context)
     context.observations = tuple([observation for _, observation in context.ingested.observations])
     state = context.state
     arrays = context.derived.arrays if state.target is None else track.present_arrays(context)
@@ -170,7 +170,7 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 # -- frames -------------------------------------------------------------------------------------------------
 
 
-def _fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
+def fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
     """Compare a frame with the prediction at its shutter, and fold it into its camera's estimate."""
     state, arrays, room = context.state, context.derived.arrays, context.derived.room
     estimate, watching, t_ns = state.cameras[camera], state.watching, observation.t_shutter_ns

@@ -1,5 +1,5 @@
 """The first six stages of a step in which nothing but the ordinary happens, as two kernel calls around the law's own:
-the arm rests, or a law with a kernel drives it, between two images.
+the arm rests, or a law with a kernel drives it. Each image is one call more.
 
 The kernels call those of the stages, in their order, so that a step has the same bits by either way. Where one of them
 finds anything that is to be told or decided, the block is put back as it was, and the stages do the step.
@@ -13,19 +13,22 @@ import numpy as np
 
 from stereoservo.core.block import HISTORY
 from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.estimate import fold_frame
 from stereoservo.core.goals.marker_body import MIN_MARKERS
-from stereoservo.core.ingest import fill_sample, take_sample
+from stereoservo.core.ingest import fill_sample, observations_of, take_sample
 from stereoservo.core.limit import FRESH, SafetyLimits, SafetyResult, limit, limit_velocity
-from stereoservo.core.monitor import FOLLOWS, account_following, account_loads
+from stereoservo.core.monitor import FOLLOWS, NOISE, QUIET, account_following, account_loads, judge_round
 from stereoservo.core.move import add_friction, foresee, friction_bounds
 from stereoservo.core.prediction import SUSPECT_FRAMES, present
-from stereoservo.core.sources.law import adaptive_gain, aim_at, measure_goal, output_of, show_face
+from stereoservo.core.sources.law import adaptive_gain, aim_at, face_now, measure_goal, output_of, show_face
 from stereoservo.core.sources.progress import GOES_ON, account_run
 from stereoservo.core.state import Holding, ServoGoal
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
+from stereoservo.ports.devices import CameraObservation
 
+Frames = tuple[tuple[int, CameraObservation], ...]
 READY = (ModelReadiness.VALID, ModelReadiness.CANDIDATE)
 
 
@@ -45,8 +48,7 @@ def _plain_inputs(context: StepContext) -> bool:
     """Whether the inputs hold joints at most, in time; these are in the workspace then."""
     inputs, numbers, sample = context.inputs, context.state.block.numbers, context.inputs.joints
     if (
-        inputs.observations
-        or inputs.requests
+        inputs.requests
         or inputs.stop
         or inputs.compiling
         or inputs.sent is not None
@@ -116,11 +118,14 @@ def _servo(
     aim_at(room, source)
     if not _look(context, True):
         return None
-    show_face(room, source)
+    if source.pose_known and context.observations:
+        face_now(source, context)
+    else:
+        show_face(room, source)
     try:
         law.kernel(room.record, room.numbers.gain, context.dt_s, source.jacobian)
     except Exception:  # the stages end its goal, with what it raises again
-        _copy_changing(room.spare, state.block.record)
+        _copy_changing(room.spare, state.block.record, bool(context.observations))
         return None
     error_px = state.block.numbers.run.error_px
     return _command(output_of(source, context, law, error_px), context, limits, True)
@@ -135,29 +140,63 @@ def _rest(context: StepContext, limits: SafetyLimits) -> tuple[SourceOutput, Saf
 
 def _look(context: StepContext, aims: bool) -> bool:
     """Whether the stages before the motion found nothing; then the ``context`` has what they know."""
-    state, room, sample, numbers = (
-        context.state,
-        context.derived.room,
-        context.inputs.joints,
-        context.state.block.numbers,
-    )
+    state, room, sample = context.state, context.derived.room, context.inputs.joints
+    block, settings, watching = state.block, context.settings, state.watching
     told = (
-        sample is not None and sample.seq != numbers.last_joints_seq and sample.t_ns > numbers.last_joints_ns
+        sample is not None
+        and sample.seq != block.numbers.last_joints_seq
+        and sample.t_ns > block.numbers.last_joints_ns
     )
     t_ns, seq, efforts, following = (0, 0, False, False)
     if told:
         assert sample is not None
         t_ns, seq = sample.t_ns, sample.seq
         efforts, following = sample.efforts is not None, sample.following_errors is not None
-    if not look(
-        state.block.record, room.spare, room.record, told, t_ns, seq, efforts, following, context.now_ns, context.dt_s,
-        state.lifecycle is Lifecycle.ACTIVE, context.settings.watch_following, room.watches_loads, aims, context.q,
-    ):  # fmt: skip
+    frames: Frames = ()
+    if context.inputs.observations:
+        passed = _plain_frames(context)
+        if passed is None:
+            return False
+        frames = passed
+    due = watching.due
+    active, spare = state.lifecycle is Lifecycle.ACTIVE, room.spare
+    if not begin_step(block.record, spare, room.record, told, t_ns, seq, active, bool(frames), context.q):
         return False
+    for camera, seen in frames:
+        fold_frame(camera, seen, context)
+    found = end_step(
+        block.record, room.record, told, t_ns, efforts, following, context.now_ns, context.dt_s, active,
+        settings.watch_following, room.watches_loads, aims, bool(frames), watching.masked, watching.due, context.q,
+    )  # fmt: skip
+    if found == UNDONE:
+        watching.due = due
+        _copy_changing(spare, block.record, bool(frames))
+        return False
+    if found == WITH_ROUND:
+        watching.due = False
+        watching.rounds += 1
+    if frames:
+        context.observations = tuple([seen for _, seen in frames])
     context.arrays, context.prediction = context.derived.arrays, room.prediction
     context.weights, context.pixels, context.features_ns = room.weights, room.pixels, room.numbers.features_ns
     context.plain = True
     return True
+
+
+def _plain_frames(context: StepContext) -> Frames | None:
+    """The frames of a step, where all pass and no more is to be done with them than `fold_frame` and a round."""
+    state, arrays, watching = context.state, context.derived.arrays, context.state.watching
+    if (
+        arrays is None
+        or arrays.joint_accuracy is not None
+        or state.model is None
+        or state.model.shutter_offsets
+        or watching.last != QUIET
+        or watching.verdict != NOISE
+    ):
+        return None
+    passed, refused = observations_of(context)
+    return None if refused else passed
 
 
 def _command(
@@ -185,80 +224,84 @@ def _command(
 
 
 @kernel
-def look(
-    block: Record, spare: Record, room: Record, told: bool, t_ns: int, seq: int, efforts: bool, following: bool,
-    now_ns: int, dt_s: float, active: bool, watches_following: bool, watches_loads: bool, aims: bool, q: FloatArray,
+def begin_step(
+    block: Record, spare: Record, room: Record, told: bool, t_ns: int, seq: int, active: bool, frames: bool,
+    q: FloatArray,
 ) -> bool:  # fmt: skip
-    """The stages before the motion, with a joint sample in the ``room`` where one is ``told``, for a goal there where a
-    law ``aims`` at one; False: there is something for them to do, and the ``block`` is as before.
+    """Take the joint sample in the ``room``, where one is ``told``, before ``frames`` where there are any; False: the
+    stages must, and the ``block`` is as before, as it is in the ``spare`` one from here on.
     """
-    memory, work = block[0], room[0]
-    newest_ns, unseen = 0, True
+    memory = block[0]
+    unseen = True
     for c in range(memory.cameras):
         unseen = unseen and not memory.sightings[c].looked
-        if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
-            return False
-        newest_ns = max(newest_ns, memory.estimates[c].accepted_ns)
-    if unseen:  # a round is complete
+    if unseen and not frames:  # a round is complete
         return False
-    _copy_changing(block, spare)
-    if not _looked(
-        block,
-        room,
-        told,
-        t_ns,
-        seq,
-        efforts,
-        following,
-        now_ns,
-        dt_s,
-        active,
-        watches_following,
-        watches_loads,
-        aims,
-        q,
-    ):
-        _copy_changing(spare, block)
+    _copy_changing(block, spare, frames)
+    if not take_sample(block, room, told, t_ns, seq, active, q):
         return False
     for c in range(memory.cameras):
         memory.sightings[c].fresh = False
-    memory.last_step_ns, work.features_ns, work.told = now_ns, newest_ns, told
     return True
 
 
+UNDONE, WITHOUT_ROUND, WITH_ROUND = range(3)
+"""What `end_step` has come to."""
+
+
 @kernel
-def _looked(
-    block: Record, room: Record, told: bool, t_ns: int, seq: int, efforts: bool, following: bool, now_ns: int,
-    dt_s: float, active: bool, watches_following: bool, watches_loads: bool, aims: bool, q: FloatArray,
-) -> bool:  # fmt: skip
-    """Whether none of the stages finds anything."""
+def end_step(
+    block: Record, room: Record, told: bool, t_ns: int, efforts: bool, following: bool, now_ns: int, dt_s: float,
+    active: bool, watches_following: bool, watches_loads: bool, aims: bool, frames: bool, masked: FloatArray, due: bool,
+    q: FloatArray,
+) -> int:  # fmt: skip
+    """The other stages before the motion, for a goal in the ``room`` where a law ``aims`` at one; `UNDONE`: there is
+    something for them to do, and the ``block`` is to be put back; otherwise whether there was a round of frames.
+    """
     memory, work = block[0], room[0]
     elapsed_s = (now_ns - memory.last_step_ns) * 1e-9
-    if not take_sample(block, room, told, t_ns, seq, active, q):
-        return False
     present(block, room, q, now_ns)
     if told and t_ns > memory.loads_ns:
         _, beyond = account_loads(block, room, t_ns, efforts, following, active, False, False)
         if beyond and watches_loads:
-            return False
+            return UNDONE
     if watches_following:
         if account_following(block, room, q, elapsed_s) != FOLLOWS:
-            return False
+            return UNDONE
         if not active:
             memory.silence_known = 0
+    found = WITHOUT_ROUND
+    if frames:
+        complete = True
+        for c in range(memory.cameras):
+            complete = complete and not memory.sightings[c].looked
+        if complete or due:
+            looked_at, odd, any_masked = judge_round(block, room, now_ns, masked, 0)
+            if odd or any_masked:
+                return UNDONE
+            found = WITH_ROUND if looked_at else found
+    newest_ns = 0
+    for c in range(memory.cameras):
+        newest_ns = max(newest_ns, memory.estimates[c].accepted_ns)
+        if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
+            return UNDONE
+    memory.last_step_ns, work.features_ns, work.told = now_ns, newest_ns, told
     if not aims:
-        return True
+        return found
     seen = measure_goal(block, room, q)
-    if seen < MIN_MARKERS:
-        return False
     measured, error_px = work.measured != 0, work.error_px
-    found = account_run(
-        block, measured, error_px, True, dt_s, work.tolerance_px, work.hold_frames, work.time_limit_s
-    )
+    if (
+        seen < MIN_MARKERS
+        or account_run(
+            block, measured, error_px, True, dt_s, work.tolerance_px, work.hold_frames, work.time_limit_s
+        )
+        != GOES_ON
+    ):
+        return UNDONE
     work.gain = adaptive_gain(
         work.gain_near, work.gain_far, work.gain_slope, error_px if measured else math.nan
     )
-    return found == GOES_ON
+    return found
 
 
 @kernel
@@ -292,10 +335,14 @@ def command_within(
 
 
 @kernel
-def _copy_changing(block: Record, into: Record) -> None:
-    """Copy what `_looked` changes of a ``block``."""
+def _copy_changing(block: Record, into: Record, frames: bool) -> None:
+    """Copy what a step changes of a ``block``, with ``frames`` or without."""
     memory, other = block[0], into[0]
     n, window = memory.joints, memory.window
+    for c in range(memory.cameras):
+        other.sightings[c].fresh = memory.sightings[c].fresh
+    if frames:
+        _copy_cameras(block, into)
     other.joints, other.window, other.past, other.delay_steps = n, window, memory.past, memory.delay_steps
     other.last_step_ns, other.last_joints_ns = memory.last_step_ns, memory.last_joints_ns
     other.last_joints_seq, other.last_followed_ns = memory.last_joints_seq, memory.last_followed_ns
@@ -332,3 +379,43 @@ def _copy_changing(block: Record, into: Record) -> None:
         other.delay_accounted[j], other.delay_missing[j] = memory.delay_accounted[j], memory.delay_missing[j]
         other.mean_efforts[j], other.efforts[j] = memory.mean_efforts[j], memory.efforts[j]
         other.following_errors[j] = memory.following_errors[j]
+
+
+@kernel
+def _copy_cameras(block: Record, into: Record) -> None:
+    """Copy what is known of the cameras, and their newest frames."""
+    memory, other = block[0], into[0]
+    c, m, rows = memory.cameras, memory.markers, memory.rows
+    other.cameras, other.markers, other.rows = c, m, rows
+    for k in range(c):
+        one, to = memory.estimates[k], other.estimates[k]
+        to.last_seq, to.last_visible, to.accepted_ns, to.frames = (
+            one.last_seq,
+            one.last_visible,
+            one.accepted_ns,
+            one.frames,
+        )
+        to.rejected_frames, to.agreeing_frames = one.rejected_frames, one.agreeing_frames
+        to.rms_px, to.offset_ns = one.rms_px, one.offset_ns
+        frame, kept = memory.sightings[k], other.sightings[k]
+        kept.t_ns, kept.looked, kept.chi2, kept.rms_px = frame.t_ns, frame.looked, frame.chi2, frame.rms_px
+        kept.worst, kept.worst_px = frame.worst, frame.worst_px
+        kept.timing.product, kept.timing.square = frame.timing.product, frame.timing.square
+        kept.timing.seen_ns = frame.timing.seen_ns
+    other.innovation[: 2 * c * m], other.sigma[: c * m] = (
+        memory.innovation[: 2 * c * m],
+        memory.sigma[: c * m],
+    )
+    other.seen_ns[: c * m], other.frame_q[: c * memory.joints] = (
+        memory.seen_ns[: c * m],
+        memory.frame_q[: c * memory.joints],
+    )
+    k = c * rows
+    other.frame_innovation[: 2 * k], other.frame_spread[: 4 * k] = (
+        memory.frame_innovation[: 2 * k],
+        memory.frame_spread[: 4 * k],
+    )
+    other.frame_seen[:k], other.frame_velocity[: 2 * k] = (
+        memory.frame_seen[:k],
+        memory.frame_velocity[: 2 * k],
+    )

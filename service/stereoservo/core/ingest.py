@@ -52,7 +52,7 @@ def ingest(context: StepContext) -> Ingested:
     last_ns = numbers.last_step_ns
     elapsed_s = (inputs.now_ns - last_ns if last_ns else context.derived.nominal_period_ns) * 1e-9
     gap = _gap(elapsed_s, context)
-    observations, refused_frames = _observations(context) if inputs.observations else ((), ())
+    observations, refused_frames = observations_of(context) if inputs.observations else ((), ())
     joints, refused_joints = _take_joints(context)
     numbers.last_step_ns = context.now_ns
     stops: tuple[Reason, ...] = ()
@@ -348,7 +348,7 @@ def _jump(sample: JointState, context: StepContext) -> Reason:
     )  # fmt: skip
 
 
-def _observations(
+def observations_of(
     context: StepContext,
 ) -> tuple[tuple[tuple[int, CameraObservation], ...], tuple[tuple[int, Reason], ...]]:
     """New observations with the index of their camera, and the reasons of refused ones.

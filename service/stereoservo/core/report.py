@@ -86,7 +86,7 @@ def _model_health(context: StepContext) -> tuple[ModelDiagnosis, Health]:
     frame has come and nothing else that they follow from is another.
     """
     state, derived, watching = context.state, context.derived, context.state.watching
-    if context.plain and derived.model_health is not None:
+    if context.plain and not context.observations and derived.model_health is not None:
         return derived.model_health[2]
     told = state.model, state.readiness, watching, watching.verdict
     marks, known = watching.masked.tobytes(), derived.model_health

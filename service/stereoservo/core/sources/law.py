@@ -109,8 +109,7 @@ def _compiled_step(
     if ended is not None:
         return ended
     if source.pose_known and (context.observations or source.choice.cameras == 0):
-        scene, task = choose(source, context, room.scene, room.task)
-        _face(room, task.face, scene.camera_centres)
+        face_now(source, context)
     else:
         show_face(room, source)
     try:
@@ -151,6 +150,13 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
     numbers.gain_near, numbers.gain_far, numbers.gain_slope = goal.gain_near, goal.gain_far, goal.gain_slope
     numbers.tolerance_px, numbers.time_limit_s = goal.tolerance_px, goal.time_limit_s
     numbers.hold_frames = goal.hold_frames
+
+
+def face_now(source: ServoGoal, context: StepContext) -> None:
+    """Choose the face that the law works on anew."""
+    room = context.derived.room
+    scene, task = choose(source, context, room.scene, room.task)
+    _face(room, task.face, scene.camera_centres)
 
 
 def show_face(room: Workspace, goal: ServoGoal) -> None:
