@@ -45,7 +45,7 @@ def test_a_block_is_read_as_it_was_written_and_anything_else_refused() -> None:
     assert again.record.tobytes() == block.record.tobytes()
     for name, wrong in (
         ("joints", 13), ("joints", -1), ("joints", "3"), ("past", None), ("command", np.zeros(4)), ("command", 0.0),
-        ("history_ns", np.zeros(128)), ("last_step_ns", "now"),
+        ("history_ns", np.zeros(128)), ("last_step_ns", "now"), ("run", {"held": "now"}), ("run", 3),
     ):  # fmt: skip
         with pytest.raises((ValueError, TypeError)):
             restored(block.kept() | {name: wrong})

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from core.former_states import without_a_block
+from core.former_states import before_version_12, without_a_block
 from stereoservo.core.cycle import DriverFault, ModelUpdate
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state_encoding import StateVersionError, decode_state, encode_state, is_recorded
@@ -496,6 +496,16 @@ def test_state_survives_serialisation_bit_for_bit(bench: Any) -> None:
         again = twin.step(inputs)
         assert again.command.tobytes() == outputs.command.tobytes()
     assert encode_state(twin.state) == encode_state(bench.core.state)
+
+
+def test_a_state_of_version_11_is_taken_up(bench: Any) -> None:
+    """In the midst of a goal, which goes on with its progress and its friction."""
+    bench.dead_speed = 0.002
+    moving(bench)
+    data = encode_state(bench.core.state)
+    assert bench.core.state.block.numbers.run.moved_s > 0.0
+    assert bench.core.state.block.friction_sent.any()
+    assert encode_state(decode_state(msgspec.msgpack.encode(before_version_12(data)))) == data
 
 
 def test_a_state_of_version_6_is_taken_up(bench: Any) -> None:

@@ -143,6 +143,7 @@ class Law:
     which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as ``body``; of the cameras
     that keep sight of the face the centres as ``eyes``), and fills in ``velocity``, ``components`` (errors, then what
     is allowed), ``component_status`` and ``conditioning``. None: the step is called.
+    For the kernel of a law without components no face is chosen.
 
     ``summary``: one line for lists. ``colour``: in figures. ``rank``: where the law stands in lists.
     """

@@ -309,7 +309,8 @@ class Block:
     def kept(self) -> dict[str, Any]:
         """All that is to be written out but the `SIGHTS`, by name: numbers, then arrays."""
         return {
-            **{name: getattr(self.numbers, name) for name, *_ in Numbers._fields_},
+            **{name: getattr(self.numbers, name) for name, *_ in Numbers._fields_ if name != "run"},
+            "run": self.numbers.run.kept(),
             **{name: getattr(self, name) for name in ARRAYS if name not in SIGHTS},
         }
 
@@ -324,8 +325,8 @@ def restored(kept: Mapping[str, Any]) -> Block:
     block = Block(counts)  # type: ignore[arg-type]
     for name, *_ in Numbers._fields_:
         if name == "run":
-            for number, told in kept.get(name, {}).items():
-                setattr(block.numbers.run, number, told)
+            for number in RunProgress.__annotations__.keys() & set(kept.get(name, ())):
+                setattr(block.numbers.run, number, kept[name][number])
         elif name in kept:
             setattr(block.numbers, name, kept[name])
     for name in ARRAYS:

@@ -92,7 +92,7 @@ class StepContext(msgspec.Struct, eq=False):
     `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
     ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) need a model. `move` sets ``paused``: the active source had
     to wait, and ``outermost`` (n,): where joints are, or with late drives will be, farthest towards where they go.
-    ``plain``: it went by `core.fast_path`, so that nothing stands that is to be told in every step.
+    `core.fast_path` has ``looked`` at the step, which was ``plain``: nothing stands that is to be told in every step.
     ``features_ns``: shutter time of the newest frame with accepted markers, 0 before the first.
     ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
     """
@@ -112,6 +112,7 @@ class StepContext(msgspec.Struct, eq=False):
     weights: FloatArray | None = None
     pixels: FloatArray | None = None
     paused: bool = False
+    looked: bool = False
     plain: bool = False
     outermost: FloatArray | None = None
     features_ns: int = 0

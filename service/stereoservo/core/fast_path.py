@@ -20,7 +20,7 @@ from stereoservo.core.limit import FRESH, SafetyLimits, SafetyResult, limit, lim
 from stereoservo.core.monitor import FOLLOWS, NOISE, QUIET, account_following, account_loads, judge_round
 from stereoservo.core.move import add_friction, foresee, friction_bounds
 from stereoservo.core.prediction import SUSPECT_FRAMES, present
-from stereoservo.core.sources.law import adaptive_gain, aim_at, face_now, measure_goal, output_of, show_face
+from stereoservo.core.sources.law import adaptive_gain, aim_at, measure_goal, output_of, show_face
 from stereoservo.core.sources.progress import GOES_ON, account_run
 from stereoservo.core.state import Holding, ServoGoal
 from stereoservo.messages.status import Lifecycle, ModelReadiness
@@ -34,14 +34,31 @@ READY = (ModelReadiness.VALID, ModelReadiness.CANDIDATE)
 
 def fast_path(context: StepContext, limits: SafetyLimits) -> tuple[SourceOutput, SafetyResult] | None:
     """What the stages up to `limit` come to, or None, and nothing has happened."""
-    if not (_plain_inputs(context) and _plain_state(context)):
+    source, rounds = context.state.source, context.state.watching.rounds
+    goal = source if isinstance(source, ServoGoal) else None
+    if not (
+        (type(source) is Holding if goal is None else _by_kernel(goal, context))
+        and context.state.friction_of == ("" if goal is None else goal.goal.id)
+        and _plain_state(context)
+        and _plain_inputs(context)
+    ):
         return None
-    source = context.state.source
-    if type(source) is ServoGoal:
-        return _servo(source, context, limits)
-    if type(source) is Holding and not context.state.friction_of:
-        return _rest(context, limits)
-    return None
+    motion = None
+    if _look(context, goal is not None):
+        motion = _drive(goal, context) if goal is not None else SourceOutput(np.zeros(context.q.size))
+    if motion is None:
+        _put_back(context, rounds)
+        return None
+    context.plain = True
+    return _command(motion, context, limits, goal is not None)
+
+
+def _put_back(context: StepContext, rounds: int) -> None:
+    """The state is as before `_look`."""
+    state = context.state
+    if context.looked:
+        _copy_changing(context.derived.room.spare, state.block.record, bool(context.observations))
+    state.watching.rounds, state.watching.due, context.observations = rounds, False, ()
 
 
 def _plain_inputs(context: StepContext) -> bool:
@@ -98,48 +115,36 @@ def _plain_state(context: StepContext) -> bool:
     )
 
 
-def _servo(
-    source: ServoGoal, context: StepContext, limits: SafetyLimits
-) -> tuple[SourceOutput, SafetyResult] | None:
-    """A step of a law to a goal that stands."""
-    state, room = context.state, context.derived.room
-    law = context.derived.laws[source.law]
+def _by_kernel(goal: ServoGoal, context: StepContext) -> bool:
+    """Whether a law with a kernel works on a ``goal`` that stands, which is in the workspace then."""
     if (
-        law.kernel is None
-        or source.stream is not None
-        or source.followed is not None
-        or source.points != "predicted"
-        or (source.pose_known and source.choice.cameras == 0)
-        or state.friction_of != source.goal.id
-        or (source.lease_s is not None and context.now_ns > source.lease_until_ns)
-        or state.lifecycle is not Lifecycle.ACTIVE
+        context.derived.laws[goal.law].kernel is None
+        or goal.stream is not None
+        or goal.followed is not None
+        or goal.points != "predicted"
+        or context.state.lifecycle is not Lifecycle.ACTIVE
+        or (goal.lease_s is not None and context.now_ns > goal.lease_until_ns)
     ):
-        return None
-    aim_at(room, source)
-    if not _look(context, True):
-        return None
-    if source.pose_known and context.observations:
-        face_now(source, context)
-    else:
-        show_face(room, source)
+        return False
+    aim_at(context.derived.room, goal)
+    return True
+
+
+def _drive(goal: ServoGoal, context: StepContext) -> SourceOutput | None:
+    """What the law makes of a ``goal``; None: it raises."""
+    state, room, law = context.state, context.derived.room, context.derived.laws[goal.law]
+    assert law.kernel is not None
+    if law.components:
+        show_face(goal, context)
     try:
-        law.kernel(room.record, room.numbers.gain, context.dt_s, source.jacobian)
+        law.kernel(room.record, room.numbers.gain, context.dt_s, goal.jacobian)
     except Exception:  # the stages end its goal, with what it raises again
-        _copy_changing(room.spare, state.block.record, bool(context.observations))
         return None
-    error_px = state.block.numbers.run.error_px
-    return _command(output_of(source, context, law, error_px), context, limits, True)
-
-
-def _rest(context: StepContext, limits: SafetyLimits) -> tuple[SourceOutput, SafetyResult] | None:
-    """A step without motion."""
-    if not _look(context, False):
-        return None
-    return _command(SourceOutput(np.zeros(context.q.size)), context, limits, False)
+    return output_of(goal, context, law, state.block.numbers.run.error_px)
 
 
 def _look(context: StepContext, aims: bool) -> bool:
-    """Whether the stages before the motion found nothing; then the ``context`` has what they know."""
+    """Whether the stages before the motion find nothing; then the ``context`` has what they know."""
     state, room, sample = context.state, context.derived.room, context.inputs.joints
     block, settings, watching = state.block, context.settings, state.watching
     told = (
@@ -152,15 +157,13 @@ def _look(context: StepContext, aims: bool) -> bool:
         assert sample is not None
         t_ns, seq = sample.t_ns, sample.seq
         efforts, following = sample.efforts is not None, sample.following_errors is not None
-    frames: Frames = ()
-    if context.inputs.observations:
-        passed = _plain_frames(context)
-        if passed is None:
-            return False
-        frames = passed
-    due = watching.due
-    active, spare = state.lifecycle is Lifecycle.ACTIVE, room.spare
-    if not begin_step(block.record, spare, room.record, told, t_ns, seq, active, bool(frames), context.q):
+    frames = _plain_frames(context) if context.inputs.observations else ()
+    if frames is None:
+        return False
+    context.observations, active = tuple([seen for _, seen in frames]), state.lifecycle is Lifecycle.ACTIVE
+    _copy_changing(block.record, room.spare, bool(frames))
+    context.looked = True
+    if not begin_step(block.record, room.record, told, t_ns, seq, active, bool(frames), context.q):
         return False
     for camera, seen in frames:
         fold_frame(camera, seen, context)
@@ -168,18 +171,13 @@ def _look(context: StepContext, aims: bool) -> bool:
         block.record, room.record, told, t_ns, efforts, following, context.now_ns, context.dt_s, active,
         settings.watch_following, room.watches_loads, aims, bool(frames), watching.masked, watching.due, context.q,
     )  # fmt: skip
-    if found == UNDONE:
-        watching.due = due
-        _copy_changing(spare, block.record, bool(frames))
+    if found == UNUSUAL:
         return False
     if found == WITH_ROUND:
         watching.due = False
         watching.rounds += 1
-    if frames:
-        context.observations = tuple([seen for _, seen in frames])
     context.arrays, context.prediction = context.derived.arrays, room.prediction
     context.weights, context.pixels, context.features_ns = room.weights, room.pixels, room.numbers.features_ns
-    context.plain = True
     return True
 
 
@@ -225,11 +223,10 @@ def _command(
 
 @kernel
 def begin_step(
-    block: Record, spare: Record, room: Record, told: bool, t_ns: int, seq: int, active: bool, frames: bool,
-    q: FloatArray,
-) -> bool:  # fmt: skip
-    """Take the joint sample in the ``room``, where one is ``told``, before ``frames`` where there are any; False: the
-    stages must, and the ``block`` is as before, as it is in the ``spare`` one from here on.
+    block: Record, room: Record, told: bool, t_ns: int, seq: int, active: bool, frames: bool, q: FloatArray
+) -> bool:
+    """Take the joint sample in the ``room``, where one is ``told``, before ``frames`` where there are any; False: there
+    is something for the stages to do.
     """
     memory = block[0]
     unseen = True
@@ -237,7 +234,6 @@ def begin_step(
         unseen = unseen and not memory.sightings[c].looked
     if unseen and not frames:  # a round is complete
         return False
-    _copy_changing(block, spare, frames)
     if not take_sample(block, room, told, t_ns, seq, active, q):
         return False
     for c in range(memory.cameras):
@@ -245,7 +241,7 @@ def begin_step(
     return True
 
 
-UNDONE, WITHOUT_ROUND, WITH_ROUND = range(3)
+UNUSUAL, WITHOUT_ROUND, WITH_ROUND = range(3)
 """What `end_step` has come to."""
 
 
@@ -255,8 +251,8 @@ def end_step(
     active: bool, watches_following: bool, watches_loads: bool, aims: bool, frames: bool, masked: FloatArray, due: bool,
     q: FloatArray,
 ) -> int:  # fmt: skip
-    """The other stages before the motion, for a goal in the ``room`` where a law ``aims`` at one; `UNDONE`: there is
-    something for them to do, and the ``block`` is to be put back; otherwise whether there was a round of frames.
+    """The other stages before the motion, for a goal in the ``room`` where a law ``aims`` at one; `UNUSUAL`: there is
+    something for the stages to do; otherwise whether there was a round of frames.
     """
     memory, work = block[0], room[0]
     elapsed_s = (now_ns - memory.last_step_ns) * 1e-9
@@ -264,10 +260,10 @@ def end_step(
     if told and t_ns > memory.loads_ns:
         _, beyond = account_loads(block, room, t_ns, efforts, following, active, False, False)
         if beyond and watches_loads:
-            return UNDONE
+            return UNUSUAL
     if watches_following:
         if account_following(block, room, q, elapsed_s) != FOLLOWS:
-            return UNDONE
+            return UNUSUAL
         if not active:
             memory.silence_known = 0
     found = WITHOUT_ROUND
@@ -278,13 +274,13 @@ def end_step(
         if complete or due:
             looked_at, odd, any_masked = judge_round(block, room, now_ns, masked, 0)
             if odd or any_masked:
-                return UNDONE
+                return UNUSUAL
             found = WITH_ROUND if looked_at else found
     newest_ns = 0
     for c in range(memory.cameras):
         newest_ns = max(newest_ns, memory.estimates[c].accepted_ns)
         if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
-            return UNDONE
+            return UNUSUAL
     memory.last_step_ns, work.features_ns, work.told = now_ns, newest_ns, told
     if not aims:
         return found
@@ -297,7 +293,7 @@ def end_step(
         )
         != GOES_ON
     ):
-        return UNDONE
+        return UNUSUAL
     work.gain = adaptive_gain(
         work.gain_near, work.gain_far, work.gain_slope, error_px if measured else math.nan
     )

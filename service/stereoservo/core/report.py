@@ -205,29 +205,18 @@ def _health_now(
     state = context.state
     assert state.model is not None
     ids = (*state.model.marker_ids, *state.model.scene_ids)
+    told = zip(context.settings.cameras, state.watching.sightings, state.mobile, strict=True)
+    cameras = {
+        camera.name: CameraHealth(
+            seen.chi2, seen.rms_px, ids[seen.worst] if seen.worst >= 0 else -1, seen.worst_px,
+            "" if moves is None else moves.place, advice(seen.timing),
+        )
+        for camera, seen, moves in told
+    }  # fmt: skip
     return Health(
-        verdict=verdict.kind,
-        subjects=verdict.subjects,
-        size=verdict.size,
-        deviation=verdict.deviation,
-        unit=verdict.unit,
-        text=verdict.text,
-        cameras={
-            camera.name: CameraHealth(
-                sighting.chi2,
-                sighting.rms_px,
-                ids[sighting.worst] if sighting.worst >= 0 else -1,
-                sighting.worst_px,
-                "" if moves is None else moves.place,
-                advice(sighting.timing),
-            )
-            for camera, sighting, moves in zip(
-                context.settings.cameras, state.watching.sightings, state.mobile, strict=True
-            )
-        },
-        masked=masked,
-        reanchoring=reanchoring,
-    )
+        verdict.kind, verdict.subjects, verdict.size, verdict.deviation, verdict.unit, verdict.text, cameras, masked,
+        reanchoring,
+    )  # fmt: skip
 
 
 KNOWN_S = 0.002

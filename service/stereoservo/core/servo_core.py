@@ -53,7 +53,7 @@ class ServoCore:
     """
 
     def __init__(self, settings: CoreSettings, state: CoreState | None = None, *, fast: bool = True) -> None:
-        self.settings, self._fast = settings, fast
+        self.settings, self.fast = settings, fast
         self.state = initial_state(settings) if state is None else state
         block, past = self.state.block, steps_of_delay(settings.rate_hz)
         if block.numbers.past != past:  # of a state that was written before drives were known to be late
@@ -78,7 +78,7 @@ class ServoCore:
         """One cycle: the seven stages, in their order."""
         events: list[Event] = []
         context = self._context(inputs, events)
-        done = fast_path(context, self._limits) if self._fast else None
+        done = fast_path(context, self._limits) if self.fast else None
         if done is not None:
             motion, limited = done
         else:

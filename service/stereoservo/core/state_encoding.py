@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from stereoservo.core.block import Block, RunProgress, restored
+from stereoservo.core.block import Block, restored
 from stereoservo.core.camera_state import CameraEstimate, CameraMonitor, CameraTiming, camera_read
 from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_sights
@@ -33,7 +33,7 @@ class _Versioned(msgspec.Struct):
     version: int
 
 
-KEPT = (Block, CameraEstimate, CameraMonitor, CameraTiming, RunProgress)
+KEPT = (Block, CameraEstimate, CameraMonitor, CameraTiming)
 """What is written out by its ``kept``."""
 
 

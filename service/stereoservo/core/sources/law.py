@@ -108,10 +108,8 @@ def _compiled_step(
     ended = run_ended(source, context, error_px, seen, source.wanted, may_end=may_end)
     if ended is not None:
         return ended
-    if source.pose_known and (context.observations or source.choice.cameras == 0):
-        face_now(source, context)
-    else:
-        show_face(room, source)
+    if law.components:
+        show_face(source, context)
     try:
         kernel(room.record, gain_now(source, error_px), context.dt_s, source.jacobian)
     except Exception as error:  # as any law: it ends its goal, never the loop
@@ -152,16 +150,13 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
     numbers.hold_frames = goal.hold_frames
 
 
-def face_now(source: ServoGoal, context: StepContext) -> None:
-    """Choose the face that the law works on anew."""
+def show_face(goal: ServoGoal, context: StepContext) -> None:
+    """The face that a law with components works on for a ``goal``, into the workspace: by new images another one."""
     room = context.derived.room
-    scene, task = choose(source, context, room.scene, room.task)
-    _face(room, task.face, scene.camera_centres)
-
-
-def show_face(room: Workspace, goal: ServoGoal) -> None:
-    """The law works on the face that was chosen for a ``goal``."""
-    if room.faced is not goal.choice:
+    if goal.pose_known and (context.observations or goal.choice.cameras == 0):
+        scene, task = choose(goal, context, room.scene, room.task)
+        _face(room, task.face, scene.camera_centres)
+    elif room.faced is not goal.choice:
         eyes = law_scene(room.scene, goal.choice).camera_centres
         _face(room, goal.choice.triple, eyes, goal.choice)
 
