@@ -17,9 +17,9 @@ from stereoservo_sim.benchmarks.cycle import drive
 from stereoservo_sim.world.synthetic import rx90
 
 PACKAGE = str(Path(stereoservo.__file__).parent)
-LINES = {"stereo": 450, "cartesian3": 455, "trajectory": 560}
-"""Of Python that a step between frames may run, kernels apart (403, 408, 523 when this was written; 533, 551, 614 with
-a call from Python for each part of a stage), in a step that sends no priors.
+LINES = {"stereo": 270, "cartesian3": 280, "trajectory": 560}
+"""Of Python that a step between frames may run, kernels apart (243, 252, 512 when this was written; 403, 408, 523
+by the stages alone; 533, 551, 614 with a call from Python for each part of a stage), in a step that sends no priors.
 """
 
 

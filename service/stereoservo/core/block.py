@@ -76,15 +76,6 @@ class RunProgress(Kept):
     least_s: float
     _fields_ = tuple((name, KINDS[kind]) for name, kind in __annotations__.items())
 
-    @property
-    def error_px(self) -> float | None:
-        """The error of the last step; None where none was measured."""
-        return self.newest_px if self.measured else None
-
-    def begin(self, frames: int) -> None:
-        """A law begins, when the cameras have had so many ``frames`` in all."""
-        self.count_as(RunProgress(last_frames=frames))
-
 
 class Numbers(ctypes.Structure):
     """The numbers at the head of a record: the counts, and what is no array. Read and written like attributes."""

@@ -28,6 +28,7 @@ from stereoservo.core.goals.plan import go_on_planning, plan_again, plan_report
 from stereoservo.core.goals.prepare import prepare, set_up, trusted_model
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.sources.law import awaits_plan
+from stereoservo.core.sources.progress import error_of_run
 from stereoservo.core.state import (
     AwaitingAcknowledgement,
     Holding,
@@ -274,7 +275,7 @@ def _blend_into_next(context: StepContext) -> None:
     if not state.queue or state.queue[0].id != following.goal.id:
         state.ahead = None
         return
-    error_px = state.block.numbers.run.error_px
+    error_px = error_of_run(state.block)
     if state.held or state.reanchoring is not None or error_px is None or error_px > source.goal.blend_px:
         return
     state.queue.pop(0)

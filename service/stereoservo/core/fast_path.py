@@ -21,7 +21,7 @@ from stereoservo.core.monitor import FOLLOWS, NOISE, QUIET, account_following, a
 from stereoservo.core.move import add_friction, foresee, friction_bounds
 from stereoservo.core.prediction import SUSPECT_FRAMES, present
 from stereoservo.core.sources.law import adaptive_gain, aim_at, measure_goal, output_of, show_face
-from stereoservo.core.sources.progress import GOES_ON, account_run
+from stereoservo.core.sources.progress import GOES_ON, account_run, error_of_run
 from stereoservo.core.state import Holding, ServoGoal
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray, Record
@@ -33,7 +33,7 @@ READY = (ModelReadiness.VALID, ModelReadiness.CANDIDATE)
 
 
 def fast_path(context: StepContext, limits: SafetyLimits) -> tuple[SourceOutput, SafetyResult] | None:
-    """What the stages up to `limit` come to, or None, and nothing has happened."""
+    """What the stages up to `limit` come to in a step without requests, or None, and nothing has happened."""
     source, rounds = context.state.source, context.state.watching.rounds
     goal = source if isinstance(source, ServoGoal) else None
     if not (
@@ -65,8 +65,7 @@ def _plain_inputs(context: StepContext) -> bool:
     """Whether the inputs hold joints at most, in time; these are in the workspace then."""
     inputs, numbers, sample = context.inputs, context.state.block.numbers, context.inputs.joints
     if (
-        inputs.requests
-        or inputs.stop
+        inputs.stop
         or inputs.compiling
         or inputs.sent is not None
         or inputs.model_update is not None
@@ -103,7 +102,6 @@ def _plain_state(context: StepContext) -> bool:
             or state.fault
         )
         and state.pending_model is None
-        and state.planning is None
         and state.ahead is None
         and state.teaching is None
         and state.reanchoring is None
@@ -140,7 +138,7 @@ def _drive(goal: ServoGoal, context: StepContext) -> SourceOutput | None:
         law.kernel(room.record, room.numbers.gain, context.dt_s, goal.jacobian)
     except Exception:  # the stages end its goal, with what it raises again
         return None
-    return output_of(goal, context, law, state.block.numbers.run.error_px)
+    return output_of(goal, context, law, error_of_run(state.block))
 
 
 def _look(context: StepContext, aims: bool) -> bool:

@@ -78,7 +78,8 @@ class ServoCore:
         """One cycle: the seven stages, in their order."""
         events: list[Event] = []
         context = self._context(inputs, events)
-        done = fast_path(context, self._limits) if self.fast else None
+        asked = inputs.requests or self.state.planning is not None
+        done = fast_path(context, self._limits) if self.fast and not asked else None
         if done is not None:
             motion, limited = done
         else:

@@ -37,6 +37,7 @@ from stereoservo.core.goals.servoing import no_plan, run_fields, used_cameras
 from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.core.prediction import points_now, scene_of
 from stereoservo.core.sources.law import options, run_ended
+from stereoservo.core.sources.progress import error_of_run
 from stereoservo.core.state import IncidenceGoal
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.kernels import project_points, triangulate
@@ -240,7 +241,7 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     usable = weights * source.used[:, None]
     points = points_now(arrays, context.q, pixels, usable, context.state.block.correction, source.points)
     scene = scene_of(prediction, pixels, arrays, points, usable)
-    task, how = _task(source), options(source, context, context.state.block.numbers.run.error_px)
+    task, how = _task(source), options(source, context, error_of_run(context.state.block))
     second = _second(source, context, scene, how.gain)
     step = incidence_step(scene, task, how, second)
     error_px = float(step.error_px.max())

@@ -24,7 +24,9 @@ from stereoservo.core.sources.progress import (
     SETTLED,
     Traits,
     account_run,
+    begin_run,
     decay_of_error,
+    error_of_run,
     examine_progress,
     follow_error,
 )
@@ -252,7 +254,7 @@ def measure_goal(block: Record, room: Record, q: FloatArray) -> int:
 def activate_run(source: LawRun, context: StepContext) -> None:
     """Start the clock, the frame count and the lease of a law that begins now."""
     source.started_ns = context.now_ns
-    context.state.block.numbers.run.begin(sum(e.frames for e in context.state.cameras))
+    begin_run(context.state.block.record)
     source.renew_lease(context.now_ns)
     if isinstance(source, ServoGoal) and source.goal.follow_markers:
         start_following(source, context)
@@ -484,7 +486,7 @@ Progress = tuple[float | None, float | None]
 
 def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
     """Share [0, 1] of the goal's path that is done, and the seconds left; None where that is not known."""
-    if context.state.block.numbers.run.error_px is None:
+    if error_of_run(context.state.block) is None:
         return None, None
     if context.derived.laws[source.law].planned:
         if source.plan is None:
@@ -520,7 +522,7 @@ def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
 
 def _plain_traits(source: LawRun, context: StepContext) -> Traits:
     gain, left_s = (
-        gain_now(source, context.state.block.numbers.run.error_px),
+        gain_now(source, error_of_run(context.state.block)),
         run_progress(source, context)[1],
     )
     return Traits(gain, left_s or 0.0)

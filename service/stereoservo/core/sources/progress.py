@@ -11,6 +11,7 @@ import numpy as np
 
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
+from stereoservo.core.block import Block
 from stereoservo.core.context import StepContext
 from stereoservo.core.state import LawRun
 from stereoservo.messages.reasons import Reason
@@ -24,6 +25,24 @@ SMALLER = 0.95
 """Of the least mean error so far, below which it counts as smaller."""
 GOES_ON, OUT_OF_TIME, SETTLED = range(3)
 """What `account_run` has found."""
+
+
+def error_of_run(block: Block) -> float | None:
+    """The error [px] of the law at work in its last step; None where none was measured."""
+    run = block.numbers.run
+    return run.newest_px if run.measured else None
+
+
+@kernel
+def begin_run(block: Record) -> None:
+    """A law begins."""
+    memory = block[0]
+    run, frames = memory.run, 0
+    for c in range(memory.cameras):
+        frames += memory.estimates[c].frames
+    run.moved_s, run.held, run.last_frames = 0.0, 0, frames
+    run.measured, run.newest_px, run.first_px = False, 0.0, 0.0
+    run.mean_px, run.least_px, run.least_s = 0.0, 0.0, 0.0
 
 
 @kernel
@@ -185,7 +204,7 @@ def _few_markers(source: LawRun, context: StepContext, traits: Traits) -> list[R
 
 
 def _tail(source: LawRun, context: StepContext, traits: Traits) -> Reason | None:
-    error = context.state.block.numbers.run.error_px
+    error = error_of_run(context.state.block)
     if error is None or not source.tolerance_px < error < TAIL * source.tolerance_px:
         return None
     gain, left_s = traits.gain, traits.left_s
@@ -202,7 +221,7 @@ def _stall_reason(
     source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
 ) -> Reason | None:
     run = context.state.block.numbers.run
-    error, since_s = run.error_px, run.moved_s - run.least_s
+    error, since_s = error_of_run(context.state.block), run.moved_s - run.least_s
     if error is None or error <= source.tolerance_px or since_s < STUCK_S:
         return None
     codes = {reason.code: reason for reason in reversed(told)}
