@@ -21,6 +21,7 @@ class RerunViewer:
         else:
             self._stream.save(file)
         self._codes: tuple[str, ...] | None = None
+        self._series: dict[str, list[str]] = {}
 
     def show(self, message: StateMessage | EventMessage | FeaturesMessage) -> None:
         """Log a message of the cell."""
@@ -43,8 +44,8 @@ class RerunViewer:
             ("command", state.command),
             ("innovation_px", state.innovation_px),
         ):
-            for name, value in values.items():
-                self._stream.log(f"{entity}/{name}", rerun.Scalars(value))
+            if values:
+                self._show_series(entity, values)
         if state.error_px is not None:
             self._stream.log("error_px", rerun.Scalars(state.error_px))
         codes = tuple(reason.code for reason in state.reasons)
@@ -52,6 +53,14 @@ class RerunViewer:
             self._codes = codes
             text = "; ".join(f"{reason.code}: {reason.hint}" for reason in state.reasons)
             self._stream.log("reasons", rerun.TextLog(text or "none"))
+
+    def _show_series(self, entity: str, values: dict[str, float]) -> None:
+        """Log values in one call: a call for each takes three times the processor time of `watch`."""
+        names = list(values)
+        if self._series.get(entity) != names:
+            self._series[entity] = names
+            self._stream.log(entity, rerun.SeriesLines(names=names), static=True)
+        self._stream.log(entity, rerun.Scalars(list(values.values())))
 
     def close(self) -> None:
         """Hand over what is not shown yet."""
