@@ -11,7 +11,7 @@ import rerun
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
 SEND_S = 0.25
-"""Messages are handed over in columns so often: one by one, each wakes the library's threads, a tenth of a core in all."""
+"""Messages are handed over in columns so often: one by one, each wakes the threads of the library."""
 SERIES = ("joints", "velocities", "command", "innovation_px")
 
 
