@@ -21,6 +21,8 @@ from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
 from stereoservo.messages.wire import MessageError
+from stereoservo.ports.devices import DriverError
+from stereoservo_drivers.detectors.dots import DotDetector
 
 Run = Callable[..., tuple[int, Any, str]]
 
@@ -390,3 +392,18 @@ def test_a_full_disk_behind_stderr_loses_a_remark_alone(monkeypatch: pytest.Monk
         output.note("the cell is up")
     with suppress(OSError):
         full.close()
+
+
+def test_warmup_of_a_cell_makes_its_detectors_too(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise DriverError("option", "no detector today")
+
+    monkeypatch.setenv("STEREOSERVO_RUNTIME_DIR", str(tmp_path / "r"))
+    monkeypatch.setenv("STEREOSERVO_STATE_DIR", str(tmp_path / "s"))
+    monkeypatch.setattr(DotDetector, "__init__", refused)
+    assert cli.invoke(["warmup", "hil-video", "--json"]) == 1
+    assert "no detector today" in json.loads(capfd.readouterr().out)["error"]["message"]
+    assert cli.invoke(["warmup", "nowhere", "--json"]) == 2
+    assert "hil-video" in capfd.readouterr().out

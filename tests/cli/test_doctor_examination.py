@@ -14,6 +14,7 @@ import pytest
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor import command
 from stereoservo.cli.doctor import joints as examination_module
+from stereoservo.cli.setup.commissioning import in_fault
 from stereoservo.daemon.cell_preparation import make_plan
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.plant_driver import make_driver
@@ -160,6 +161,15 @@ def test_a_driver_error_is_a_failed_check(doctor: Doctor, examination: Examinati
     assert code == 1
     assert checks[-1]["message"] == "no adapter at /dev/ttyACM0"
     assert checks[-1]["ok"] is False
+
+
+def test_a_fault_that_comes_up_while_the_arm_is_examined_is_one_that_setup_offers_to_reset(
+    doctor: Doctor, examination: Examination
+) -> None:
+    examination.error = DriverError("drive_fault", "node 1: RPDO timed out", latched=True)
+    _, checks = doctor()
+    assert checks[-1]["name"] == "fault"
+    assert in_fault([ExaminationFinding("drives", True, ""), ExaminationFinding(**checks[-1])]) is not None
 
 
 @pytest.fixture

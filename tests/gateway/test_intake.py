@@ -190,6 +190,24 @@ def test_a_plan_is_handed_on_and_not_kept_for_retries(bench: Bench) -> None:
     assert [reply.plan for _, reply in bench.replies.sent] == [plan, None]
 
 
+def test_goals_that_run_are_told_with_set_points_and_plan_until_they_end(bench: Bench) -> None:
+    plan = PlanReport("stereo", "straight", 2.5, (), (0.0, 1.0), {"j1": (0.0, 0.1)}, {})
+    bench.goal(Goal(ID, TaughtTarget("pick")), "bob")
+    assert bench.intake.running().goals == (), "it is not accepted yet"
+    bench.answer(1, True, "accepted", plan)
+    (running,) = bench.intake.running().goals
+    assert (running.goal.id, running.operator, running.plan) == (ID, "bob", plan)
+    assert running.goal.target == FeatureTarget(POINTS, 7), "what the taught goal was resolved to"
+    moved = FeatureTarget({"left": {k: (u + 1.0, v) for k, (u, v) in POINTS["left"].items()}})
+    bench.intake.goal_sample(Message(KEYS.goal("bob"), encode(UpdateGoal(ID, moved))))
+    bench.answer(2, True)
+    assert bench.intake.running().goals[0].goal.target == moved
+    bench.intake.core_event(Event(10, 10, "goal_started", id=ID))
+    assert bench.intake.running().goals
+    bench.intake.core_event(Event(11, 11, "goal_reached", id=ID))
+    assert bench.intake.running().goals == ()
+
+
 def test_goals_have_time_to_be_planned_and_commands_have_not(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,6 +121,9 @@ class Desk:
             return self.served([sys.executable, "-m", "stereoservo.cli.main", *words])
         if words[0] == "init":
             (self.folder / words[1]).rename(self.folder / "kept")
+        if words[0] == "setup":  # what a person would answer on the terminal
+            (self.folder / "answers.toml").write_text('calibrate = "yes"\ngo = "yes"\n', encoding="utf-8")
+            words += ["--answers", "answers.toml"]
         if "--rig" in words and not (self.folder / "pictures").exists():
             rendered_pictures(5, self.folder / "pictures", places=9)
         if "flight.mcap" in words and not (self.folder / "flight.mcap").exists():

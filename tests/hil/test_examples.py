@@ -157,7 +157,8 @@ def test_watch_writes_a_live_cell_for_rerun(client: Client, tmp_path: Path) -> N
     listed = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "print", str(file)], check=True, capture_output=True, text=True
     ).stdout
-    for entity in ("/joints/j1", "/command/j1", "/camera/left/markers", "/camera/right/markers", "/reasons"):
+    values = ("/joints", "/command", "/velocities", "/innovation_px")
+    for entity in (*values, "/camera/left/markers", "/camera/right/markers", "/reasons"):
         assert f" - {entity} " in listed
 
 

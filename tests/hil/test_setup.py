@@ -54,9 +54,9 @@ def _joint(name: str, key: str, value: str) -> tuple[str, str]:
 YES = {"move": "yes", "reset": "yes"}
 """A machine that stalls leaves a drive in the fault of its watch, which another case then finds."""
 MISTAKES = {
-    "wrong node id": Mistake("node 9 (j3): no answer", (_joint("j3", "node_id", "9"),)),
+    "wrong node id": Mistake("node 11 (j3): no answer", (_joint("j3", "node_id", "11"),)),
     "wrong bit rate": Mistake(
-        "nodes 1, 2, 3, 4, 5, 6 answer at 1000000", (("bitrate = 1000000", "bitrate = 500000"),)
+        "nodes 1, 2, 3, 4, 5, 6, 9 answer at 1000000", (("bitrate = 1000000", "bitrate = 500000"),)
     ),
     "duplicate id": Mistake("2 drives answer as node 2", drives=("duplicate 2 running", "duplicate 2 off")),
     "one camera twice": Mistake(
@@ -265,6 +265,7 @@ def test_a_scripted_person_gets_from_nothing_to_a_goal(
     answers = {
         "cameras": f"{server}/left.mjpg {server}/right.mjpg",
         "bus": f"stereoservo_slcan:{box.emulator.channel}",
+        "order": "1 2 3 4 5 6",
         "gear_ratio": "160 160 120 100 100 100",
         "velocity_units": "counts counts counts 60000 counts counts",
         "limits": "-50:50 20:140 -70:60 -60:120 -110:60 -120:60",

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from recording.bench_flight import record_bench
@@ -87,6 +88,27 @@ def test_a_goal_dragged_in_one_picture_is_reached(shared: DaemonProcess) -> None
         assert end["event"]["error_px"] < 0.5
         assert not page.ask("check", name="nobody")["ok"]
         page.close()
+
+
+@pytest.mark.process
+def test_the_goal_of_another_client_is_drawn_with_its_path_and_in_the_scene(client: Client) -> None:
+    with serving(CELL) as served:
+        page = Page(served["url"])
+        page.until(lambda message: message.get("scene"))
+        handle = client.goal("park", tolerance_px=0.5)
+        drawn = page.until(lambda message: message.get("goal", {}).get("id") == handle.id)["goal"]
+        handle.reached(60.0)
+        at_rest = page.until(lambda message: message.get("state", {}).get("goal") == "" and message["scene"])
+        page.close()
+    for camera, markers in drawn["set_points"].items():
+        for marker, pixel in markers.items():
+            assert at_rest["predicted"][camera][marker] == pytest.approx(pixel, abs=1.0)
+            assert drawn["plan"]["pixels"][camera][marker][-1] == pytest.approx(pixel, abs=1.0)
+    markers, cameras = np.array(at_rest["scene"]["markers"]), at_rest["scene"]["cameras"]
+    size = np.linalg.norm(np.array(cameras[0]["centre"]) - markers.mean(axis=0))
+    assert np.allclose(drawn["scene"], markers, atol=5e-3 * size), (
+        "in the scene it is where the arm then stands"
+    )
 
 
 @pytest.mark.process

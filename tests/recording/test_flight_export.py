@@ -75,6 +75,17 @@ def test_the_recording_is_in_it_bit_for_bit(exported: Exported) -> None:
     assert (result.identical, result.steps) == (True, STEPS)
 
 
+def test_the_recording_takes_no_more_room_in_it_than_by_itself(exported: Exported) -> None:
+    def own_bytes(file: Path) -> int:
+        with file.open("rb") as stream:
+            messages = make_reader(stream).iter_messages()
+            return sum(len(message.data) for schema, _, message in messages if schema is None)
+
+    assert own_bytes(exported.file) < 1.02 * own_bytes(exported.flight), (
+        "it is compressed as the recorder does"
+    )
+
+
 def test_every_message_is_valid_by_its_schema_and_at_the_wall_clocks_time(
     exported: Exported, messages: dict[str, list[tuple[int, Any]]]
 ) -> None:

@@ -87,6 +87,8 @@ def test_a_moment_is_what_was_recorded(shown: Shown) -> None:
         assert abs(image.astype(int) - step // 100 * 25).max() <= 1
         rows = sent["plots"]["plots"]["error"]
         assert rows[-1] == [pytest.approx(state["t_ns"] * 1e-9), state["error_px"]]
+        reasons = sent["plots"]["plots"]["reasons"]
+        assert reasons[-1] == [rows[-1][0], [reason["code"] for reason in state["reasons"]]]
 
 
 def test_the_goal_is_drawn_and_told_from_when_it_ran(shown: Shown) -> None:
@@ -97,6 +99,9 @@ def test_the_goal_is_drawn_and_told_from_when_it_ran(shown: Shown) -> None:
         assert after["goal"]["goal"]["set_points"][camera] == {str(m): list(p) for m, p in wanted.items()}
         ends = {m: way[-1] for m, way in after["goal"]["goal"]["plan"]["pixels"][camera].items()}
         assert all(np.allclose(ends[str(m)], p, atol=0.5) for m, p in wanted.items())
+    truth, plan = shown.bench.truth, after["goal"]["goal"]["plan"]
+    there = truth.points(np.array([way[-1] for way in plan["joints"].values()]))
+    assert np.allclose(after["goal"]["goal"]["scene"], there, atol=1e-6), "its markers, in the true frame"
     kinds = [event["event"]["kind"] for event in after["events"]["events"]]
     assert "goal_started" in kinds
     assert kinds == [e.kind for _, o in shown.bench.log[-STEPS:] for e in o.events if e.kind != "reply"]

@@ -363,6 +363,7 @@ class CanJointDriver:
                 axis=fault.axis,
                 value=fault.value,
                 limit=fault.limit,
+                latched=True,
             )
 
     def _wait(self, until: Callable[[], bool], limit_s: float) -> bool:

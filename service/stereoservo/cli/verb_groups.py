@@ -28,7 +28,7 @@ EXAMPLES: dict[str, str] = {
     "print-plate": "print-plate plate.pdf",
     "learn-corners": "learn-corners mycell.toml landmarks.npz --ask-to-move",
     "driver-check": "driver-check mycell.toml",
-    "warmup": "warmup",
+    "warmup": "warmup demo",
     "run": "run mycell.toml --commissioning",
     "status": "status mycell",
     "ls": "ls",

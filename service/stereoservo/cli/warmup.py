@@ -7,16 +7,31 @@ import subprocess
 import sys
 import time
 from importlib.util import find_spec
+from typing import Annotated
 
-from stereoservo.cli.output import CommandError, JsonOption, emit
+import typer
+
+from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
 from stereoservo.daemon.process_control import child_environment
+from stereoservo.messages.directories import cell_directories
 
 
-def warmup(json: JsonOption = False) -> None:
+def warmup(
+    cell: Annotated[
+        str,
+        typer.Argument(
+            metavar="[NAME|PATH]",
+            help="Also compile what the detectors of this cell need: a file, or the name of a shipped cell.",
+        ),
+    ] = "",
+    json: JsonOption = False,
+) -> None:
     """Compile the kernels of the loop, so that the first start is as fast as any other."""
     if find_spec("numba") is None:
         raise ModuleNotFoundError(name="numba")
     began = time.monotonic()
+    if cell:
+        _warm_up_detectors(cell)
     command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]
     done = subprocess.run(command, env=child_environment(), stdout=sys.stderr, check=False)
     if done.returncode != 0:
@@ -25,3 +40,16 @@ def warmup(json: JsonOption = False) -> None:
         )
     seconds = time.monotonic() - began
     emit({"seconds": seconds}, f"kernels are compiled ({seconds:.1f} s)", json)
+
+
+def _warm_up_detectors(cell: str) -> None:
+    """Make the drivers and detectors of a cell, which compiles what they are missing. Raises as `make_plan`."""
+    from stereoservo.daemon.cell_preparation import (  # not for --help: numerical libraries
+        PlanOptions,
+        make_plan,
+    )
+    from stereoservo.messages.cell_file import load_cell_file
+
+    path = shipped_or_path(cell).absolute()
+    directories = cell_directories(load_cell_file(path).cell.name)
+    make_plan(path, directories.runtime, directories.state, PlanOptions("warmup"))

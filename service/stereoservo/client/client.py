@@ -42,6 +42,8 @@ from stereoservo.messages.wire import (
     FeaturesMessage,
     Record,
     Reply,
+    RunningGoal,
+    RunningGoals,
     StateMessage,
     Synthesise,
     decode,
@@ -68,6 +70,10 @@ class Client(Connection):
     def info(self) -> CellInfo:
         """Joints, cameras, laws, model and taught goals."""
         return self.fetch(self.keys.info, CellInfo)
+
+    def running_goals(self) -> tuple[RunningGoal, ...]:
+        """Goals of all operators that were accepted and have not ended, with set-points and plans, the oldest first."""
+        return self.fetch(self.keys.goals, RunningGoals).goals
 
     def schema(self, name: str) -> bytes:
         """The JSON Schema of a message."""

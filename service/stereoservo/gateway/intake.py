@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from stereoservo.client.goal_handle import TERMINAL
 from stereoservo.core.cycle import Event
 from stereoservo.gateway.boundary import Boundary, RateLimit
 from stereoservo.gateway.point_alignment import TransferError
@@ -35,7 +36,7 @@ from stereoservo.messages.goals import (
     UpdateGoal,
 )
 from stereoservo.messages.keys import KeySpace
-from stereoservo.messages.wire import Reply, decode, decode_command, encode
+from stereoservo.messages.wire import Reply, RunningGoal, RunningGoals, decode, decode_command, encode
 
 REPLY_TIMEOUT_S = 1.0
 PLANNED_REPLY_TIMEOUT_S = 5.0
@@ -87,6 +88,7 @@ class Intake:
         self.boundary = Boundary(boot)
         self._pending: dict[int, _Pending] = {}
         self._goals: OrderedDict[str, Reply] = OrderedDict()
+        self._running: OrderedDict[str, RunningGoal] = OrderedDict()
         self._note = ""
         self._stream_limit = RateLimit(1)
         self._put_limit = RateLimit(REPORTED_AT_ONCE)
@@ -209,9 +211,26 @@ class Intake:
                 while len(self._goals) > KNOWN_GOALS:
                     self._goals.popitem(last=False)
                 if reply.accepted:
+                    self._running[goal.id] = RunningGoal(goal, pending.operator, event.plan)
+                    while len(self._running) > KNOWN_GOALS:
+                        self._running.popitem(last=False)
                     self._log.add_core(event, "goal_accepted", pending.operator)
-        streamed = pending.query is None and isinstance(pending.command, UpdateGoal)
+        moved = pending.command
+        if isinstance(moved, UpdateGoal) and reply.accepted and moved.id in self._running:
+            before = self._running[moved.id]
+            goal = msgspec.structs.replace(before.goal, target=moved.target)
+            self._running[moved.id] = msgspec.structs.replace(before, goal=goal)
+        streamed = pending.query is None and isinstance(moved, UpdateGoal)
         self._answer(pending.query, reply, pending.operator, streamed)
+
+    def core_event(self, event: Event) -> None:
+        """Handle an event of the core: a goal that ended runs no longer."""
+        if event.kind in TERMINAL:
+            self._running.pop(event.id, None)
+
+    def running(self) -> RunningGoals:
+        """Goals that this gateway saw accepted and that have not ended."""
+        return RunningGoals(tuple(self._running.values()))
 
     def expire(self) -> None:
         """Reply to requests that the core left unanswered."""

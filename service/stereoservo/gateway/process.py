@@ -206,6 +206,7 @@ class Gateway:
         self._info_queries = session.declare_queryable(keys.info, RingChannel(32))
         self._schema_queries = session.declare_queryable(keys.any_schema, RingChannel(32))
         self._model_queries = session.declare_queryable(keys.model, RingChannel(32))
+        self._running_queries = session.declare_queryable(keys.goals, RingChannel(32))
         self._sources: tuple[tuple[Any, Callable[[Any], None]], ...] = (
             (self._goal_puts, self._intake.goal_sample),
             (self._goal_queries, self._intake.goal_query),
@@ -223,6 +224,10 @@ class Gateway:
             (self._schema_queries, partial(self._answer, work=self._schema)),
             (self._any_command_queries, self._answer_wrong_key),
             (self._model_queries, partial(self._answer, work=self._model, key=self.keys.model)),
+            (
+                self._running_queries,
+                partial(self._answer, work=lambda _: encode(self._intake.running()), key=self.keys.goals),
+            ),
         )
         self._alive = session.liveliness().declare_token(keys.alive)
 
@@ -386,6 +391,7 @@ class Gateway:
             self._intake.core_reply(event)
         if event.kind in SILENT:
             return
+        self._intake.core_event(event)
         # A restarted gateway is sent the servo process's events again.
         fresh = not self._handled.is_acted_on(event)
         self._repeated = self._handled.is_journaled(event)

@@ -49,6 +49,7 @@ class KeySpace:
         self.event = f"{self.prefix}/event"
         self.info = f"{self.prefix}/info"
         self.model = f"{self.prefix}/model"
+        self.goals = f"{self.prefix}/goals"
         self.alive = f"{self.prefix}/alive"
         self.stop = f"{self.prefix}/command/stop"
         self.any_goal = f"{self.prefix}/goal/*"

@@ -329,8 +329,25 @@ class Reply(msgspec.Struct, frozen=True):
     plan: PlanReport | None = None
 
 
+class RunningGoal(msgspec.Struct, frozen=True):
+    """A goal that was accepted and has not ended, of this ``operator``: taught ones as the set-points that they were
+    resolved to, moved ones (``update``) as they were sent. ``plan``: as the reply to it had it.
+    """
+
+    goal: Goal
+    operator: str = ""
+    plan: PlanReport | None = None
+
+
+class RunningGoals(msgspec.Struct, frozen=True):
+    """Reply to ``get …/goals``: goals that were accepted and have not ended, the oldest first."""
+
+    goals: tuple[RunningGoal, ...] = ()
+
+
 SCHEMAS: dict[str, Any] = {
     "goal": Goal,
+    "goals": RunningGoals,
     "state": StateMessage,
     "event": EventMessage,
     "events": EventList,

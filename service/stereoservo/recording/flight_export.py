@@ -21,7 +21,8 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import RunGoal
 from stereoservo.messages.recording_request import images_directory
 from stereoservo.ports.image_files import ImageReader
-from stereoservo.recording.flight_recorder import FORMAT
+from stereoservo.recording.compression import Checkpoints, StepBlocks
+from stereoservo.recording.flight_recorder import FORMAT, TOPICS
 from stereoservo.recording.foxglove_channels import (
     MetricScene,
     Published,
@@ -46,6 +47,8 @@ from stereoservo.recording.step_layout import decode_step
 STATE_EVERY_NS = 50_000_000
 SCENE_EVERY_NS = 200_000_000
 JPEG_QUALITY = 80
+BLOCK_STEPS = 100
+"""In a compressed block, as in 0.4 s of a loop of 250 Hz."""
 
 
 @dataclass
@@ -130,7 +133,7 @@ class _File:
     def copy(self, topic: str, data: bytes, t_ns: int) -> None:
         """A message of the recording, as it is."""
         if topic not in self._channels:
-            self._channels[topic] = self._writer.register_channel(topic, "msgpack", 0)
+            self._channels[topic] = self._writer.register_channel(topic, TOPICS[topic], 0)
         self._add(topic, data, t_ns)
 
     def publish(self, message: Published) -> None:
@@ -214,11 +217,25 @@ def _fill(file: _File, source: Path, target: Path) -> ExportResult:
 
 
 def _copy(file: _File, source: Path, t_ns: int, shift_ns: int) -> None:
-    """The recording's own messages, at the wall clock's time of the step that they belong to."""
+    """The recording's own messages, compressed as it has them, at the wall clock's time of the step they belong to."""
+    blocks, checkpoints, held, held_ns = StepBlocks(), Checkpoints(), list[bytes](), t_ns
     for topic, data in whole_messages(source):
         if topic == "step":
             t_ns = decode_step(data).inputs.now_ns + shift_ns
-        file.copy(topic, data, t_ns)
+            held_ns = held_ns if held else t_ns
+            held.append(data)
+            if len(held) < BLOCK_STEPS:
+                continue
+        if held:
+            file.copy("steps", blocks.compress(held), held_ns)
+            held = []
+        if topic == "checkpoint":
+            blocks.begin()
+            file.copy("state", checkpoints.compress(data), t_ns)
+        elif topic != "step":
+            file.copy(topic, data, t_ns)
+    if held:
+        file.copy("steps", blocks.compress(held), held_ns)
 
 
 def _add_pictures(file: _File, video: Path, shift_ns: int) -> None:

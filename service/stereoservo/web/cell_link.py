@@ -72,6 +72,7 @@ class CellLink:
         self._epoch = -1
         self._seen: dict[str, FeaturesMessage] = {}
         self._state: StateMessage | None = None
+        self._goal = ""
         self._leases = Leases(lambda: self._client)
         self._why = ""
         self.watched = threading.Event()
@@ -116,7 +117,7 @@ class CellLink:
 
     def _read(self, client: Client) -> None:
         """Publish what ``client`` receives, until the daemon goes away. Raises ClientError."""
-        self._epoch = -1
+        self._epoch, self._goal = -1, ""
         self._tell_info(client)
         self._tell("link", {"up": True, "why": ""})
         prefix = client.keys.prefix
@@ -156,6 +157,8 @@ class CellLink:
         if state.model_epoch != self._epoch:
             self._load_model(client, state.model_epoch)
         self._tell("state", {"state": msgspec.Raw(data), **self.view.at(state)}, keep=True)
+        if state.goal != self._goal:
+            self._tell_goal(client, state.goal)
 
     def _load_model(self, client: Client, epoch: int) -> None:
         self._epoch = epoch
@@ -182,6 +185,18 @@ class CellLink:
             at = time.strftime("%H:%M:%S", time.localtime(event.t_wall))
             self._log(f"{at} {event.kind} {event.id}: {why(event)}")
         self._tell("", {"event": event})
+
+    def _tell_goal(self, client: Client, goal: str) -> None:
+        """Publish what is drawn of a ``goal`` that has begun, whoever sent it."""
+        self._goal = goal
+        try:
+            running = client.running_goals() if goal else ()
+        except ClientError as error:  # such as of a daemon that is older
+            self._tell("", {"notice": f"goal {goal} cannot be drawn: {error}", "t_wall": time.time()})
+            return
+        for one in running:
+            if one.goal.id == goal:
+                self._tell("goal", self.view.goal(one.goal, one.plan), keep=True)
 
     def _take_picture(self, sample: Any) -> None:
         if sample.attachment is None:  # no picture of a camera process

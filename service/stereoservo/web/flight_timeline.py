@@ -29,12 +29,11 @@ from stereoservo.ports.devices import CameraObservation, Frame
 from stereoservo.ports.image_files import ImageFileError, ImageReader
 from stereoservo.recording.replay import RecordedSpan, RecordingError, replay
 from stereoservo.web.cell_link import picture_message
-from stereoservo.web.model_view import ModelView, goal_message
+from stereoservo.web.model_view import ModelView, no_goal
 
 STATE_EVERY_NS = 50_000_000
 PLOT_NS = 60_000_000_000
 """What the plots show of the past."""
-NO_GOAL = msgspec.json.encode({"goal": {"id": "", "plan": None, "set_points": {}}})
 
 
 class Timeline:
@@ -47,6 +46,7 @@ class Timeline:
         self._places: dict[str, list[tuple[int, int]]] = {}
         self._end = 0
         self._rows: list[tuple[float | None, ...]] = []
+        self._reasons: list[tuple[float, tuple[str, ...]]] = []
         self.read_ns = 0
         """Up to here the recording was read."""
 
@@ -59,10 +59,13 @@ class Timeline:
             self._places.setdefault(slot, []).append((self._end, len(data)))
             self._end += len(data)
 
-    def add_row(self, t_ns: int, error: float | None, late_us: float, velocities: list[float]) -> None:
-        """Append what is plotted of one state."""
+    def add_row(
+        self, t_ns: int, error: float | None, late_us: float, velocities: list[float], codes: tuple[str, ...]
+    ) -> None:
+        """Append what is plotted of one state; ``codes``: of its reasons."""
         with self._lock:
             self._rows.append((t_ns * 1e-9, error, late_us, *velocities))
+            self._reasons.append((t_ns * 1e-9, codes))
 
     @property
     def slots(self) -> tuple[str, ...]:
@@ -81,15 +84,17 @@ class Timeline:
             begin, size = self._places[slot][number]
         return os.pread(self._file.fileno(), size, begin)
 
-    def plots(self, t_ns: int) -> dict[str, list[tuple[float | None, ...]]]:
+    def plots(self, t_ns: int) -> dict[str, list[Any]]:
         """Rows of the page's plots, each with its time [s], of the minute before ``t_ns``."""
         with self._lock:
             begin = bisect_left(self._rows, (t_ns - PLOT_NS) * 1e-9, key=_time_of)
-            rows = self._rows[begin : bisect_right(self._rows, t_ns * 1e-9, key=_time_of)]
+            end = bisect_right(self._rows, t_ns * 1e-9, key=_time_of)
+            rows, reasons = self._rows[begin:end], self._reasons[begin:end]
         return {
             "error": [row[:2] for row in rows],
             "velocity": [(row[0], *row[3:]) for row in rows],
             "loop": [(row[0], row[2]) for row in rows],
+            "reasons": reasons,
         }
 
 
@@ -151,7 +156,7 @@ class FlightReader:
             {"cell": {"cell": {"name": settings.cell}}, "boot": "", "joints": {"joints": joints}}, RunRecord
         )
         self._tell("info", self._span.first_ns, {"info": self._info})
-        self._timeline.add("goal", self._span.first_ns, NO_GOAL)
+        self._tell("goal", self._span.first_ns, no_goal())
 
     def _take(self, inputs: StepInputs, outputs: StepOutputs) -> None:
         if self.ended.is_set():
@@ -198,7 +203,7 @@ class FlightReader:
             elif event.kind in TERMINAL:
                 self._goals.pop(event.id, None)
         if outputs.status.goal == told and told in self._goals:
-            self._tell("goal", inputs.now_ns, goal_message(*self._goals[told]))
+            self._tell("goal", inputs.now_ns, self._view.goal(*self._goals[told]))
 
     def _event(self, event: Event) -> EventMessage:
         t_wall = (event.t_ns + self._span.shift_ns) * 1e-9
@@ -239,7 +244,8 @@ class FlightReader:
             t_wall=(status.t_ns + self._span.shift_ns) * 1e-9,
         )
         self._tell("state", inputs.now_ns, {"state": message, **self._view.at(message)})
-        self._timeline.add_row(inputs.now_ns, message.error_px, p99, list(message.velocities.values()))
+        codes = tuple(reason.code for reason in status.reasons)
+        self._timeline.add_row(inputs.now_ns, message.error_px, p99, list(message.velocities.values()), codes)
 
     def _tell(self, slot: str, t_ns: int, tree: dict[str, Any]) -> None:
         self._timeline.add(slot, t_ns, msgspec.json.encode(tree))

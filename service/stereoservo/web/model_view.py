@@ -39,6 +39,16 @@ class ModelView:
             "scene": None if self.scene is None else self.scene.at(joints),
         }
 
+    def goal(self, goal: Goal, plan: PlanReport | None) -> dict[str, Any]:
+        """What a page draws of a goal that runs: its plan, its set-points where it states pixels, and in the ``scene``
+        the markers (m, 3) where the plan ends, else None.
+        """
+        points = None
+        if self.scene is not None and plan is not None and len(plan.joints) == len(self.scene.chain.kinds):
+            points = self.scene.markers(np.array([way[-1] for way in plan.joints.values()])).tolist()
+        stated = getattr(goal.target, "set_points", {})
+        return {"goal": {"id": goal.id, "plan": plan, "set_points": stated, "scene": points}}
+
 
 def by_camera(model: DragModel, pixels: FloatArray) -> dict[str, dict[int, list[float]]]:
     """Pixels (c, m, 2) by camera and marker; those that are not there are left out."""
@@ -66,6 +76,6 @@ def drag_answer(model: DragModel, joints: FloatArray, camera: str, left_px: floa
     }
 
 
-def goal_message(goal: Goal, plan: PlanReport | None) -> dict[str, Any]:
-    """What a page draws of a goal that runs: its plan, and its set-points where it states pixels."""
-    return {"goal": {"id": goal.id, "plan": plan, "set_points": getattr(goal.target, "set_points", {})}}
+def no_goal() -> dict[str, Any]:
+    """What a page draws while no goal runs."""
+    return {"goal": {"id": "", "plan": None, "set_points": {}, "scene": None}}

@@ -37,10 +37,15 @@ class Scene:
         ]
         return cls(ProjectiveChain(parts.kinds, parts.generators, parts.zero), parts.points, cameras)
 
+    def markers(self, joints: FloatArray) -> FloatArray:
+        """Markers (m, 3) at ``joints`` (n,)."""
+        points = self.points @ self.chain.displacement(joints).T
+        found: FloatArray = points[:, :3] / points[:, 3:]
+        return found
+
     def at(self, joints: FloatArray) -> dict[str, Any]:
         """Axes (a point near the markers, a direction), markers and cameras at ``joints`` (n,)."""
-        markers = self.points @ self.chain.displacement(joints).T
-        markers = markers[:, :3] / markers[:, 3:]
+        markers = self.markers(joints)
         axes = joint_axes(self.chain.kinds, self.chain.operators_at(joints))
         middle = markers.mean(axis=0)
         origins = np.where(np.isfinite(axes.points), axes.points, middle)

@@ -33,7 +33,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web import requests as ask
 from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, refusal
 from stereoservo.web.leases import LEASE_S
-from stereoservo.web.model_view import ModelView, drag_answer, goal_message
+from stereoservo.web.model_view import ModelView, drag_answer
 from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
 
 FILES = {
@@ -418,7 +418,6 @@ class PageServer:
 
     def _send_goal(self, goal: Goal) -> dict[str, Any]:
         reply = self._cell_link.send(goal)
-        self._publish("goal", msgspec.json.encode(goal_message(goal, reply.plan)), True)
         return _told(reply) | {"id": goal.id}
 
 

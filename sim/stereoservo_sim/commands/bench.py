@@ -101,6 +101,12 @@ def _startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
     return run_startup(repetitions, seed, progress)
 
 
+def _watch(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.live_loop.watch import run_watch
+
+    return run_watch(repetitions, seed, progress)
+
+
 def _wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.wire import run_wire
 
@@ -122,6 +128,7 @@ BENCHES: dict[str, Bench] = {
     "soak": _soak,
     "soak-live": _soak_live,
     "startup": _startup,
+    "watch": _watch,
     "wire": _wire,
 }
 """By the name given on the command line."""
@@ -134,8 +141,8 @@ def bench(
         typer.Option(
             min=1,
             help="Timed fits of `calibration`, trials of each of `faults`, ten of `kills`, two virtual minutes of "
-            "`soak`, two real ones of `soak-live`, commands of `startup`, segments of `idle`, pairs of them of `loop` "
-            "and `page`; the others take a multiple.",
+            "`soak`, two real ones of `soak-live`, commands of `startup`, segments of `idle`, pairs of them of `loop`, "
+            "`page` and `watch`; the others take a multiple.",
         ),
     ] = 7,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,

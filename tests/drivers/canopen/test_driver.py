@@ -197,8 +197,9 @@ def test_a_drive_that_is_in_fault_at_the_start(arm: Arm) -> None:
     arm.server.order("sticky 1 0x4310")
     driver = arm.driver
     driver.configure()
-    with pytest.raises(DriverError, match="0x4310"):
+    with pytest.raises(DriverError, match="0x4310") as told:
         driver.read_state()
+    assert told.value.data["latched"], "a reset ends it, and nothing else"
     assert np.isfinite(driver.read_state().positions).all()
     with pytest.raises(DriverError):
         driver.activate()

@@ -128,6 +128,7 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "soak",
         "soak-live",
         "startup",
+        "watch",
         "wire",
     ]
     assert "wheels" in error["message"]

@@ -71,5 +71,5 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFind
                 yield from driver.examine(may_move)
             else:
                 yield from examine_samples(plan, driver, clock)
-        except DriverError as error:
-            yield ExaminationFinding("drives", False, str(error))
+        except DriverError as error:  # `latched`: a fault that came up meanwhile, and only a reset ends
+            yield ExaminationFinding("fault" if error.data.get("latched") else "drives", False, str(error))

@@ -174,10 +174,16 @@ def _joints(dialogue: Dialogue, scan: BusScan) -> list[JointChoice]:
     drives = {drive.address: drive for drive in scan.drives}
     order = dialogue.ask(
         "order",
-        "Node ids of the joints, base first; with a p behind that of a slide (prismatic joint)",
+        "Node ids of the joints, base first, grippers left out; with a p behind that of a slide (prismatic joint)",
         " ".join(str(address) for address in sorted(drives)),
         lambda text: chosen_order(text, drives),
     )
+    left_out = sorted(set(drives) - {drive.address for drive, _ in order})
+    if left_out:
+        dialogue.say(
+            f"   no joints: nodes {', '.join(map(str, left_out))}; a gripper on a drive of its own is a section "
+            "[[joints.options.gripper]] of the cell file, to be added once it is written"
+        )
     n = len(order)
     told = [drive.options.get("counts_per_rev") for drive, _ in order]
     counts = dialogue.ask(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from stereoservo.cli.watch.rerun_viewer import RerunViewer
 
 STATE_EVERY_S = 1.0
+MARKERS_EVERY_NS = 60_000_000
+"""Of a camera, for viewers: what an eye follows; each frame at 30 Hz would double what `watch` takes of a core."""
 
 
 def watch(
@@ -49,12 +51,14 @@ def watch(
         viewers = _viewers(client.cell, port if foxglove else None, rerun, save, opened)
         until = time.monotonic() + seconds
         last_state = 0.0
+        thinned = Thinned()
         for message in client.watch(features=features or bool(viewers)):
             now = time.monotonic()
             if now > until:
                 return
-            for viewer in viewers:
-                viewer.show(message)
+            if viewers and thinned.shows(message):
+                for viewer in viewers:
+                    viewer.show(message)
             if isinstance(message, FeaturesMessage) and not features:
                 continue
             if isinstance(message, StateMessage) and not json:
@@ -63,6 +67,23 @@ def watch(
                 last_state = now
             kind = type(message).__name__.removesuffix("Message").lower()
             emit({"kind": kind, kind: message}, _line(message), json)
+
+
+class Thinned:
+    """Of each camera's markers those that viewers are shown: none sooner than ``MARKERS_EVERY_NS`` after the last."""
+
+    def __init__(self) -> None:
+        self._shown_ns: dict[str, int] = {}
+
+    def shows(self, message: StateMessage | EventMessage | FeaturesMessage) -> bool:
+        """Whether a message is to be shown, the next one of its kind in order of time."""
+        if not isinstance(message, FeaturesMessage):
+            return True
+        last_ns = self._shown_ns.get(message.camera)
+        if last_ns is not None and 0 <= message.t_shutter_ns - last_ns < MARKERS_EVERY_NS:
+            return False
+        self._shown_ns[message.camera] = message.t_shutter_ns
+        return True
 
 
 def _viewers(

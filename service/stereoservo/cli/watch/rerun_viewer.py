@@ -10,6 +10,10 @@ import rerun
 
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
+SEND_S = 0.25
+"""Messages are handed over in columns so often: one by one, each wakes the threads of the library."""
+SERIES = ("joints", "velocities", "command", "innovation_px")
+
 
 class RerunViewer:
     """Shows messages of a ``cell`` in a viewer that is started, or writes them into ``file`` (*.rrd)."""
@@ -21,40 +25,73 @@ class RerunViewer:
         else:
             self._stream.save(file)
         self._codes: tuple[str, ...] | None = None
+        self._names: dict[str, list[str]] = {}
+        self._series: dict[str, list[tuple[float, list[float]]]] = {}
+        self._frames: dict[str, list[FeaturesMessage]] = {}
+        self._sent_s = 0.0
 
     def show(self, message: StateMessage | EventMessage | FeaturesMessage) -> None:
-        """Log a message of the cell."""
-        stream = self._stream
-        stream.set_time("wall", timestamp=message.t_wall)
+        """Log a message of the cell, at the latest ``SEND_S`` after it."""
         if isinstance(message, EventMessage):
-            stream.log("log", rerun.TextLog(f"{message.kind}: {message.message}"))
+            self._log_text("log", message.t_wall, f"{message.kind}: {message.message}")
         elif isinstance(message, FeaturesMessage):
-            labels = [str(marker) for marker in message.ids]
-            stream.log(
-                f"camera/{message.camera}/markers", rerun.Points2D(list(message.pixels), labels=labels)
-            )
+            self._frames.setdefault(message.camera, []).append(message)
         else:
-            self._show_state(message)
+            self._take_state(message)
+        if not 0.0 <= message.t_wall - self._sent_s < SEND_S:
+            self._sent_s = message.t_wall
+            self._send()
 
-    def _show_state(self, state: StateMessage) -> None:
-        for entity, values in (
-            ("joints", state.joints),
-            ("velocities", state.velocities),
-            ("command", state.command),
-            ("innovation_px", state.innovation_px),
-        ):
-            for name, value in values.items():
-                self._stream.log(f"{entity}/{name}", rerun.Scalars(value))
+    def _take_state(self, state: StateMessage) -> None:
+        for entity in SERIES:
+            self._add_series(entity, state.t_wall, getattr(state, entity))
         if state.error_px is not None:
-            self._stream.log("error_px", rerun.Scalars(state.error_px))
+            self._add_series("error_px", state.t_wall, {"error": state.error_px})
         codes = tuple(reason.code for reason in state.reasons)
         if codes != self._codes:
             self._codes = codes
             text = "; ".join(f"{reason.code}: {reason.hint}" for reason in state.reasons)
-            self._stream.log("reasons", rerun.TextLog(text or "none"))
+            self._log_text("reasons", state.t_wall, text or "none")
+
+    def _add_series(self, entity: str, t_wall: float, values: dict[str, float]) -> None:
+        names = list(values)
+        if not names:
+            return
+        if self._names.get(entity) != names:
+            self._send()  # what is held has the names of before
+            self._names[entity] = names
+            self._stream.log(entity, rerun.SeriesLines(names=names), static=True)
+        self._series.setdefault(entity, []).append((t_wall, list(values.values())))
+
+    def _log_text(self, entity: str, t_wall: float, text: str) -> None:
+        self._stream.set_time("wall", timestamp=t_wall)
+        self._stream.log(entity, rerun.TextLog(text))
+
+    def _send(self) -> None:
+        """Hand over series and markers that are held."""
+        series, self._series = self._series, {}
+        for entity, rows in series.items():
+            scalars = rerun.Scalars.columns(scalars=[value for _, values in rows for value in values])
+            self._stream.send_columns(
+                entity,
+                [rerun.TimeColumn("wall", timestamp=[t_wall for t_wall, _ in rows])],
+                scalars.partition([len(values) for _, values in rows]),
+            )
+        frames, self._frames = self._frames, {}
+        for camera, seen in frames.items():
+            points = rerun.Points2D.columns(
+                positions=[pixel for frame in seen for pixel in frame.pixels],
+                labels=[str(marker) for frame in seen for marker in frame.ids],
+            )
+            self._stream.send_columns(
+                f"camera/{camera}/markers",
+                [rerun.TimeColumn("wall", timestamp=[frame.t_wall for frame in seen])],
+                points.partition([len(frame.ids) for frame in seen]),
+            )
 
     def close(self) -> None:
         """Hand over what is not shown yet."""
+        self._send()
         self._stream.flush()
 
     def __enter__(self) -> Self:

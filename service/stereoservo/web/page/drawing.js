@@ -120,8 +120,29 @@ export function drawPlot(canvas, history, names, logarithmic) {
   });
 }
 
-export function drawScene(canvas, scene, turn) {
-  // An orthographic view of axes, markers and cameras, turned by turn = [yaw, pitch]; the model has no metres.
+export function drawReasons(canvas, history) {
+  // history: [seconds, codes] rows; a bar for each code while it was given, over the last 60 s.
+  const [ctx, w, h] = fitted(canvas);
+  const end = history.length ? history[history.length - 1][0] : 0;
+  const shown = history.filter((row) => row[0] > end - 60);
+  const codes = [...new Set(shown.flatMap((row) => row[1]))];
+  ctx.fillStyle = getComputedStyle(canvas).getPropertyValue("--faint"); ctx.font = "11px system-ui, sans-serif";
+  if (!codes.length) { ctx.fillText("none", 4, 14); return; }
+  const step = Math.min(16, h / codes.length), x = (t) => ((t - end + 60) / 60) * w;
+  codes.forEach((code, k) => {
+    ctx.fillStyle = COLOURS[k % COLOURS.length] + "66";
+    shown.forEach(([t, given], i) => {
+      const next = shown[i + 1]?.[0] ?? t + 0.05;
+      if (given.includes(code)) ctx.fillRect(x(t), k * step + 1, Math.max(1, x(Math.min(next, t + 1)) - x(t)), step - 2);
+    });
+    ctx.fillStyle = getComputedStyle(canvas).getPropertyValue("--ink");
+    ctx.fillText(code, 4, (k + 0.5) * step + 4);
+  });
+}
+
+export function drawScene(canvas, scene, goal, turn) {
+  // An orthographic view of axes, markers, cameras and the goal's markers (or null), turned by turn = [yaw, pitch]; the
+  // model has no metres.
   const [ctx, w, h] = fitted(canvas);
   const centre = [0, 1, 2].map((i) => scene.markers.reduce((s, m) => s + m[i], 0) / scene.markers.length);
   const [cy, sy, cp, sp] = [Math.cos(turn[0]), Math.sin(turn[0]), Math.cos(turn[1]), Math.sin(turn[1])];
@@ -141,6 +162,8 @@ export function drawScene(canvas, scene, turn) {
     const [u, v] = at(along(p, d, 0.13));
     ctx.fillText(String(k + 1), u, v);
   });
+  ctx.fillStyle = SET_POINT;
+  for (const m of goal ?? []) { const [u, v] = at(m); ctx.fillRect(u - 3, v - 0.5, 7, 1.5); ctx.fillRect(u - 0.5, v - 3, 1.5, 7); }
   ctx.fillStyle = MARKER;
   for (const m of scene.markers) { const [u, v] = at(m); ctx.fillRect(u - 2, v - 2, 4, 4); }
   ctx.fillStyle = getComputedStyle(canvas).getPropertyValue("--ink");

@@ -1,18 +1,18 @@
 // The operators' page: what the cell publishes comes over one WebSocket, and what the page asks goes back over it. What
 // a page may do is decided on the server; the buttons only show it.
 
-import { drawPicture, drawPlot, drawScene, hull, inside } from "/drawing.js";
+import { drawPicture, drawPlot, drawReasons, drawScene, hull, inside } from "/drawing.js";
 
 const $ = (id) => document.getElementById(id);
 const views = new Map();
-const history = { error: [], velocity: [], loop: [] };
+const history = { error: [], velocity: [], loop: [], reasons: [] };
 const answers = new Map();
 const stats = (window.stats = { pictures: 0, latencies: [], answers: [], events: [] });
 stats.middle = (camera) => {
   const pixels = views.get(camera)?.predicted ?? [];
   return pixels.length ? [0, 1].map((i) => pixels.reduce((sum, p) => sum + p[i], 0) / pixels.length) : null;
 };
-let socket, number = 0, rights = {}, state, scene, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null, flight = null, arrived = 0, sought = null;
+let socket, number = 0, rights = {}, state, scene, sceneGoal = null, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null, flight = null, arrived = 0, sought = null;
 let drawDue = false;
 
 function view(camera) {
@@ -158,6 +158,7 @@ function showState({ state: s, predicted, scene: shape }) {
   history.error.push([t, s.error_px]);
   history.velocity.push([t, ...Object.values(s.velocities)]);
   history.loop.push([t, s.loop.lateness_us.p99 ?? null]);
+  history.reasons.push([t, s.reasons.map((r) => r.code)]);
   for (const rows of Object.values(history)) if (rows.length > 1300) rows.splice(0, rows.length - 1300);
   for (const [camera, markers] of Object.entries(predicted)) {
     const v = view(camera);
@@ -244,7 +245,8 @@ async function seek() {
   sought = null;
 }
 
-function showGoal({ id, plan, set_points: stated }) {
+function showGoal({ id, plan, set_points: stated, scene: markers }) {
+  sceneGoal = markers;
   if (!id) $("plan").textContent = "";
   else showPlan(plan, `goal ${id.slice(0, 8)}`);
   for (const v of views.values()) {
@@ -369,7 +371,8 @@ setInterval(() => {
   drawPlot($("plot-error"), history.error, ["error"], true);
   drawPlot($("plot-velocity"), history.velocity, joints, false);
   drawPlot($("plot-loop"), history.loop, ["lateness"], false);
+  drawReasons($("plot-reasons"), history.reasons);
   $("scene-box").hidden = !scene;
-  if (scene) drawScene($("scene"), scene, turn);
+  if (scene) drawScene($("scene"), scene, sceneGoal, turn);
 }, 250);
 connect();

@@ -73,19 +73,25 @@ def _cell_text() -> str:
 
 def _segment(processes: dict[str, int]) -> dict[str, tuple[float, float]]:
     """Per cent of a core and runs a second, by process."""
-    began_s, before = time.monotonic(), {name: _spent(number) for name, number in processes.items()}
+    began_s, before = time.monotonic(), {name: spent_by(number) for name, number in processes.items()}
     time.sleep(SEGMENT_S)
-    took_s, after = time.monotonic() - began_s, {name: _spent(number) for name, number in processes.items()}
+    took_s, after = time.monotonic() - began_s, {name: spent_by(number) for name, number in processes.items()}
     return {
         name: (
-            1e-7 * (after[name].processor_ns - before[name].processor_ns) / took_s,
+            processor_share(before[name], after[name], took_s),
             (after[name].runs - before[name].runs) / took_s,
         )
         for name in processes
     }
 
 
-def _spent(process: int) -> Spent:
+def processor_share(before: Spent, after: Spent, took_s: float) -> float:
+    """Per cent of a core between two moments of a process."""
+    return 1e-7 * (after.processor_ns - before.processor_ns) / took_s
+
+
+def spent_by(process: int) -> Spent:
+    """What a process has taken since its start."""
     threads = [path.read_text().split() for path in Path(f"/proc/{process}/task").glob("*/schedstat")]
     return Spent(sum(int(thread[0]) for thread in threads), sum(int(thread[2]) for thread in threads))
 

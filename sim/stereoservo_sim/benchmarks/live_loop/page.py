@@ -75,8 +75,8 @@ def run_page(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
         "rate_hz": RATE_HZ,
         "scheduler": cell.scheduler,
         "segments": repetitions,
-        **{name: _quantiles(late[shown]) for name, shown in (("pages", True), ("none", False))},
-        "ratio": _ratios(late[True], late[False], draws),
+        **{name: quantiles(late[shown]) for name, shown in (("pages", True), ("none", False))},
+        "ratio": ratios(late[True], late[False], draws),
         "first_picture_s": round(first, 2),
         "pictures": len(ages),
         "picture_ms": {
@@ -94,12 +94,13 @@ def _levels(segments: list[IntArray]) -> FloatArray:
     return found
 
 
-def _quantiles(segments: list[IntArray]) -> dict[str, float | int]:
+def quantiles(segments: list[IntArray]) -> dict[str, float | int]:
+    """Cycles, median and p99 [us] of all segments."""
     p50, p99 = _levels(segments).tolist()
     return {"cycles": sum(map(len, segments)), "p50_us": round(p50, 1), "p99_us": round(p99, 1)}
 
 
-def _ratios(pages: list[IntArray], none: list[IntArray], draws: np.random.Generator) -> dict[str, Any]:
+def ratios(pages: list[IntArray], none: list[IntArray], draws: np.random.Generator) -> dict[str, Any]:
     """Ratios of the quantiles with pages to those without, and their intervals: whole pairs are drawn again."""
     resampled = []
     for _ in range(RESAMPLES):
