@@ -320,8 +320,8 @@ def _body_moves(cell: CellFile) -> bool:
         raise CellFileError(
             cell.cell.name,
             "scene.moves",
-            "the cameras stand, and the body that they see is carried by the arm; a target that moves beside it is named "
-            "by the goal that follows it (--follow-markers)",
+            "the cameras stand, and the body that they see is carried by the arm; a target that moves beside it is "
+            "named by the goal that follows it (--follow-markers)",
         )
     return cell.scene.moves
 

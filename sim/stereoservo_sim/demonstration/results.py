@@ -18,7 +18,7 @@ from stereoservo_sim.demonstration.runner import Demonstration
 MAX_ERROR_PX = 0.3
 MAX_ERROR_MM = 0.5
 MAX_STEADY_PX = 1.0
-"""While a part moves at a steady speed."""
+"""While a part moves at a steady speed, for 99 % of the time: a busy computer may hold the arm for a moment."""
 MAX_MET_PX = 0.5
 """Of a part that was met while it moved, when it stands: the cell's tolerance."""
 MAX_MET_MM = 2.0
@@ -93,8 +93,8 @@ def problems(model: CellModel, goals: Sequence[Judgement]) -> list[str]:
 def _unsteady(steady: Steady) -> list[str]:
     if not np.isfinite(steady.met_s):
         return ["the part was not met while the belt carried it"]
-    if steady.largest_px > MAX_STEADY_PX:
-        return [f"{steady.largest_px:.2f} px off while the part moved, {MAX_STEADY_PX} px allowed"]
+    if steady.p99_px > MAX_STEADY_PX:
+        return [f"up to {steady.p99_px:.2f} px off while the part moved, {MAX_STEADY_PX} px allowed"]
     return []
 
 
