@@ -1,5 +1,5 @@
-"""A running daemon goes with a part on a conveyor: it is met while it moves, waited for where it leaves the view, followed
-where it comes again; when the belt stands, the goal is reached. Cameras on the arm, fakes, the exact model.
+"""A running daemon goes with a part on a conveyor: it is met while it moves, waited for where it leaves the view,
+followed where it comes again; when the belt stands, the goal is reached. Cameras on the arm, fakes, the exact model.
 """
 
 from __future__ import annotations
@@ -81,7 +81,9 @@ def test_part_on_a_conveyor_is_met_waited_for_and_reached(roots: Path) -> None:
 
             belt.run()
             handle = client.goal(
-                FeatureTarget(goal_pixels()), law="stereo", follow_markers=tuple(int(i) for i in world.body.ids)
+                FeatureTarget(goal_pixels()),
+                law="stereo",
+                follow_markers=tuple(int(i) for i in world.body.ids),
             )
             eventually("the part is met", lambda: "target_met" in told("target_met"), 60.0)
             begin_ns = time.monotonic_ns()
@@ -133,5 +135,8 @@ def test_the_belt_is_run_by_a_command_and_stands_at_its_end(roots: Path) -> None
             assert process.wait(60) == 0
         finally:
             process.kill()
-    assert json.loads((directories.runtime / "simulated-workpiece.json").read_text())["shift_m"] == stands["shift_m"]
+    assert (
+        json.loads((directories.runtime / "simulated-workpiece.json").read_text())["shift_m"]
+        == stands["shift_m"]
+    )
     assert -0.12 <= stands["shift_m"][1] <= 0.12

@@ -189,7 +189,11 @@ def _conveyor(settings: _Settings, termination: Termination) -> None:
     from stereoservo_sim.world.conveyor import ConveyorError, conveyor_of
     from stereoservo_sim.world.workpiece import MovedFile
 
-    for given, option in ((settings.channel, "--channel"), (settings.bit_time, "--bit-time"), (settings.orders, "--order")):
+    for given, option in (
+        (settings.channel, "--channel"),
+        (settings.bit_time, "--bit-time"),
+        (settings.orders, "--order"),
+    ):
         if given not in (None, ()):
             raise typer.BadParameter("a conveyor has none; it is for drives or cameras", param_hint=option)
     path = _cell_path(settings.cell)

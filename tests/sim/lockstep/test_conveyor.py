@@ -47,7 +47,11 @@ class OnBelt:
     def __init__(self, folder: Path, since_m: float = -0.1) -> None:
         self.history = TrueJointHistory.in_memory(6, capacity=1 << 14)
         self.cell = LockstepCell(
-            with_fakes(SHIPPED), cell_dir=folder, runtime_dir=folder, seed=SEED, services={"world": self.history}
+            with_fakes(SHIPPED),
+            cell_dir=folder,
+            runtime_dir=folder,
+            seed=SEED,
+            services={"world": self.history},
         )
         conveyor = Conveyor(velocity_m_s=(0.0, 0.02, 0.0), begin_m=(0.0, since_m, 0.0), for_s=600.0)
         self.belt = Belt(conveyor, folder, self.cell.clock.now_ns)
@@ -108,7 +112,9 @@ def test_part_is_met_carried_through_a_drop_out_and_reached_when_it_stands(tmp_p
         camera.blackout = False
     flight.cell.run_for(1.5)
     after = flight.largest_px(1.0)
-    print(f"seed {SEED}: {steady:.2f} px at most, {blind:.2f} px in a drop-out of 0.3 s, {after:.2f} px after it")
+    print(
+        f"seed {SEED}: {steady:.2f} px at most, {blind:.2f} px in a drop-out of 0.3 s, {after:.2f} px after it"
+    )
     assert steady <= 1.0
     assert blind <= 3.0
     assert after <= 1.0

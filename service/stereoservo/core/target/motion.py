@@ -29,8 +29,10 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 FREEDOMS = 6
-ACCELERATION_PX = 100.0
+ACCELERATION_PX = 15.0
 """[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
+TURNS = 0.1
+"""Share of it by which turns of a target about its own middle move its markers."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0
 """[px/s] of a target that was just found."""
@@ -97,12 +99,13 @@ def begin(
     body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
 ) -> bool:
     """The target is where it is said to be at ``t_ns``, moving no one knows how; whether its markers tell of all six
-    freedoms. ``basis`` (6, 4, 4) of displacements, in the units of a ``metric`` frame or any; seen by ``matrices``
-    (c, 3, 4) through ``carrier`` (4, 4).
+    freedoms. ``basis`` (6, 4, 4) of displacements: of a ``metric`` frame three translations and three turns about any
+    point, that move a body of its size alike; seen by ``matrices`` (c, 3, 4) through ``carrier`` (4, 4).
     """
-    scaled, drift, good = scaled_basis(
-        basis, matrices, carrier, transform_points(body.displacement, body.points)
-    )
+    here = transform_points(body.displacement, body.points)
+    if metric:
+        basis = turns_about(basis, here, TURNS)
+    scaled, drift, good = scaled_basis(basis, matrices, carrier, here)
     if not good:
         return False
     body.basis[:] = scaled
@@ -121,6 +124,62 @@ def widen(body: TargetBody, pose_px: float) -> None:
         (pose_px**2 * np.eye(FREEDOMS), SPEED_PX**2 * body.drift, ACCELERATION_PX**2 * body.drift)
     ):
         body.covariance[FREEDOMS * k : FREEDOMS * (k + 1), FREEDOMS * k : FREEDOMS * (k + 1)] = block
+
+
+@kernel
+def solve_into(M: FloatArray, X: FloatArray) -> None:
+    """``M⁻¹ X`` (n, k) in place, by elimination with pivots; ``M`` (n, n) is overwritten."""
+    n, k = X.shape
+    for i in range(n):
+        pivot = i
+        for row in range(i + 1, n):
+            if abs(M[row, i]) > abs(M[pivot, i]):
+                pivot = row
+        for j in range(n):
+            M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
+        for j in range(k):
+            X[i, j], X[pivot, j] = X[pivot, j], X[i, j]
+        for row in range(n):
+            if row == i:
+                continue
+            share = M[row, i] / M[i, i]
+            for j in range(i, n):
+                M[row, j] -= share * M[i, j]
+            for j in range(k):
+                X[row, j] -= share * X[i, j]
+    for i in range(n):
+        for j in range(k):
+            X[i, j] /= M[i, i]
+
+
+@kernel
+def turns_about(basis: FloatArray, points: FloatArray, share: float) -> FloatArray:
+    """The ``basis`` (6, 4, 4), translations and turns, with the turns about the middle of ``points`` (k, 4) of unit
+    height in place of wherever, and by a ``share``.
+    """
+    middle, moved = np.zeros(4), np.zeros((FREEDOMS, 4))
+    for i in range(points.shape[0]):
+        for a in range(4):
+            middle[a] += points[i, a] / points.shape[0]
+    for k in range(FREEDOMS):
+        for a in range(4):
+            for b in range(4):
+                moved[k, a] += basis[k, a, b] * middle[b]
+    N, along = np.zeros((3, 3)), np.zeros((3, 3))  # Σ x_j T_j M = R_k M
+    for i in range(3):
+        for a in range(4):
+            for j in range(3):
+                N[i, j] += moved[i, a] * moved[j, a]
+                along[i, j] += moved[i, a] * moved[3 + j, a]
+    solve_into(N, along)
+    found = basis.copy()
+    for k in range(3):
+        for a in range(4):
+            for b in range(4):
+                for j in range(3):
+                    found[3 + k, a, b] -= along[j, k] * basis[j, a, b]
+                found[3 + k, a, b] *= share
+    return found
 
 
 @kernel
@@ -247,32 +306,6 @@ def elapse(
                         for d in range(b, 3):
                             total += F[a, c] * F[b, d] * before[c * n + i, d * n + j]
                     covariance[a * n + i, b * n + j] = total
-
-
-@kernel
-def solve_into(M: FloatArray, X: FloatArray) -> None:
-    """``M⁻¹ X`` (n, k) in place, by elimination with pivots; ``M`` (n, n) is overwritten."""
-    n, k = X.shape
-    for i in range(n):
-        pivot = i
-        for row in range(i + 1, n):
-            if abs(M[row, i]) > abs(M[pivot, i]):
-                pivot = row
-        for j in range(n):
-            M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
-        for j in range(k):
-            X[i, j], X[pivot, j] = X[pivot, j], X[i, j]
-        for row in range(n):
-            if row == i:
-                continue
-            share = M[row, i] / M[i, i]
-            for j in range(i, n):
-                M[row, j] -= share * M[i, j]
-            for j in range(k):
-                X[row, j] -= share * X[i, j]
-    for i in range(n):
-        for j in range(k):
-            X[i, j] /= M[i, i]
 
 
 @kernel
