@@ -235,12 +235,16 @@ def _follow(
     )
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
-    used = None if since_s > LOST_S else _explained(body, left, J, variances, seen, gate)
+    lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
+    used = None if lost else _explained(body, left, J, variances, seen, gate)
     if used is None:
         found, moved_px, rest_px = jumped(
             body.basis, body.points, pose, arrays.matrices[camera : camera + 1], carrier, sights, seen
         )
-        if not _jumps(body, camera, t_ns, (moved_px, rest_px), since_s, state):
+        if lost and rest_px <= RIGID_PX:
+            widen(body, FOUND_PX)
+            body.odd, body.told[:] = 0, False
+        elif lost or not _jumps(body, camera, t_ns, (moved_px, rest_px), since_s, state):
             return
         body.displacement[:] = found
         left, J = compare(
@@ -272,15 +276,10 @@ def _explained(
 def _jumps(
     body: TargetBody, camera: int, t_ns: int, jump: tuple[float, float], since_s: float, state: CoreState
 ) -> bool:
-    """Whether a frame that the predicted motion does not explain, or that comes after a while without any, is that of a
-    target which went otherwise: by so many pixels, and what that leaves. It may be something else, or not decided yet.
+    """Whether a frame that the predicted motion does not explain, is that of a target which went otherwise: by so many
+    pixels, and what that leaves. It may be something else, or not decided yet.
     """
     moved_px, rest_px = jump
-    if since_s > LOST_S:
-        if rest_px <= RIGID_PX:
-            widen(body, FOUND_PX)
-            body.odd, body.told[:] = 0, False
-        return rest_px <= RIGID_PX
     body.odd_ns[camera] = t_ns
     recent = np.maximum(body.seen_ns, body.odd_ns) > t_ns - RECENT_NS
     if bool((body.odd_ns[recent] == 0).any()):
