@@ -19,9 +19,11 @@ from stereoservo.core.target.motion import (
     displaced,
     elapse,
     fold_frame,
+    jumped,
     pixel_rates,
     scaled_basis,
     solve_into,
+    turns_about,
 )
 from stereoservo.kinematics.kernels import image_jacobian, project_points, transform_points
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
@@ -187,6 +189,34 @@ def test_the_scaled_basis_moves_the_markers_by_a_pixel_each_way() -> None:
     np.testing.assert_allclose(
         drift, 6.0 * whitening @ whitening.T / np.trace(whitening @ whitening.T), atol=1e-8
     )
+
+
+def test_turns_are_about_the_middle_of_the_markers() -> None:
+    basis, _, points, _ = scene(6)
+    found = turns_about(basis, points, 0.3)
+    np.testing.assert_array_equal(found[:3], basis[:3])
+    np.testing.assert_allclose(found[3:] @ points.mean(axis=0), 0.0, atol=1e-12)
+    turned = displaced(np.eye(4), found, np.array([0, 0, 0, 1.0, 0, 0]))
+    alone = displaced(np.eye(4), basis, np.array([0, 0, 0, 0.3, 0, 0]))
+    np.testing.assert_allclose(
+        np.linalg.eigvals(turned).imag.max(), np.linalg.eigvals(alone).imag.max(), atol=1e-6
+    )
+
+
+def test_a_target_that_jumped_is_found_in_one_frame_of_one_camera() -> None:
+    basis, cameras, points, _ = scene(7)
+    rng = np.random.default_rng(7)
+    scaled, _, _ = scaled_basis(basis, cameras, np.eye(4), points)
+    carrier = displaced(np.eye(4), basis, 0.05 * rng.standard_normal(6))
+    before = displaced(np.eye(4), scaled, 5.0 * rng.standard_normal(6))
+    there = displaced(before, scaled, np.array([60.0, -40.0, 5.0, 3.0, -2.0, 1.0]))
+    sights, _ = project_points(cameras[:1], transform_points(carrier, transform_points(there, points)))
+    seen = np.ones(len(points))
+    seen[2] = 0.0
+    pose, moved_px, rest_px = jumped(scaled, points, before, cameras[:1], carrier, sights[0], seen)
+    np.testing.assert_allclose(transform_points(pose, points), transform_points(there, points), atol=1e-6)
+    assert moved_px > 40.0
+    assert rest_px < 1e-6
 
 
 def test_a_frame_is_folded_as_a_kalman_filter_does() -> None:

@@ -38,6 +38,7 @@ class GoalOptions(TypedDict, total=False):
     mode: Literal["preempt", "queue"]
     blend_px: float | None
     acknowledge_s: float | None
+    follow_markers: tuple[int, ...]
 
 
 def as_target(target: Target | str | Mapping[str, Any]) -> Target:

@@ -66,6 +66,9 @@ EventKind = Literal[
     "model",
     "goal_started",
     "goal_face",  # the law works on another face of the body from here on
+    "target_seen",  # the target that a goal follows is found, or is there again
+    "target_unseen",  # it is not seen any more: the arm waits
+    "target_met",  # it moves, and the goal holds on it all the same
     "goal_acknowledged",
     "goal_reached",
     "goal_aborted",

@@ -125,6 +125,8 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     contact: ContactSettings | None = None
     scene_ids: tuple[int, ...] = ()
     """Ids that stand still for good: ``[scene] static``."""
+    body_moves: bool = False
+    """The body before cameras on the arm moves by itself: ``[scene] moves``."""
     reanchor: bool = True
     """Whether a camera that was moved is found anew by itself."""
     resolution: tuple[float, ...] = ()
@@ -236,6 +238,7 @@ def core_settings(
         watch_following=watch_following,
         contact=_contact_settings(cell, joints),
         scene_ids=_scene_ids(cell, camera_settings),
+        body_moves=_body_moves(cell),
         reanchor=cell.servo.reanchor == "auto",
         resolution=tuple(joint.resolution for joint in joints.joints),
     )
@@ -310,6 +313,17 @@ def _scene_ids(cell: CellFile, cameras: tuple[CameraSettings, ...]) -> tuple[int
             f"and calibration needs {needed}: name only what stands still for good",
         )
     return tuple(sorted(set(cell.scene.static)))
+
+
+def _body_moves(cell: CellFile) -> bool:
+    if cell.scene.moves and cell.camera[0].mount != "eye_in_hand":
+        raise CellFileError(
+            cell.cell.name,
+            "scene.moves",
+            "the cameras stand, and the body that they see is carried by the arm; a target that moves beside it is "
+            "named by the goal that follows it (--follow-markers)",
+        )
+    return cell.scene.moves
 
 
 def _contact_settings(cell: CellFile, joints: JointDriverDescription) -> ContactSettings:

@@ -138,13 +138,14 @@ class LawRun(Leased, eq=False, kw_only=True):
 
 class Followed(msgspec.Struct, eq=False, kw_only=True):
     """Of a goal that follows a target: the displacement ``reference`` (4, 4) of the target at which its ``set_points``
-    (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,) hold.
+    (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,) hold. ``told``: the last event of the target.
     """
 
     reference: FloatArray
     set_points: FloatArray
     target_points: FloatArray
     centre_target: FloatArray
+    told: Literal["", "target_seen", "target_unseen", "target_met"] = ""
 
 
 class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):

@@ -66,12 +66,14 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class SceneSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[scene]``: ``static``, ids of markers that never move (e.g. a plate on a wall) and that the arm does not
-    carry.
+    carry. ``moves``: the marker body before cameras on the arm moves by itself once the cell is calibrated, on a
+    conveyor for instance.
 
-    Calibration triangulates them; a camera that is bumped is known, and re-anchored, by them.
+    Calibration triangulates static markers; a camera that is bumped is known, and re-anchored, by them.
     """
 
     static: tuple[Annotated[int, Meta(ge=0)], ...] = ()
+    moves: bool = False
 
 
 class ServoSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

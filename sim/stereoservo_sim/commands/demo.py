@@ -70,11 +70,14 @@ def demo(
     from stereoservo_sim.demonstration.results import summary
     from stereoservo_sim.demonstration.runner import conduct_live, conduct_lockstep
     from stereoservo_sim.demonstration.scenario import shown_goals
+    from stereoservo_sim.world.conveyor import ConveyorError, conveyor_of
 
     try:
         path = Path(cell) if cell.endswith(".toml") else shipped_cell_path(cell)
-        truth = _checked(load_cell_file(path), path.parent, lockstep)
-    except ValueError as error:
+        file = load_cell_file(path)
+        truth = _checked(file, path.parent, lockstep)
+        conveyor = conveyor_of(file)
+    except (ValueError, ConveyorError) as error:
         raise typer.BadParameter(str(error), param_hint="--cell") from error
     if law is not None and law not in LAWS:
         raise typer.BadParameter(str(UnknownLawError(law, tuple(LAWS))), param_hint="--law")
@@ -84,7 +87,7 @@ def demo(
             path = with_mechanics(path, out, mechanics.value)
         except ValueError as error:
             raise typer.BadParameter(str(error), param_hint="--mechanics") from error
-    first, *others = shown_goals(truth)
+    first, *others = shown_goals(truth, on_belt=conveyor is not None)
     goals = (first if law is None else replace(first, law=law), *others)
     conduct = conduct_lockstep if lockstep else conduct_live
     started = time.monotonic()
@@ -174,4 +177,13 @@ def _print(result: dict[str, Any]) -> None:
             f"{goal['seconds']:.1f}", goal["outcome"],
         )  # fmt: skip
     console.print(table)
+    for goal in result["goals"]:
+        steady = goal.get("steady")
+        if steady is not None and steady["met_s"] is not None:
+            console.print(
+                f"goal {goal['name']}: met after {steady['met_s']:.1f} s on a part at {steady['speed_mm_s']:.0f} mm/s, "
+                f"and held for {steady['seconds']:.1f} s: {steady['rms_px']:.2f} px rms, {steady['largest_px']:.2f} px "
+                f"and {steady['largest_mm']:.2f} mm at most off the truth",
+                highlight=False, soft_wrap=True,
+            )  # fmt: skip
     console.print(f"report: {result['report']}", highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""``stereoservo emulate WHAT CELL``: runs emulated drives or cameras in place of a cell's hardware."""
+"""``stereoservo emulate WHAT CELL``: runs emulated drives or cameras, or a conveyor, in place of a cell's hardware."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRACE_S = 5.0
 
 
 def emulate(
-    what: Annotated[str, typer.Argument(help="What to stand in for: drives, cameras.")],
+    what: Annotated[str, typer.Argument(help="What to stand in for: drives, cameras, conveyor.")],
     cell: Annotated[
         str, typer.Argument(metavar="CELL", help="A cell file (*.toml), or the name of a shipped cell.")
     ],
@@ -53,7 +53,9 @@ def emulate(
     parent: Annotated[int, typer.Option("--parent", help="End when the process of this number ends.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Events as JSON lines on stdout.")] = False,
 ) -> None:
-    """Put emulated drives or cameras, those of the simulated arm, in the place of real ones. Orders come from stdin."""
+    """Put emulated drives or cameras, those of the simulated arm, in the place of real ones; orders come from stdin. Or
+    run the belt of a simulated cell, until Ctrl-C.
+    """
     if what not in KINDS:
         raise typer.BadParameter(
             f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT"
@@ -179,4 +181,44 @@ def _cameras(settings: _Settings, termination: Termination) -> None:
             raise typer.BadParameter(str(error), param_hint="--order") from error
 
 
-KINDS = {"drives": _drives, "cameras": _cameras}
+def _conveyor(settings: _Settings, termination: Termination) -> None:
+    """The belt runs until the end; the part then stays where it is."""
+    from stereoservo.messages.directories import cell_directories, create_directories
+    from stereoservo_sim.emulators.console import Printer
+    from stereoservo_sim.emulators.fault_engine import EmulationError
+    from stereoservo_sim.world.conveyor import ConveyorError, conveyor_of
+    from stereoservo_sim.world.workpiece import MovedFile
+
+    for given, option in (
+        (settings.channel, "--channel"),
+        (settings.bit_time, "--bit-time"),
+        (settings.orders, "--order"),
+    ):
+        if given not in (None, ()):
+            raise typer.BadParameter("a conveyor has none; it is for drives or cameras", param_hint=option)
+    path = _cell_path(settings.cell)
+    cell = load_cell_file(path)
+    try:
+        conveyor = conveyor_of(cell)
+    except ConveyorError as error:
+        raise EmulationError(f"{path}: {error}") from error
+    if conveyor is None:
+        raise EmulationError(f"{path}: no [emulate.conveyor]; the shipped cell 'conveyor' has it")
+    directories = cell_directories(cell.cell.name)
+    create_directories(directories)
+    file, running = MovedFile(directories.runtime), conveyor.running(time.monotonic_ns())
+    file.write(running)
+    printer = Printer(settings.as_json)
+    printer.say(
+        "ready", f"the belt runs at {conveyor.velocity_m_s} m/s, as {file.path} says; Ctrl-C stops it",
+        velocity_m_s=conveyor.velocity_m_s, for_s=conveyor.for_s, t_ns=running.since_ns, pid=os.getpid(),
+    )  # fmt: skip
+    while not termination.asked:
+        time.sleep(0.05)
+    stopped = running.at(time.monotonic_ns())
+    file.write(stopped)
+    printer.say("end", f"the belt stands, the part at {stopped.shift_m} m", shift_m=stopped.shift_m)
+    printer.end()
+
+
+KINDS = {"drives": _drives, "cameras": _cameras, "conveyor": _conveyor}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.recording.replay import ReplayResult, replay
+from stereoservo_sim.demonstration.belt import Belt
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 JUDGED_S = 1.0
+TRACK_POINTS = 200
 
 
 @dataclass
@@ -60,7 +63,25 @@ class Judgement:
     velocities: FloatArray = field(repr=False)
     path_m: FloatArray = field(repr=False)
     line_m: FloatArray = field(repr=False)
-    joints: FloatArray = field(repr=False)
+    tracks: Mapping[str, FloatArray] = field(repr=False)
+    steady: Steady | None = None
+
+
+@dataclass(frozen=True)
+class Steady:
+    """How a part that moved was followed: from when it was met, ``met_s`` after the goal's start, for ``seconds``,
+    until the belt stood: distance of a marker from where the goal has it, rms and largest over markers, cameras and
+    time, what it stayed below for 99 % of the time, and the largest in space; the part's ``speed_mm_s``. NaN where it
+    was not met.
+    """
+
+    speed_mm_s: float
+    met_s: float
+    seconds: float
+    rms_px: float
+    p99_px: float
+    largest_px: float
+    largest_mm: float
 
 
 def read_flight(recording: Path) -> RecordedDemonstration:
@@ -104,9 +125,10 @@ def judge_goal(
     truth_t: IntArray,
     truth_q: FloatArray,
     cell: SimulatedCell,
+    belt: Belt | None = None,
 ) -> Judgement:
-    """Evaluate the goal that was taught as ``name`` and executed with ``law``. Raises LookupError where it was not
-    executed.
+    """Evaluate the goal that was taught as ``name`` and executed with ``law``, on a part that a ``belt`` carried.
+    Raises LookupError where it was not executed.
     """
     taught = next((e for e in flight.events if e.kind == "taught" and e.name == name), None)
     if taught is None:
@@ -115,19 +137,26 @@ def judge_goal(
     shown = _during(truth_t, truth_q, taught.t_ns - int(0.5e9), taught.t_ns)
     reached = _during(truth_t, truth_q, end.t_ns + int(0.1e9), end.t_ns + int((0.1 + JUDGED_S) * 1e9))
     way = (truth_t >= start.t_ns) & (truth_t <= end.t_ns)
-    path = np.array(
-        [cell.marker_positions_rig(q).mean(axis=0) for q in truth_q[way][:: max(1, int(way.sum()) // 400)]]
-    )
+    places = _Places(cell, belt)
+    seen = [
+        (places.at(t), q)
+        for t, q in zip(
+            *(values[way][:: max(1, int(way.sum()) // 400)] for values in (truth_t, truth_q)), strict=True
+        )
+    ]
+    path = np.array([here.marker_positions_rig(q).mean(axis=0) for here, q in seen])
+    at_end = places.at(end.t_ns)
     shown_points = np.mean([cell.marker_positions_rig(q) for q in shown], axis=0)
-    start_points = cell.marker_positions_rig(truth_q[way][0])
-    reached_points = np.mean([cell.marker_positions_rig(q) for q in reached], axis=0)
+    start_points = seen[0][0].marker_positions_rig(seen[0][1])
+    reached_points = np.mean([at_end.marker_positions_rig(q) for q in reached], axis=0)
     line = np.array([path[0], shown_points.mean(axis=0)])
     steps = (flight.t_ns >= start.t_ns) & (flight.t_ns <= end.t_ns)
+    pixels = [here.truth_pixels(q) for here, q in seen[:: max(1, len(seen) // TRACK_POINTS)]]
     return Judgement(
         name=name,
         law=law,
         outcome=outcome,
-        final_error_px=_pixel_error(cell, reached, shown),
+        final_error_px=_pixel_error(at_end, reached, cell, shown),
         final_error_mm=float(1e3 * np.linalg.norm(reached_points - shown_points, axis=1).max()),
         max_line_deviation_mm=float(1e3 * _line_distance(path, line).max()),
         rotation_deg=_rotation_deg(start_points, shown_points),
@@ -139,8 +168,55 @@ def judge_goal(
         velocities=flight.commands[steps],
         path_m=path,
         line_m=line,
-        joints=truth_q[way],
+        tracks={camera.name: np.array([p[camera.name] for p in pixels]) for camera in cell.rig.cameras},
+        steady=None if belt is None else _steady(start, flight, (truth_t, truth_q), shown, places, belt),
     )
+
+
+class _Places:
+    """The cell with its part where the belt had it."""
+
+    def __init__(self, cell: SimulatedCell, belt: Belt | None) -> None:
+        self.cell, self._belt = cell, belt
+
+    def at(self, t_ns: int) -> SimulatedCell:
+        return self.cell if self._belt is None else self._belt.cell_at(self.cell, int(t_ns))
+
+
+def _steady(
+    start: Event,
+    flight: Course,
+    truth: tuple[IntArray, FloatArray],
+    shown: FloatArray,
+    places: _Places,
+    belt: Belt,
+) -> Steady:
+    """Of a goal that set out at ``start`` and was ``shown`` at joints (k, n)."""
+    speed = 1e3 * float(np.linalg.norm(belt.conveyor.velocity_m_s))
+    met = next((e for e in flight.events if e.kind == "target_met" and e.id == start.id), None)
+    if met is None:
+        return Steady(speed, *(6 * [np.nan]))
+    stops_ns = belt.stops_ns(met.t_ns)
+    times, positions = truth
+    judged = (times >= met.t_ns) & (times <= stops_ns)
+    cell = places.cell
+    goal_points = np.mean([cell.marker_positions_rig(q) for q in shown], axis=0)
+    goal_pixels = {
+        camera.name: np.mean([cell.truth_pixels(q)[camera.name] for q in shown], axis=0)
+        for camera in cell.rig.cameras
+    }
+    apart_px, apart_mm = [], 0.0
+    for t, q in zip(times[judged][::5], positions[judged][::5], strict=True):
+        here = places.at(t)
+        pixels = here.truth_pixels(q)
+        apart_px.append([np.linalg.norm(pixels[name] - goal, axis=1) for name, goal in goal_pixels.items()])
+        apart_m = np.linalg.norm(here.marker_positions_rig(q) - goal_points, axis=1).max()
+        apart_mm = max(apart_mm, float(1e3 * apart_m))
+    found = np.array(apart_px)
+    return Steady(
+        speed, (met.t_ns - start.t_ns) * 1e-9, (stops_ns - met.t_ns) * 1e-9, float(np.sqrt((found**2).mean())),
+        float(np.quantile(found.max(axis=(1, 2)), 0.99)), float(found.max()), apart_mm,
+    )  # fmt: skip
 
 
 def _flown(name: str, flight: Course) -> tuple[Event, Event]:
@@ -163,12 +239,14 @@ def _during(times: IntArray, positions: FloatArray, start_ns: int, end_ns: int) 
     return inside[::5]
 
 
-def _pixel_error(cell: SimulatedCell, reached: FloatArray, shown: FloatArray) -> float:
-    """Largest distance, over cameras and markers seen at the goal, of the mean noise-free reprojections [px]."""
+def _pixel_error(place: SimulatedCell, reached: FloatArray, cell: SimulatedCell, shown: FloatArray) -> float:
+    """Largest distance, over cameras and markers seen at the goal, of the mean noise-free reprojections [px] at joints
+    ``reached`` in ``place`` from those ``shown`` in ``cell``.
+    """
     worst = 0.0
     for camera in cell.rig.cameras:
         seen = cell.visible(shown[0], camera)
-        a = np.mean([cell.truth_pixels(q)[camera.name] for q in reached], axis=0)
+        a = np.mean([place.truth_pixels(q)[camera.name] for q in reached], axis=0)
         b = np.mean([cell.truth_pixels(q)[camera.name] for q in shown], axis=0)
         worst = max(worst, float(np.linalg.norm(a - b, axis=1)[seen].max()))
     return worst

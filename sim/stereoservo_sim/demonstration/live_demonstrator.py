@@ -97,9 +97,9 @@ class LiveDemonstrator:
         assert plan is not None  # a goal of the images is planned
         return plan.seconds
 
-    def servo(self, target: VisualTarget, law: LawName) -> str:
+    def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
         """Execute a goal to its end, under a lease."""
-        result: GoalResult = self._client.goal(target, law=law, lease_s=2.0).wait()
+        result: GoalResult = self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow).wait()
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
     def _look(self) -> None:

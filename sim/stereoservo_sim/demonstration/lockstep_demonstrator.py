@@ -83,9 +83,9 @@ class LockstepDemonstrator:
         """Seconds that the goal's plan needs."""
         return self._operator.planned(target, law=law).seconds
 
-    def servo(self, target: VisualTarget, law: LawName) -> str:
+    def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
         """Execute a goal to its end."""
-        event = self._operator.goal(target, law=law)
+        event = self._operator.goal(target, law=law, follow_markers=follow)
         return (
             "reached"
             if event.kind == "goal_reached"

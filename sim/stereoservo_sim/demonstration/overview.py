@@ -21,12 +21,10 @@ def write_overview(path: Path, goals: Sequence[Judgement], cell: SimulatedCell, 
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3, width_ratios=(1, 1, 1))
     for axis, camera in zip(axes[:2], cell.rig.cameras, strict=True):
-        image = Renderer(cell, camera, RenderSettings()).render(goals[0].joints[0], np.random.default_rng(0))
+        image = Renderer(cell, camera, RenderSettings()).render(cell.base, np.random.default_rng(0))
         axis.imshow(image, cmap="gray", vmin=0, vmax=255)
         for k, goal in enumerate(goals):
-            tracks = np.array(
-                [cell.truth_pixels(q)[camera.name] for q in goal.joints[:: max(1, len(goal.joints) // 150)]]
-            )
+            tracks = goal.tracks[camera.name]
             axis.plot(tracks[:, :, 0], tracks[:, :, 1], color=COLOURS[k], linewidth=0.8)
             axis.plot(tracks[-1, :, 0], tracks[-1, :, 1], "x", color=COLOURS[k], markersize=4)
         axis.set(

@@ -16,9 +16,6 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.demonstration.judge import Judgement, RecordedDemonstration
 from stereoservo_sim.demonstration.report import CalibrationPlots, GoalPlots, ReportData, write_report
 from stereoservo_sim.demonstration.runner import Demonstration
-from stereoservo_sim.world.simulated_cell import SimulatedCell
-
-TRACK_POINTS = 200
 
 
 def write_pages(
@@ -26,7 +23,6 @@ def write_pages(
 ) -> None:
     """Write the report. Raises OSError."""
     cell = demonstration.cell
-    truth = demonstration.truth
     mode = "lockstep, virtual time" if demonstration.lockstep else "real processes over zenoh"
     facts = {
         "mode": mode,
@@ -44,7 +40,7 @@ def write_pages(
         title="stereoservo demonstration",
         joints=demonstration.joint_names,
         calibration=None if flight.trials is None else _calibration(demonstration, flight.trials),
-        goals=tuple(_goal(goal, cell.servo.gain, truth) for goal in goals),
+        goals=tuple(_goal(goal, cell.servo.gain) for goal in goals),
         tolerance_px=cell.servo.tolerance_px,
         velocity_limits=flight.velocity_max,
         summary="An arm that nobody calibrated learnt itself through two cameras that nobody calibrated, and reached "
@@ -100,9 +96,7 @@ def residuals(model: CellModel, trials: TrialData) -> FloatArray:
     return found
 
 
-def _goal(goal: Judgement, gain: float, cell: SimulatedCell) -> GoalPlots:
-    chosen = goal.joints[:: max(1, len(goal.joints) // TRACK_POINTS)]
-    pixels = [cell.truth_pixels(q) for q in chosen]
+def _goal(goal: Judgement, gain: float) -> GoalPlots:
     return GoalPlots(
         name=goal.name,
         law=goal.law,
@@ -120,5 +114,5 @@ def _goal(goal: Judgement, gain: float, cell: SimulatedCell) -> GoalPlots:
         steps=goal.steps,
         seconds=goal.seconds,
         gain=gain,
-        tracks={camera.name: np.array([p[camera.name] for p in pixels]) for camera in cell.rig.cameras},
+        tracks=goal.tracks,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, c
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo.messages.wire import LoopInfo
 from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo_sim.demonstration.belt import Belt
 from stereoservo_sim.demonstration.emulated import (
     ANY_PORT,
     ANY_SERVER,
@@ -31,6 +33,7 @@ from stereoservo_sim.demonstration.progress import DemoFailedError, Demonstratio
 from stereoservo_sim.demonstration.scenario import Calibrated, ShownGoal, perform, shown_goals
 from stereoservo_sim.demonstration.truth import TruthLog, shown_positions, true_cell
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
+from stereoservo_sim.world.conveyor import conveyor_of
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
@@ -52,6 +55,7 @@ class Demonstration:
     lockstep: bool
     truth: SimulatedCell
     goals: Sequence[ShownGoal]
+    belt: Belt | None
 
 
 def conduct_lockstep(
@@ -64,7 +68,8 @@ def conduct_lockstep(
     """Run in one process in virtual time; deterministic given the seed. ``goals``: by default those of the arm."""
     cell = load_cell_file(cell_path)
     truth = true_cell(cell, cell_path.parent)
-    goals = shown_goals(truth) if goals is None else goals
+    conveyor = conveyor_of(cell)
+    goals = shown_goals(truth, on_belt=conveyor is not None) if goals is None else goals
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
     with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
@@ -75,6 +80,7 @@ def conduct_lockstep(
         ) as lockstep:  # fmt: skip
             log = TruthLog(history)
             lockstep.on_step = _every(2000, log.take)
+            belt = None if conveyor is None else Belt(conveyor, Path(scratch), lockstep.clock.now_ns)
             names = lockstep.settings.joint_names
             calibrated, outcomes = perform(
                 LockstepDemonstrator(lockstep, seed, stage.progress),
@@ -82,11 +88,25 @@ def conduct_lockstep(
                 shown_positions(cell, truth),
                 stage.tell,
                 goals,
+                belt,
             )
             times, positions = log.end()
     save_model(calibrated.model, out / "model.json")
     return Demonstration(
-        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, True, truth, goals
+        cell,
+        names,
+        calibrated,
+        outcomes,
+        times,
+        positions,
+        recording,
+        out,
+        None,
+        seed,
+        True,
+        truth,
+        goals,
+        belt,
     )
 
 
@@ -114,7 +134,8 @@ def conduct_live(
     """
     cell = load_cell_file(cell_path)
     truth = true_cell(cell, cell_path.parent)
-    goals = shown_goals(truth) if goals is None else goals
+    conveyor = conveyor_of(cell)
+    goals = shown_goals(truth, on_belt=conveyor is not None) if goals is None else goals
     configurations = shown_positions(cell, truth)
     recording = out / "flight.mcap"
     recording.unlink(missing_ok=True)  # of an earlier demonstration
@@ -134,7 +155,9 @@ def conduct_live(
         with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
             daemon.wait_ready()
             stage.tell(f"look on: {RUNTIME_VARIABLE}={scratch / 'run'} stereoservo web {cell.cell.name}")
-            log = TruthLog.of_directory(cell_directories(cell.cell.name).runtime)
+            runtime_dir = cell_directories(cell.cell.name).runtime
+            log = TruthLog.of_directory(runtime_dir)
+            belt = None if conveyor is None else Belt(conveyor, runtime_dir, time.monotonic_ns)
             log.follow()
             with Client(cell.cell.name) as client:
                 names = tuple(joint.name for joint in client.info().joints)
@@ -144,6 +167,7 @@ def conduct_live(
                     configurations,
                     stage.tell,
                     goals,
+                    belt,
                 )
                 loop = client.status().loop
             times, positions = log.end()
@@ -152,7 +176,20 @@ def conduct_live(
                 raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
     save_model(calibrated.model, out / "model.json")
     return Demonstration(
-        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, False, truth, goals
+        cell,
+        names,
+        calibrated,
+        outcomes,
+        times,
+        positions,
+        recording,
+        out,
+        loop,
+        seed,
+        False,
+        truth,
+        goals,
+        belt,
     )
 
 

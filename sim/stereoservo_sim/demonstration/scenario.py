@@ -13,6 +13,7 @@ from stereoservo.kinematics.joint_reprojection import joint_problem, seen_chain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import DisplacementTarget, LawName, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.demonstration.belt import Belt
 from stereoservo_sim.world.arms.arm_goals import goes_straight
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
@@ -32,12 +33,14 @@ class ShownGoal:
     """A goal of the demonstration, one of ``arm_goals.goals_of``: the law that reaches it, and the kind of its target.
 
     ``taught``: by its name, the pixels that were shown. ``displacement``: by what the body has to do from where it is,
-    a projective 4x4 in the model's frame, without a pixel of the goal.
+    a projective 4x4 in the model's frame, without a pixel of the goal. ``follows``: it holds on a part that the belt
+    carries.
     """
 
     name: str
     law: LawName
     stated: Literal["taught", "displacement"] = "taught"
+    follows: bool = False
 
 
 GOALS = (
@@ -48,13 +51,23 @@ GOALS = (
 """From home: 29, 180 and 94 degrees of rotation, 0.12, 0.14 and 0.37 m; see ``world``."""
 
 
-def shown_goals(cell: SimulatedCell) -> tuple[ShownGoal, ...]:
+ON_BELT = (
+    ShownGoal("near", "stereo", follows=True),
+    ShownGoal("roll", "cartesian3", follows=True),
+    ShownGoal("far", "points", follows=True),
+)
+"""Of the same places, shown on a part that stands and met on parts that the belt carries."""
+
+
+def shown_goals(cell: SimulatedCell, *, on_belt: bool = False) -> tuple[ShownGoal, ...]:
     """The goals of a cell's demonstration, with laws that its arm can follow.
 
     An arm of few freedoms cannot turn a face about its hinge and in its plane, each for itself, as the Cartesian laws
     do; one that does not reach on a straight way what it reaches takes a law in the images there, too.
     """
     robot = cell.robot
+    if on_belt:
+        return ON_BELT
     if len(robot.joints) >= 6 or robot.prismatic.all():
         return GOALS
     near, roll, far = GOALS
@@ -128,8 +141,10 @@ class Operator(Protocol):
         """Duration of a goal by its plan, without motion."""
         ...
 
-    def servo(self, target: VisualTarget, law: LawName) -> str:
-        """Execute a goal; returns its outcome: ``reached`` or what else ended it, with the message."""
+    def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
+        """Execute a goal, which goes with the markers to ``follow``; returns its outcome: ``reached`` or what else
+        ended it, with the message.
+        """
         ...
 
     def rest(self, seconds: float) -> None: ...
@@ -141,9 +156,10 @@ def perform(
     configurations: Mapping[str, FloatArray],
     tell: Callable[[str], None],
     goals: Sequence[ShownGoal] = GOALS,
+    belt: Belt | None = None,
 ) -> tuple[Calibrated, dict[str, str]]:
-    """Run the whole demonstration, ``goals`` taught at ``configurations`` (n,); returns the calibration and each
-    goal's outcome.
+    """Run the whole demonstration, ``goals`` taught at ``configurations`` (n,), those that follow on parts that the
+    ``belt`` carries; returns the calibration and each goal's outcome.
     """
     operator.enable()
     tell("calibrating: each joint moves alone in view of both cameras")
@@ -161,18 +177,38 @@ def perform(
             shown[goal.name] = joints_by_images(calibrated.model, operator)
     outcomes = {}
     for goal in goals:
+        if belt is not None:
+            belt.clear()
         operator.home()
         operator.rest(REST_S)
         target: VisualTarget = TaughtTarget(goal.name)
         if goal.stated == "displacement":
             here = joints_by_images(calibrated.model, operator)
             target = displacement_between(calibrated.model, here, shown[goal.name])
+        if belt is not None and goal.follows:
+            outcomes[goal.name] = _met_on_belt(operator, goal, calibrated.model, belt, tell)
+            continue
         seconds = operator.planned_s(target, goal.law)
         tell(f"goal {goal.name!r}, stated as {goal.stated}, with law {goal.law}: planned {seconds:.1f} s")
         outcomes[goal.name] = operator.servo(target, goal.law)
         operator.rest(JUDGE_S)
         tell(f"goal {goal.name!r}: {outcomes[goal.name]}")
     return calibrated, outcomes
+
+
+def _met_on_belt(
+    operator: Operator, goal: ShownGoal, model: CellModel, belt: Belt, tell: Callable[[str], None]
+) -> str:
+    """Go with a part from when the belt sets off until it stands; the outcome."""
+    belt.put()
+    operator.rest(REST_S)
+    belt.run()
+    speed = 1e3 * float(np.linalg.norm(belt.conveyor.velocity_m_s))
+    tell(f"goal {goal.name!r}, on a part that the belt carries at {speed:.0f} mm/s, with law {goal.law}")
+    outcome = operator.servo(TaughtTarget(goal.name), goal.law, model.marker_ids)
+    operator.rest(JUDGE_S)
+    tell(f"goal {goal.name!r}: {outcome}")
+    return outcome
 
 
 def joints_by_images(model: CellModel, operator: Operator) -> FloatArray:

@@ -56,7 +56,8 @@ class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class Motion(Moved, frozen=True, forbid_unknown_fields=True):
     """A displacement that goes on: at ``velocity_m_s``, turning at ``turn_rate_deg_s``, and swinging along ``swing_m``
-    at ``swing_hz``, from the monotonic time ``since_ns`` on (None: from when its file was written), for ``for_s``.
+    at ``swing_hz``, from the monotonic time ``since_ns`` on (None: from when its file was written), for ``for_s``, and
+    every ``every_s`` anew from where it began.
     """
 
     velocity_m_s: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -65,10 +66,12 @@ class Motion(Moved, frozen=True, forbid_unknown_fields=True):
     swing_hz: Annotated[float, Meta(ge=0, le=10)] = 0.0
     since_ns: int | None = None
     for_s: Annotated[float, Meta(gt=0)] | None = None
+    every_s: Annotated[float, Meta(gt=0)] | None = None
 
     def at(self, t_ns: int) -> Moved:
         """The displacement at ``t_ns``."""
         elapsed_s = max(0.0, (t_ns - (self.since_ns or 0)) * 1e-9)
+        elapsed_s = elapsed_s if self.every_s is None else elapsed_s % self.every_s
         elapsed_s = elapsed_s if self.for_s is None else min(elapsed_s, self.for_s)
         swing = float(np.sin(2.0 * np.pi * self.swing_hz * elapsed_s))
         shift = (

@@ -22,8 +22,11 @@ from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_sim import cells
 
 CELL_FILES = {path.stem: path for path in sorted(Path(cells.__file__).parent.glob("*.toml"))}
-REAL_TIME = [name for name, path in CELL_FILES.items() if load_cell_file(path).emulate]
-LOCKSTEP = [name for name in CELL_FILES if name not in (*REAL_TIME, *cells.ARMS)]
+REAL_TIME = [
+    name for name, path in CELL_FILES.items() if {"drives", "cameras"} & load_cell_file(path).emulate.keys()
+]
+ON_BELT = "conveyor"
+LOCKSTEP = [name for name in CELL_FILES if name not in (*REAL_TIME, *cells.ARMS, ON_BELT)]
 SEEDS = (0, 1, 2)
 MORE_SEEDS = range(3, 10)
 TIMEOUT_S = 900
@@ -114,6 +117,22 @@ def test_lockstep_is_deterministic_given_the_seed(demos: Demos, tmp_path: Path) 
 @pytest.mark.parametrize("cell", LOCKSTEP)
 def test_every_cell_with_a_lockstep_does_likewise(every_demo: Demos, cell: str, seed: int) -> None:
     check(every_demo[f"{cell}-{seed}"].result())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(TIMEOUT_S)
+@pytest.mark.parametrize("options", [("--lockstep",), ()], ids=["lockstep", "processes"])
+def test_part_on_the_conveyor_is_met_by_every_law(tmp_path: Path, options: tuple[str, ...]) -> None:
+    result = run_demo(tmp_path, "--cell", ON_BELT, *options)
+    assert result["verdicts"] == []
+    assert [goal["law"] for goal in result["goals"]] == ["stereo", "cartesian3", "points"]
+    for goal in result["goals"]:
+        assert goal["outcome"] == "reached"
+        assert goal["steady"]["speed_mm_s"] == 20.0
+        assert goal["steady"]["p99_px"] <= 1.0
+        assert goal["steady"]["seconds"] > 2.0
+        assert goal["final_error_px"] <= 0.5
+    assert result["replay"]["identical"] is True
 
 
 @pytest.mark.slow

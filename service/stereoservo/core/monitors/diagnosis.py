@@ -40,7 +40,7 @@ def start_model_monitor(
         if marker in arrays.index:
             watching.masked[arrays.index[marker]] = 1.0
     state.watching = watching
-    restart(state, arrays)
+    restart(state, arrays, settings)
 
 
 def emit_diagnosis(verdict: ModelDiagnosis, context: StepContext) -> None:

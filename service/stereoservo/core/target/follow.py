@@ -6,6 +6,8 @@ go with the target.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from stereoservo.core.context import RefusalError, StepContext
@@ -132,7 +134,35 @@ def start_following(source: ServoGoal, context: StepContext) -> None:
 
 
 def follow_target(source: ServoGoal, context: StepContext) -> Reason | None:
-    """Bring a goal to where its target is now, with the velocities of its set-points; the reason where it cannot."""
+    """Bring a goal to where its target is now, with the velocities of its set-points; the reason where it cannot.
+
+    By events it tells when the target is seen, is lost, and is met while it moves.
+    """
+    waits = _brought(source, context)
+    followed = source.followed
+    assert followed is not None
+    if waits is not None:
+        source.held = 0  # what was held, was held on a target that was seen
+        if followed.told in ("target_seen", "target_met"):
+            _tell("target_unseen", f"{waits.hint}; the arm waits until it is there again", source, context)
+    elif followed.told in ("", "target_unseen"):
+        _tell("target_seen", "the target is seen: the goal goes with it", source, context)
+    elif followed.told == "target_seen" and source.held >= source.hold_frames and source.error_px is not None:
+        message = f"error {source.error_px:.4f} px on the target as it moves, for {source.held} frames"
+        _tell("target_met", message, source, context)
+    return waits
+
+
+def _tell(
+    kind: Literal["target_seen", "target_unseen", "target_met"], message: str, source: ServoGoal, context: StepContext
+) -> None:  # fmt: skip
+    assert source.followed is not None
+    source.followed.told = kind
+    ids = ", ".join(str(marker) for marker in source.goal.follow_markers)
+    context.emit(kind, id=source.goal.id, name=ids, message=message, error_px=source.error_px)
+
+
+def _brought(source: ServoGoal, context: StepContext) -> Reason | None:
     body, arrays, followed = context.state.target, context.arrays, source.followed
     assert arrays is not None
     assert followed is not None

@@ -29,8 +29,10 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 FREEDOMS = 6
-ACCELERATION_PX = 100.0
+ACCELERATION_PX = 15.0
 """[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
+TURNS = 0.1
+"""Share of it by which turns of a target about its own middle move its markers."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0
 """[px/s] of a target that was just found."""
@@ -97,12 +99,13 @@ def begin(
     body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
 ) -> bool:
     """The target is where it is said to be at ``t_ns``, moving no one knows how; whether its markers tell of all six
-    freedoms. ``basis`` (6, 4, 4) of displacements, in the units of a ``metric`` frame or any; seen by ``matrices``
-    (c, 3, 4) through ``carrier`` (4, 4).
+    freedoms. ``basis`` (6, 4, 4) of displacements: of a ``metric`` frame three translations and three turns about any
+    point, that move a body of its size alike; seen by ``matrices`` (c, 3, 4) through ``carrier`` (4, 4).
     """
-    scaled, drift, good = scaled_basis(
-        basis, matrices, carrier, transform_points(body.displacement, body.points)
-    )
+    here = transform_points(body.displacement, body.points)
+    if metric:
+        basis = turns_about(basis, here, TURNS)
+    scaled, drift, good = scaled_basis(basis, matrices, carrier, here)
     if not good:
         return False
     body.basis[:] = scaled
@@ -121,6 +124,62 @@ def widen(body: TargetBody, pose_px: float) -> None:
         (pose_px**2 * np.eye(FREEDOMS), SPEED_PX**2 * body.drift, ACCELERATION_PX**2 * body.drift)
     ):
         body.covariance[FREEDOMS * k : FREEDOMS * (k + 1), FREEDOMS * k : FREEDOMS * (k + 1)] = block
+
+
+@kernel
+def solve_into(M: FloatArray, X: FloatArray) -> None:
+    """``M⁻¹ X`` (n, k) in place, by elimination with pivots; ``M`` (n, n) is overwritten."""
+    n, k = X.shape
+    for i in range(n):
+        pivot = i
+        for row in range(i + 1, n):
+            if abs(M[row, i]) > abs(M[pivot, i]):
+                pivot = row
+        for j in range(n):
+            M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
+        for j in range(k):
+            X[i, j], X[pivot, j] = X[pivot, j], X[i, j]
+        for row in range(n):
+            if row == i:
+                continue
+            share = M[row, i] / M[i, i]
+            for j in range(i, n):
+                M[row, j] -= share * M[i, j]
+            for j in range(k):
+                X[row, j] -= share * X[i, j]
+    for i in range(n):
+        for j in range(k):
+            X[i, j] /= M[i, i]
+
+
+@kernel
+def turns_about(basis: FloatArray, points: FloatArray, share: float) -> FloatArray:
+    """The ``basis`` (6, 4, 4), translations and turns, with the turns about the middle of ``points`` (k, 4) of unit
+    height in place of wherever, and by a ``share``.
+    """
+    middle, moved = np.zeros(4), np.zeros((FREEDOMS, 4))
+    for i in range(points.shape[0]):
+        for a in range(4):
+            middle[a] += points[i, a] / points.shape[0]
+    for k in range(FREEDOMS):
+        for a in range(4):
+            for b in range(4):
+                moved[k, a] += basis[k, a, b] * middle[b]
+    N, along = np.zeros((3, 3)), np.zeros((3, 3))  # Σ x_j T_j M = R_k M
+    for i in range(3):
+        for a in range(4):
+            for j in range(3):
+                N[i, j] += moved[i, a] * moved[j, a]
+                along[i, j] += moved[i, a] * moved[3 + j, a]
+    solve_into(N, along)
+    found = basis.copy()
+    for k in range(3):
+        for a in range(4):
+            for b in range(4):
+                for j in range(3):
+                    found[3 + k, a, b] -= along[j, k] * basis[j, a, b]
+                found[3 + k, a, b] *= share
+    return found
 
 
 @kernel
@@ -250,32 +309,6 @@ def elapse(
 
 
 @kernel
-def solve_into(M: FloatArray, X: FloatArray) -> None:
-    """``M⁻¹ X`` (n, k) in place, by elimination with pivots; ``M`` (n, n) is overwritten."""
-    n, k = X.shape
-    for i in range(n):
-        pivot = i
-        for row in range(i + 1, n):
-            if abs(M[row, i]) > abs(M[pivot, i]):
-                pivot = row
-        for j in range(n):
-            M[i, j], M[pivot, j] = M[pivot, j], M[i, j]
-        for j in range(k):
-            X[i, j], X[pivot, j] = X[pivot, j], X[i, j]
-        for row in range(n):
-            if row == i:
-                continue
-            share = M[row, i] / M[i, i]
-            for j in range(i, n):
-                M[row, j] -= share * M[i, j]
-            for j in range(k):
-                X[row, j] -= share * X[i, j]
-    for i in range(n):
-        for j in range(k):
-            X[i, j] /= M[i, i]
-
-
-@kernel
 def compare(
     basis: FloatArray, points: FloatArray, D: FloatArray, matrix: FloatArray, carrier: FloatArray, sights: FloatArray,
     seen: FloatArray,
@@ -371,69 +404,10 @@ def fold_frame(
     rate += step[2 * n :]
 
 
-@kernel
-def moved_by(left: FloatArray, J: FloatArray, used: FloatArray) -> tuple[float, float]:
-    """By how much [px] rms the rigid displacement moves the markers that explains best what is ``left`` (k, 2), and
-    what rms [px] it leaves.
-    """
-    weights = np.repeat(used, 2)
-    rows, errors = J.copy().reshape((-1, FREEDOMS)), left.copy().reshape(-1)
-    step, _ = damped_least_squares(rows, errors, weights, 1e-12)
-    moved = rest = 0.0
-    count = 0
-    for i in range(errors.size):
-        if not weights[i] > 0.0:
-            continue
-        along = 0.0
-        for k in range(FREEDOMS):
-            along += rows[i, k] * step[k]
-        moved += along * along
-        rest += (errors[i] - along) ** 2
-        count += 1
-    return math.sqrt(moved / max(count, 1)), math.sqrt(rest / max(count, 1))
-
-
-@kernel
-def pixel_rates(
-    basis: FloatArray, twist: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
-) -> FloatArray:
-    """Pixel velocities (c, k, 2) [px/s] of ``points`` (k, 4), where they are now, that move with a ``twist`` (6,)."""
-    J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points))
-    rates = np.zeros(J.shape[:3])
-    for c in range(J.shape[0]):
-        for i in range(J.shape[1]):
-            for a in range(2):
-                for k in range(FREEDOMS):
-                    rates[c, i, a] += J[c, i, a, k] * twist[k]
-    return rates
-
-
 FITS = 40
 """Rounds of least squares that find a target whose shape is known."""
 FOUND_REST_PX = 3.0
 """What they may leave, rms."""
-
-
-@kernel
-def find_shape(
-    matrices: FloatArray, sights: FloatArray, seen: FloatArray, plane: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that two cameras or more show, and which these
-    are (k,) 1 or 0.
-    """
-    points, ok = triangulate(matrices, sights, seen, 5)
-    known = np.zeros(points.shape[0])
-    for i in range(points.shape[0]):
-        views, height = 0.0, 0.0
-        for c in range(seen.shape[0]):
-            views += 1.0 if seen[c, i] > 0.0 else 0.0
-        for k in range(4):
-            height += points[i, k] * plane[k]
-        if ok[i] and views >= 2.0 and height != 0.0:
-            known[i] = 1.0
-        for k in range(4):
-            points[i, k] = points[i, k] / height if known[i] > 0.0 else plane[k]
-    return points, known
 
 
 @kernel
@@ -460,3 +434,66 @@ def find_pose(
                 count += 2.0
     rest = math.sqrt(total / count) if count > 0.0 else math.inf
     return D, rest if math.isfinite(rest) else math.inf
+
+
+@kernel
+def jumped(
+    basis: FloatArray, points: FloatArray, D: FloatArray, matrix: FloatArray, carrier: FloatArray, sights: FloatArray,
+    seen: FloatArray,
+) -> tuple[FloatArray, float, float]:  # fmt: skip
+    """The pose (4, 4) that explains a frame best, from ``D`` on; by how much [px] rms it moves the markers, and what
+    rms [px] it leaves. Arguments as of `compare`.
+    """
+    before = transform_points(carrier, transform_points(D, points))
+    shown = seen.reshape((1, -1))
+    moved, rest_px = find_pose(_carried(basis, carrier), matrix, before, sights.reshape((1, -1, 2)), shown)
+    here, _ = project_points(matrix, transform_points(moved, before))
+    there, _ = project_points(matrix, before)
+    total = count = 0.0
+    for i in range(seen.size):
+        if seen[i] > 0.0:
+            total += (here[0, i, 0] - there[0, i, 0]) ** 2 + (here[0, i, 1] - there[0, i, 1]) ** 2
+            count += 2.0
+    half, pose = np.empty((4, 4)), np.empty((4, 4))
+    multiply4_into(invert4(carrier), moved, half)  # C⁻¹ M C D
+    multiply4_into(half, carrier, pose)
+    multiply4_into(pose.copy(), D, pose)
+    moved_px = math.sqrt(total / count) if count > 0.0 else math.inf
+    return pose, moved_px, rest_px
+
+
+@kernel
+def pixel_rates(
+    basis: FloatArray, twist: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Pixel velocities (c, k, 2) [px/s] of ``points`` (k, 4), where they are now, that move with a ``twist`` (6,)."""
+    J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points))
+    rates = np.zeros(J.shape[:3])
+    for c in range(J.shape[0]):
+        for i in range(J.shape[1]):
+            for a in range(2):
+                for k in range(FREEDOMS):
+                    rates[c, i, a] += J[c, i, a, k] * twist[k]
+    return rates
+
+
+@kernel
+def find_shape(
+    matrices: FloatArray, sights: FloatArray, seen: FloatArray, plane: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that two cameras or more show, and which these
+    are (k,) 1 or 0.
+    """
+    points, ok = triangulate(matrices, sights, seen, 5)
+    known = np.zeros(points.shape[0])
+    for i in range(points.shape[0]):
+        views, height = 0.0, 0.0
+        for c in range(seen.shape[0]):
+            views += 1.0 if seen[c, i] > 0.0 else 0.0
+        for k in range(4):
+            height += points[i, k] * plane[k]
+        if ok[i] and views >= 2.0 and height != 0.0:
+            known[i] = 1.0
+        for k in range(4):
+            points[i, k] = points[i, k] / height if known[i] > 0.0 else plane[k]
+    return points, known

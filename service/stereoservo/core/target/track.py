@@ -18,8 +18,10 @@ from stereoservo.core.context import StepContext
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.prediction import chain_at, gate_threshold, positions_at, undistort_sights
+from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.core.target.motion import (
+    FOUND_PX,
     FOUND_REST_PX,
     FREEDOMS,
     SIGHT_PX,
@@ -33,7 +35,8 @@ from stereoservo.core.target.motion import (
     find_shape,
     fold_frame,
     gate_sights,
-    moved_by,
+    jumped,
+    target_body,
     widen,
 )
 from stereoservo.kinematics.kernels import project_points, transform_points
@@ -58,6 +61,10 @@ OTHERS = ("joint_zero", "camera_moved", "marker_slipped")
 """Verdicts of what else may have moved, which the target is not followed into."""
 STILL_S, STILL_PX = 0.5, 0.5
 """A target whose markers moved by less in that time stands."""
+LONGEST_S = 1.0
+"""For so long a target that is not seen is carried on; then it is where that took it."""
+LOST_S = 0.5
+"""After so long it is found anew, wherever it is."""
 IDENTITY = np.eye(4)
 
 
@@ -103,8 +110,9 @@ def present_arrays(context: StepContext) -> ModelArrays | None:
 
 def pose_at(body: TargetBody, t_ns: int) -> tuple[FloatArray, FloatArray]:
     """Its displacement (4, 4) and twist (6,) at ``t_ns``."""
+    ahead_s = min((t_ns - body.t_ns) * 1e-9, LONGEST_S)
     found: tuple[FloatArray, FloatArray] = after(
-        body.displacement, body.basis, body.twist, body.rate, (t_ns - body.t_ns) * 1e-9
+        body.displacement, body.basis, body.twist, body.rate, ahead_s
     )
     return found
 
@@ -192,13 +200,15 @@ def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], p
     body.stated = True
 
 
-def restart(state: CoreState, arrays: ModelArrays) -> None:
-    """A model is in use from here on: with its cameras found anew, what was followed is found anew, too."""
+def restart(state: CoreState, arrays: ModelArrays, settings: CoreSettings) -> None:
+    """A model is in use from here on: with its cameras found anew, what was followed is found anew, too, and a body
+    that is said to move is followed from the first frame.
+    """
     body = state.target
-    if body is None:
-        return
-    if not state.pending_reanchored:
-        state.target = None
+    if body is None or not state.pending_reanchored:
+        moves = settings.body_moves and displacements_of(arrays) is not None
+        cameras = len(settings.cameras)
+        state.target = target_body(arrays.ids, arrays.marker_points, cameras, carried=True) if moves else None
         return
     body.t_ns, body.seen_ns[:], body.first_seen[:] = 0, 0, 0.0
     if body.carried and body.points.shape == arrays.marker_points.shape:
@@ -215,7 +225,7 @@ def _follow(
     sights, variances, seen = frame
     state, arrays = context.state, context.derived.arrays
     assert arrays is not None
-    dt_s = (t_ns - body.t_ns) * 1e-9
+    dt_s = min((t_ns - body.t_ns) * 1e-9, LONGEST_S)
     if dt_s > 0.0:
         elapse(body.displacement, body.basis, body.drift, body.twist, body.rate, body.covariance, dt_s)
         body.t_ns = t_ns
@@ -224,12 +234,25 @@ def _follow(
         body.basis, body.points, pose, arrays.matrices[camera : camera + 1], carrier, sights, seen
     )
     gate = gate_threshold(context.settings.gate_sigma)
-    used = _explained(body, left, J, variances, seen, gate)
+    since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
+    lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
+    used = None if lost else _explained(body, left, J, variances, seen, gate)
     if used is None:
-        since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
-        used = _odd(body, camera, t_ns, (left, J, variances, seen), since_s, gate, state)
-    if used is None:
-        return
+        found, moved_px, rest_px = jumped(
+            body.basis, body.points, pose, arrays.matrices[camera : camera + 1], carrier, sights, seen
+        )
+        if lost and rest_px <= RIGID_PX:
+            widen(body, FOUND_PX)
+            body.odd, body.told[:] = 0, False
+        elif lost or not _jumps(body, camera, t_ns, (moved_px, rest_px), since_s, state):
+            return
+        body.displacement[:] = found
+        left, J = compare(
+            body.basis, body.points, found, arrays.matrices[camera : camera + 1], carrier, sights, seen
+        )
+        used = _explained(body, left, J, variances, seen, gate)
+        if used is None:
+            return
     fold_frame(
         body.displacement, body.basis, body.twist, body.rate, body.covariance, left, J, variances, used
     )
@@ -250,29 +273,27 @@ def _explained(
     return None
 
 
-def _odd(
-    body: TargetBody, camera: int, t_ns: int, frame: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    since_s: float, gate: float, state: CoreState,
-) -> FloatArray | None:  # fmt: skip
-    """The markers (k,) of a frame that the predicted motion does not explain, where another motion of the target does;
-    None where it may be something else, or is not decided yet.
+def _jumps(
+    body: TargetBody, camera: int, t_ns: int, jump: tuple[float, float], since_s: float, state: CoreState
+) -> bool:
+    """Whether a frame that the predicted motion does not explain, is that of a target which went otherwise: by so many
+    pixels, and what that leaves. It may be something else, or not decided yet.
     """
-    left, J, variances, seen = frame
+    moved_px, rest_px = jump
     body.odd_ns[camera] = t_ns
     recent = np.maximum(body.seen_ns, body.odd_ns) > t_ns - RECENT_NS
     if bool((body.odd_ns[recent] == 0).any()):
-        return None  # the others agree: it is the camera
+        return False  # the others agree: it is the camera
     body.odd += 1
-    moved_px, rest_px = moved_by(left, J, seen)
     if not rest_px <= RIGID_PX:
-        return None
+        return False
     quick = moved_px > SPEED_PX * since_s + SMALL_PX
     named = any(verdict.kind in OTHERS for verdict in (*state.watching.last, state.watching.verdict))
     if quick and (named or body.odd < FOUND_ANEW):
-        return None
-    widen(body, moved_px + SMALL_PX)
+        return False
+    widen(body, FOUND_PX + 0.1 * moved_px)
     body.odd, body.told[:] = 0, not quick
-    return _explained(body, left, J, variances, seen, gate)
+    return True
 
 
 def _look_whether_still(body: TargetBody, t_ns: int, matrix: FloatArray, carrier: FloatArray) -> None:

@@ -67,10 +67,11 @@ def drives_of_cell(cell: CellFile, cell_dir: Path = Path()) -> tuple[CanOptions,
             f"cell {cell.cell.name!r}: joints.driver is {cell.joints.driver!r}; drives are emulated for 'canopen' "
             "(the shipped cell 'hil-can' is one)"
         )
-    unknown = [name for name in cell.emulate if name not in ("drives", "cameras")]
+    unknown = [name for name in cell.emulate if name not in ("drives", "cameras", "conveyor")]
     if unknown:
         raise EmulationError(
-            f"cell {cell.cell.name!r}: emulate.{unknown[0]} is unknown; valid: emulate.drives, emulate.cameras"
+            f"cell {cell.cell.name!r}: emulate.{unknown[0]} is unknown; valid: emulate.drives, emulate.cameras, "
+            "emulate.conveyor"
         )
     options = can_options(cell.joints.options, cell_dir)
     try:
