@@ -1,0 +1,113 @@
+"""The model that a recording is examined with: learnt from the stretch of it that fits best, since something may have
+happened in the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.examination.recorded_views import (
+    LearningStops,
+    RecordedViews,
+    instants,
+    learning_stops,
+    single_joint_motions,
+    stop_positions,
+)
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.kinematics.covariance import pixel_covariances
+from stereoservo.numerics.arrays import IntArray
+
+AS_GOOD = 1.1
+"""The whole is taken where it scatters no more than so many times the best half."""
+
+
+@dataclass(frozen=True)
+class ReferenceModel:
+    """A ``fit`` to the ``stops`` of frames ``first`` to ``last``."""
+
+    fit: CalibrationFit
+    stops: LearningStops
+    first: int
+    last: int
+
+    @property
+    def middle(self) -> int:
+        """A frame that the model is of."""
+        return (self.first + self.last) // 2
+
+    @property
+    def noise_factor(self) -> float:
+        """Noise of the pixels over what is stated, 1 at least."""
+        return max(1.0, self.fit.report.sigma_factor)
+
+    @property
+    def scatter_px(self) -> float:
+        """rms deviation [px] that the model expects of a pixel at its stops, errors of the joints included."""
+        _, covariances = pixel_covariances(self.fit.model, self.stops.trials.positions)
+        own = (self.noise_factor * float(np.median(self.stops.trials.sigmas))) ** 2
+        return float(np.sqrt(0.5 * np.trace(np.median(covariances, axis=(0, 1, 2))) + own))
+
+
+class LearningError(Exception):
+    """No stretch of a recording gives a model; ``stops``: those of the last attempt, ``error``: its refusal."""
+
+    def __init__(self, error: CalibrationError, stops: LearningStops) -> None:
+        super().__init__(str(error))
+        self.error, self.stops = error, stops
+
+
+def learn_reference(views: RecordedViews) -> ReferenceModel:
+    """The model of the best stretch. Raises LearningError where there is none, CalibrationError (``bad_data``,
+    ``too_few_stops``).
+    """
+    if not len(views.camera):
+        raise CalibrationError("too_few_stops", "the recording has no frame that shows a marker", stops=0)
+    if views.generators is None:
+        return _attempt(views, *_single_joint_stretch(views))
+    f = len(views.camera)
+    found: list[ReferenceModel] = []
+    failed: LearningError | None = None
+    for first, last in ((0, f - 1), (0, f // 2 - 1), (f // 2, f - 1)):
+        try:
+            found.append(_attempt(views, first, last))
+        except LearningError as error:
+            failed = failed or error
+    if not found:
+        assert failed is not None
+        raise failed
+    best = min(found, key=lambda one: one.scatter_px)
+    whole = found[0]
+    return whole if whole.scatter_px <= AS_GOOD * best.scatter_px else best
+
+
+def _attempt(views: RecordedViews, first: int, last: int) -> ReferenceModel:
+    stops = learning_stops(views.select(np.arange(first, last + 1)))
+    stops = LearningStops(stops.trials, stops.frames + first)
+    try:
+        return ReferenceModel(fit_model(stops.trials, epoch=1), stops, first, last)
+    except CalibrationError as error:
+        raise LearningError(error, stops) from error
+
+
+def _single_joint_stretch(views: RecordedViews) -> tuple[int, int]:
+    """First and last frame of the motions of single joints. Raises CalibrationError (``too_few_stops``)."""
+    instant = instants(views)
+    alone = single_joint_motions(stop_positions(views, instant))
+    missing = [name for j, name in enumerate(views.joint_names) if not (alone == j).any()]
+    if missing:
+        raise CalibrationError(
+            "too_few_stops",
+            f"joint {', '.join(missing)} never moves alone over four stops or more in this recording, and where an arm's "
+            "axes are not known they are learnt from that. Move each joint by itself once, or give the hand's poses in "
+            "place of joints",
+            joints=missing,
+        )
+    stops = np.unique(instant[instant >= 0])
+    moving: IntArray = stops[alone >= 0]
+    frames = np.flatnonzero((instant >= moving[0]) & (instant <= moving[-1]))
+    return int(frames[0]), int(frames[-1])
