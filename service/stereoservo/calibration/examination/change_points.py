@@ -35,7 +35,7 @@ from stereoservo.calibration.examination.examined_frames import (
     frames_concerned,
 )
 from stereoservo.calibration.examination.recorded_views import RecordedViews
-from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 FALSE_ALARM = 0.001
 """Probability that a recording to which nothing has happened is said to have any change."""
@@ -97,38 +97,44 @@ def best_change(
 ) -> ChangePoint | None:
     """The most probable significant change, None where there is none; ``middle``: a frame that the model is of."""
     here = problem.residuals_at(start_state(problem))
-    candidates = [_first_order(problem, views, one, here, middle) for one in tested]
+    found = likely_changes(problem, views, tested, middle)
     count = here.size
     limits = check_thresholds(FALSE_ALARM, len(tested) * len(views.camera), count)
-    size = np.array([one.change.size for one in tested], dtype=np.int64)
-    gains = np.array([one.gain for one in candidates])
-    chosen = np.argsort(-(gains - size * math.log(count)))[:REFINED]
-    found = [_refined(problem, views, candidates[i], here) for i in chosen.tolist()]
     chi2 = float(here @ problem.whitened(here))
     left = np.array([chi2 - one.ratio for one in found])
-    sizes = size[chosen]
+    sizes = np.array([one.hypothesis.change.size for one in found], dtype=np.int64)
     every = np.ones(len(found), dtype=np.bool_)
     noise = noise_level(left, sizes, every, count)
-    first = int(
-        np.argmin([penalised_chi2(c, s, noise, math.log(count)) for c, s in zip(left, sizes, strict=True)])
-    )
-    noise *= _correlation(problem, views, found[first])
+    scores = [_score(left, sizes, k, noise, count) for k in range(len(found))]
+    noise *= _correlation(problem, views, found[int(np.argmin(scores))])
     effects = np.array([one.effect_px for one in found])
     best, second = two_best(
         chi2, left, sizes, effects, every, noise, math.log(count), limits.ratios, LEAST_PX
     )
     if best < 0:
         return None
-    if second >= 0 and _apart(left, sizes, best, second, noise, count) < UNCLEAR:
+    if (
+        second >= 0
+        and _score(left, sizes, second, noise, count) - _score(left, sizes, best, noise, count) < UNCLEAR
+    ):
         return replace(found[best], runner_up=found[second].hypothesis)
     return found[best]
 
 
-def _apart(left: FloatArray, sizes: FloatArray, best: int, second: int, noise: float, count: int) -> float:
-    price = math.log(count)
-    return penalised_chi2(left[second], sizes[second], noise, price) - penalised_chi2(
-        left[best], sizes[best], noise, price
-    )
+def likely_changes(
+    problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], middle: int
+) -> list[ChangePoint]:
+    """The changes of the largest gain to first order, significant or not, estimated in full, the likeliest first."""
+    here = problem.residuals_at(start_state(problem))
+    candidates = [_first_order(problem, views, one, here, middle) for one in tested]
+    price = math.log(here.size)
+    order = np.argsort([one.hypothesis.change.size * price - one.gain for one in candidates])[:REFINED]
+    found = [_refined(problem, views, candidates[i]) for i in order.tolist()]
+    return sorted(found, key=lambda one: one.hypothesis.change.size * price - one.ratio)
+
+
+def _score(left: FloatArray, sizes: IntArray, k: int, noise: float, count: int) -> float:
+    return penalised_chi2(float(left[k]), int(sizes[k]), noise, math.log(count))
 
 
 def _by_frame(problem: ExaminedFrames, frames: int, rows: FloatArray) -> FloatArray:
@@ -193,8 +199,9 @@ def _frames_of(one: _Candidate, views: RecordedViews, onset: int) -> BoolArray:
     return np.asarray(shown & mine)
 
 
-def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate, here: FloatArray) -> ChangePoint:
+def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> ChangePoint:
     """A candidate estimated in full, with the onset at which it then explains most."""
+    here = problem.residuals_at(start_state(problem))
     change, onset, x = one.hypothesis.change, one.onset, None
     span = (onset, onset)
     for _ in range(SETTLED):

@@ -13,19 +13,29 @@ import numpy as np
 from stereoservo.calibration.change.hypothesis_test import is_unexplained
 from stereoservo.calibration.change.model_changes import change_jacobian, estimate_changes, start_state
 from stereoservo.calibration.change.model_check import NOISE_MARGIN, SENTENCES, isolated_outliers
-from stereoservo.calibration.examination.change_points import FALSE_ALARM, ChangePoint, best_change
+from stereoservo.calibration.examination.change_points import (
+    FALSE_ALARM,
+    ChangePoint,
+    best_change,
+    likely_changes,
+)
 from stereoservo.calibration.examination.examined_frames import (
     ExaminedFrames,
     Hypothesis,
+    corrected_views,
     examined_frames,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import Gap, gaps
+from stereoservo.calibration.examination.frame_times import Gap, gaps, step_between
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
+    AS_GOOD,
+    MENDS,
     LearningError,
+    ReferenceModel,
     learn_reference,
 )
+from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
@@ -50,8 +60,9 @@ _Gaps = dict[str, list[Gap] | None]
 
 
 class Onset(msgspec.Struct, frozen=True):
-    """First frame of what has happened: ``frame`` counts those of ``camera`` from 0, ``earliest`` and ``latest`` (likewise)
-    are those that the data do not exclude. ``after_s``: stamp of the camera's last frame before it; both [s] as stamped.
+    """First frame of what has happened: ``frame`` counts those of ``camera`` from 0, ``earliest`` and ``latest``
+    (likewise) are those that the data do not exclude. ``after_s``: stamp of the camera's last frame before it; both
+    [s] as stamped.
     """
 
     camera: str
@@ -95,8 +106,9 @@ class CameraResiduals(msgspec.Struct, frozen=True):
 
 
 class RecordingReport(msgspec.Struct, frozen=True):
-    """Result of an examination. Residuals rms [px] an axis beside the causes found, ``before_px`` with them. ``joints``:
-    of the frames in which a joint is away from its median. ``learnt_from``: first and last frame (of all), stops.
+    """Result of an examination. Residuals rms [px] an axis beside the causes found, ``before_px`` with them.
+
+    ``joints``: of the frames in which a joint is away from its median. ``learnt_from``: first and last frame (of all), stops.
     ``false_alarm``: probability that a recording to which nothing has happened is said to have any change.
     """
 
@@ -121,7 +133,7 @@ def examine_views(views: RecordedViews) -> RecordingReport:
     lost = _dropped(views)
     dropped = {camera.name: gaps(views, c) for c, camera in enumerate(views.cameras)}
     try:
-        reference = learn_reference(views)
+        views, reference, found = _mended(views, learn_reference(views))
     except LearningError as failed:
         return _not_learnt(views, failed, lost, dropped)
     model = reference.fit.model
@@ -130,7 +142,6 @@ def examine_views(views: RecordedViews) -> RecordingReport:
     problem = problem.select(~outliers)
     before = _residuals_px(problem)
     tested = hypotheses(model, views, problem)
-    found: list[ChangePoint] = []
     while len(found) < MOST_CHANGES:
         change = best_change(problem, views, tested, reference.middle)
         if change is None:
@@ -147,6 +158,38 @@ def examine_views(views: RecordedViews) -> RecordingReport:
         tuple(sorted(causes, key=_when)), tuple(reference.fit.report.notes),
         (reference.first, reference.last, len(reference.stops.frames)), int(outliers.sum()),
     )  # fmt: skip
+
+
+def _mended(
+    views: RecordedViews, reference: ReferenceModel
+) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
+    """Recording and model without what happened to joints and stamps while the model was learnt: a change that, taken
+    back, makes the model scatter less.
+    """
+    found: list[ChangePoint] = []
+    while len(found) < MENDS and not reference.fits:
+        exact = msgspec.structs.replace(reference.fit.model, joint_accuracy=None)
+        problem = examined_frames(exact, views, reference.noise_factor)
+        tested = [one for one in hypotheses(exact, views, problem) if one.kind in ("joint", "stamps")]
+        better = None
+        for change in likely_changes(problem, views, tested, reference.middle)[:MENDS]:
+            mended = corrected_views(views, change.hypothesis, change.frames, float(change.x[0]))
+            again = None if mended is None else _learnt(mended)
+            if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
+                better = mended, again, change
+                break
+        if better is None:
+            break
+        views, reference = better[:2]
+        found.append(better[2])
+    return views, reference, found
+
+
+def _learnt(views: RecordedViews) -> ReferenceModel | None:
+    try:
+        return learn_reference(views)
+    except (LearningError, CalibrationError):
+        return None
 
 
 def _when(cause: RecordingCause) -> float:
@@ -273,7 +316,7 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
                 deviation=0.0,
                 unit="frames",
                 gaps=tuple((int(ranks[hole.frame]), hole.missing) for hole in holes[:MOST_GAPS]),
-            )  # fmt: skip
+            )
         )
     return found
 
@@ -294,14 +337,14 @@ def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames
         RecordingCause(
             "unexplained",
             views.cameras[worst].name,
-            f"what is left is {math.sqrt(chi2 / here.size):.3g} times the expected noise and no single change explains it: "
-            f"most in camera {views.cameras[worst].name} ({by_camera[worst]:.3g} times), the largest at frame "
-            f"{onset.frame} of camera {onset.camera} ({math.sqrt(float(frame[one])):.3g} times). Detections that are worse "
-            "than stated, play or errors of the joints (or of the poses), stamps that scatter; a marker that stands "
+            f"what is left is {math.sqrt(chi2 / here.size):.3g} times the expected noise and no single change explains "
+            f"it: most in camera {views.cameras[worst].name} ({by_camera[worst]:.3g} times), the largest at frame "
+            f"{onset.frame} of camera {onset.camera} ({math.sqrt(float(frame[one])):.3g} times). Detections that are "
+            "worse than stated, play or errors of the joints (or of the poses), stamps that scatter; a marker that stands "
             "still, and frames at rest, would tell pictures from joints",
             onset,
             _rms(_residuals_px(problem)),
-        )  # fmt: skip
+        )
     ]
 
 
@@ -309,14 +352,16 @@ def _not_learnt(
     views: RecordedViews, failed: LearningError, lost: list[RecordingCause], dropped: _Gaps
 ) -> RecordingReport:
     """The report where no model can be learnt: the refusal of the fit is the cause, with the frame of its stop."""
-    error, onset = failed.error, None
+    error = failed.error
+    onset: Onset | None = None
     names = [camera.name for camera in views.cameras]
     stop, camera = error.data.get("stop"), error.data.get("camera")
     if isinstance(stop, int) and 0 <= stop < len(failed.stops.frames):
-        frame = int(failed.stops.frames[stop])
-        before = int(failed.stops.frames[max(0, stop - 1)])
-        c = names.index(camera) if camera in names else int(views.camera[frame])
-        onset = _onset(views, frame, (min(before + 1, frame), frame), c)
+        frames = failed.stops.frames
+        c = names.index(camera) if camera in names else int(views.camera[frames[stop]])
+        around = frames[max(0, stop - 3)], frames[min(stop + 3, len(frames) - 1)]
+        between = frames[max(0, stop - 1)], frames[stop]
+        onset = _onset(views, *step_between(views, c, around, between), c)
     kind: RecordingCauseKind = "not_learnt"
     if error.code == "camera_moved":
         kind = "camera_moved"

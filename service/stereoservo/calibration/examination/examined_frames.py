@@ -52,7 +52,7 @@ class ExaminedFrames(LinearisedProblem):
 
     @cached_property
     def _whiteners(self) -> tuple[IntArray, FloatArray]:
-        """Of each row its place (2 k,) in a padded table of frames (f, w), and the matrices (f, w, w) that whiten it."""
+        """Of each row its place (2 k,) in a padded table of frames (f, w), and matrices (f, w, w) that whiten it."""
         frame = np.repeat(self.data.stop, 2)
         _, begin, which = np.unique(frame, return_index=True, return_inverse=True)
         place = np.arange(len(frame)) - begin[which]
@@ -138,6 +138,29 @@ def _late(views: RecordedViews, problem: ExaminedFrames, subject: str, frames: B
         return state[0], state[1] + apart[:, order]
 
     return Hypothesis("stamps", subject, ModelChange("joint", subject, 1, apply))
+
+
+def corrected_views(
+    views: RecordedViews, one: Hypothesis, frames: BoolArray, x: float
+) -> RecordedViews | None:
+    """The recording as it would be without a change ``x`` of a joint's zero, or of stamps, in ``frames`` (f,); None
+    where it is a change of another kind.
+    """
+    if one.kind == "stamps":
+        times = np.where(frames, views.times + x, views.times)
+        order = np.argsort(times, kind="stable")
+        return replace(views, times=times).select(order)
+    if one.kind != "joint" or not frames.any():
+        return None
+    shown = views.times[frames]
+    readings = (views.joint_times >= shown[0]) & (views.joint_times <= shown[-1])
+    if frames[0]:
+        readings |= views.joint_times < shown[0]
+    if frames[-1]:
+        readings |= views.joint_times > shown[-1]
+    positions = views.positions.copy()
+    positions[readings, views.joint_names.index(one.subject)] += x
+    return replace(views, positions=positions)
 
 
 def frames_concerned(hypothesis: Hypothesis, views: RecordedViews) -> IntArray:

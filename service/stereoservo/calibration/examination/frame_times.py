@@ -1,4 +1,6 @@
-"""Frames that a camera dropped, by its numbers where it counts them, else by gaps between stamps."""
+"""What frames tell by themselves, without a model: those that a camera dropped, by its numbers where it counts them, else
+by gaps between stamps; and where its pixels jump beside what the joints do.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +8,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.calibration.examination.recorded_views import RecordedViews
+from stereoservo.calibration.examination.recorded_views import ALONE, RecordedViews
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 GAP, JITTERS = 1.5, 6.0
 """A gap is longer than so many periods, and than a period by so many times the stamps' scatter."""
 REGULAR, NEAR = 0.8, 0.25
 """Share of the intervals that must be within a share of the period for there to be one."""
+
+LASTING = 3
+"""Frames beside the terms of a course from which a step can be told from it."""
+CREDIBLE = 9.2
+"""Difference of chi-square within which another onset is not excluded: odds of 100 to 1."""
 
 
 class Gap(NamedTuple):
@@ -49,3 +56,44 @@ def _missing(intervals: FloatArray, same: np.ndarray[tuple[int], np.dtype[np.boo
     long = intervals > max(GAP * period, period + JITTERS * jitter)
     found: IntArray = np.where(long, np.round(intervals / period).astype(np.int64) - 1, 0)
     return found
+
+
+def step_between(
+    views: RecordedViews, camera: int, around: tuple[int, int], between: tuple[int, int]
+) -> tuple[int, tuple[int, int]]:
+    """Frame after ``between[0]``, up to ``between[1]``, from which on a camera's pixels are best explained by a step
+    beside quadratics of the joints, by the frames ``around``; and the span of such frames that are not excluded.
+    """
+    first, last = (int(one) for one in between)
+    mine = np.flatnonzero(views.camera == camera)
+    mine = mine[(mine >= around[0]) & (mine <= around[1])]
+    mine = mine[views.seen[mine].any(axis=1)]
+    onsets = mine[(mine > first) & (mine <= last)]
+    joints = views.at(views.times[mine])
+    spread = np.ptp(joints, axis=0)
+    moved = joints[:, spread > ALONE]
+    moved = (moved - moved.mean(axis=0)) / np.maximum(np.ptp(moved, axis=0), 1e-12)
+    terms = np.hstack([np.ones((len(mine), 1)), moved, moved**2])
+    if len(onsets) < 2 or len(mine) < terms.shape[1] + LASTING:
+        return last, (min(first + 1, last), last)
+    costs = []
+    for onset in onsets.tolist():
+        design = np.hstack([terms, (mine >= onset).astype(np.float64)[:, None]])
+        costs.append(sum(_misfit(design, views, mine, marker) for marker in range(views.pixels.shape[1])))
+    best = int(np.argmin(costs))
+    # In the noise that the best onset leaves.
+    rows = 2 * int(views.seen[mine].sum())
+    level = max(float(costs[best]) / rows, 1e-12)
+    near = onsets[np.array(costs) <= costs[best] + CREDIBLE * level]
+    return int(onsets[best]), (int(near[0]), int(near[-1]))
+
+
+def _misfit(design: FloatArray, views: RecordedViews, frames: IntArray, marker: int) -> float:
+    """Squares [sigmas²] that a linear model leaves of a marker's pixels in some frames."""
+    known = views.seen[frames, marker]
+    if known.sum() <= design.shape[1]:
+        return 0.0
+    at = frames[known]
+    pixels = views.pixels[at, marker] / views.sigmas[at, marker, None]
+    answer = np.linalg.lstsq(design[known], pixels, rcond=None)[0]
+    return float(((pixels - design[known] @ answer) ** 2).sum())

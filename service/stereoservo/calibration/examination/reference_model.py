@@ -24,6 +24,9 @@ from stereoservo.numerics.arrays import IntArray
 
 AS_GOOD = 1.1
 """The whole is taken where it scatters no more than so many times the best half."""
+GOOD = 1.5
+"""A model that scatters more than so many times the noise is asked whether something happened while it was learnt."""
+MENDS = 3
 
 
 @dataclass(frozen=True)
@@ -40,16 +43,24 @@ class ReferenceModel:
         """A frame that the model is of."""
         return (self.first + self.last) // 2
 
+    noise: float
+    """Noise of the pixels over what is stated, as they differ from frame to frame, 1 at least."""
+
     @property
     def noise_factor(self) -> float:
-        """Noise of the pixels over what is stated, 1 at least."""
-        return max(1.0, self.fit.report.sigma_factor)
+        """Noise of the pixels over what is stated, 1 at least: what they leave may be more than noise."""
+        return max(1.0, min(self.fit.report.sigma_factor, self.noise))
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing but noise, of pixels and within it of joints, is left."""
+        return self.scatter_px <= GOOD * self.noise * float(np.median(self.stops.trials.sigmas))
 
     @property
     def scatter_px(self) -> float:
         """rms deviation [px] that the model expects of a pixel at its stops, errors of the joints included."""
         _, covariances = pixel_covariances(self.fit.model, self.stops.trials.positions)
-        own = (self.noise_factor * float(np.median(self.stops.trials.sigmas))) ** 2
+        own = (max(1.0, self.fit.report.sigma_factor) * float(np.median(self.stops.trials.sigmas))) ** 2
         return float(np.sqrt(0.5 * np.trace(np.median(covariances, axis=(0, 1, 2))) + own))
 
 
@@ -85,11 +96,26 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
     return whole if whole.scatter_px <= AS_GOOD * best.scatter_px else best
 
 
+def frame_noise(views: RecordedViews) -> float:
+    """Noise of the pixels over the stated one: median second difference of each marker from frame to frame of a camera,
+    1 at least.
+    """
+    apart = []
+    for c in range(len(views.cameras)):
+        mine = views.camera == c
+        pixels, sigmas = views.pixels[mine], views.sigmas[mine]
+        apart.append(((pixels[2:] - 2.0 * pixels[1:-1] + pixels[:-2]) / sigmas[1:-1, :, None]).ravel())
+    found = np.abs(np.concatenate(apart))
+    found = found[np.isfinite(found)]
+    return max(1.0, 1.4826 * float(np.median(found)) / np.sqrt(6.0)) if len(found) else 1.0
+
+
 def _attempt(views: RecordedViews, first: int, last: int) -> ReferenceModel:
     stops = learning_stops(views.select(np.arange(first, last + 1)))
     stops = LearningStops(stops.trials, stops.frames + first)
     try:
-        return ReferenceModel(fit_model(stops.trials, epoch=1), stops, first, last)
+        fit = fit_model(stops.trials, epoch=1)
+        return ReferenceModel(fit, stops, first, last, frame_noise(views))
     except CalibrationError as error:
         raise LearningError(error, stops) from error
 
@@ -102,8 +128,8 @@ def _single_joint_stretch(views: RecordedViews) -> tuple[int, int]:
     if missing:
         raise CalibrationError(
             "too_few_stops",
-            f"joint {', '.join(missing)} never moves alone over four stops or more in this recording, and where an arm's "
-            "axes are not known they are learnt from that. Move each joint by itself once, or give the hand's poses in "
+            f"joint {', '.join(missing)} never moves alone over four stops or more in this recording, and where an "
+            "arm's axes are not known they are learnt from that. Move each joint by itself once, or give the hand's poses in "
             "place of joints",
             joints=missing,
         )

@@ -25,7 +25,7 @@ from stereoservo.calibration.examination.examination import (
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.known_arm.free_arm import KINDS, NAMES, free_arm
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.experiment import draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.summaries import count_row
@@ -168,12 +168,14 @@ def _recorded(truth: _Truth, kind: str, rng: np.random.Generator) -> RecordedVie
         size = float(np.exp(rng.uniform(*np.log(DRIFTS))))
         drift = _drift(cell, joint, size, shown[0, later])
         truth.faults.append(
-            TrueFault("joint_zero", "" if truth.poses else cell.joint_names[joint], frame, drift[joint])
+            TrueFault(
+                "joint_zero", "" if truth.poses else cell.joint_names[joint], frame, float(drift[joint])
+            )
         )
     pixels = np.empty((2, len(times), len(cell.body), 2))
     for part, seen in ((~later, cell), (later, bumped)):
         offset = drift if part is later else 0.0 * drift
-        for c in range(2):
+        for c in range(2) if part.any() else ():
             pixels[c, part] = seen.pixels(shown[c, part] + offset)[c]
             inside = seen.in_view(shown[c, part] + offset)[c]
             pixels[c, part] = np.where(inside[..., None], pixels[c, part], np.nan)
@@ -253,7 +255,7 @@ def _with_drops(views: RecordedViews, truth: _Truth, rng: np.random.Generator) -
 
 class ExaminedVerdict(msgspec.Struct, frozen=True):
     """Of a case: ``true`` faults, those ``found``, with the ``late_by`` frames of their onsets, those ``missed``, causes
-    ``falsely`` told, and those named beside another as not told apart (``unsure``). ``code``: refused.
+    that are ``falsely`` told, and those that are named beside another, as not told apart (``unsure``).
     """
 
     seed: int
@@ -396,6 +398,6 @@ def show_examined_recordings(answer: dict[str, Any], console: Console) -> None:
     console.print(f"faults within the trial motions: {answer['in_trial_motions']}")
     for case in answer["beyond"]:
         console.print(
-            f"case {case['seed']}: true {case['true']}, missed {case['missed']}, falsely {case['falsely']}, onsets off by "
-            f"{case['late_by']} frames (size {case['size']:.3g}, noise {case['sigma_px']:.3g} px)"
+            f"case {case['seed']}: true {case['true']}, missed {case['missed']}, falsely {case['falsely']}, onsets off "
+            f"by {case['late_by']} frames (size {case['size']:.3g}, noise {case['sigma_px']:.3g} px)"
         )
