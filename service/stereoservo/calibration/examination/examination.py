@@ -5,6 +5,7 @@ stamps and frames, each with its onset, size and deviation.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import msgspec
@@ -40,6 +41,10 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 MOST_CHANGES = 8
+TRIED = 2
+"""Changes that are taken back to see whether the model is better without."""
+SAME_ONSET = 4
+"""Frames within which two onsets are one."""
 AWAY = 0.2
 """Share of its largest distance from its median from which a joint is away from it."""
 MOST_GAPS = 20
@@ -49,7 +54,7 @@ UNKNOWN_S = 0.05
 
 RecordingCauseKind = Literal[
     "camera_moved", "cameras_moved", "body_moved", "marker_slipped", "joint_zero", "late_stamps", "dropped_frames",
-    "unexplained", "not_learnt",
+    "joint_errors", "unexplained", "not_learnt",
 ]  # fmt: skip
 _KINDS: dict[str, RecordingCauseKind] = {
     "camera": "camera_moved", "cameras": "cameras_moved", "body": "body_moved", "marker": "marker_slipped",
@@ -108,7 +113,8 @@ class CameraResiduals(msgspec.Struct, frozen=True):
 class RecordingReport(msgspec.Struct, frozen=True):
     """Result of an examination. Residuals rms [px] an axis beside the causes found, ``before_px`` with them.
 
-    ``joints``: of the frames in which a joint is away from its median. ``learnt_from``: first and last frame (of all), stops.
+    ``joints``: of the frames in which a joint is away from its median. ``learnt_from``: first and last frame (of all),
+    stops.
     ``false_alarm``: probability that a recording to which nothing has happened is said to have any change.
     """
 
@@ -148,8 +154,9 @@ def examine_views(views: RecordedViews) -> RecordingReport:
             break
         found.append(change)
         problem = _without(problem, change)
+    found = _merged(found)
     causes = [_cause(model, views, change) for change in found] + lost
-    causes += _unexplained(model, views, problem)
+    causes += _joint_errors(reference) + _unexplained(model, views, problem)
     left = _residuals_px(problem)
     return RecordingReport(
         _rms(left), _rms(before), float(np.median(problem.data.sigmas)), model.stratum,
@@ -171,18 +178,67 @@ def _mended(
         exact = msgspec.structs.replace(reference.fit.model, joint_accuracy=None)
         problem = examined_frames(exact, views, reference.noise_factor)
         tested = [one for one in hypotheses(exact, views, problem) if one.kind in ("joint", "stamps")]
-        better = None
-        for change in likely_changes(problem, views, tested, reference.middle)[:MENDS]:
-            mended = corrected_views(views, change.hypothesis, change.frames, float(change.x[0]))
-            again = None if mended is None else _learnt(mended)
-            if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
-                better = mended, again, change
+        for change in likely_changes(problem, views, tested, reference.middle)[:TRIED]:
+            better = _taken_back(views, reference, change)
+            if better is not None:
                 break
-        if better is None:
+        else:
             break
-        views, reference = better[:2]
-        found.append(better[2])
+        views, reference, change = better
+        found.append(change)
     return views, reference, found
+
+
+def _taken_back(
+    views: RecordedViews, reference: ReferenceModel, change: ChangePoint
+) -> tuple[RecordedViews, ReferenceModel, ChangePoint] | None:
+    """Recording and model with a change taken back, and the change as it then was; None where the model is no better.
+
+    The model was learnt with the change in it and hides a part of it: the square of its scatter is a parabola of what
+    is taken back.
+    """
+    x, squares = float(change.x[0]), [reference.scatter_px**2]
+    best: tuple[RecordedViews, ReferenceModel, float] | None = None
+    for share in (1.0, 2.0, 0.0):
+        if share == 0.0:
+            bend = squares[0] - 2.0 * squares[1] + squares[2]
+            if not bend > 0.0:
+                break
+            share = 1.0 + 0.5 * (squares[0] - squares[2]) / bend
+        mended = corrected_views(views, change.hypothesis, change.frames, share * x)
+        again = None if mended is None else _learnt(mended)
+        if mended is None or again is None:
+            break
+        squares.append(again.scatter_px**2)
+        if not again.scatter_px < reference.scatter_px:
+            break
+        if best is None or again.scatter_px < best[1].scatter_px:
+            best = mended, again, share
+    if best is None or not best[1].scatter_px * AS_GOOD < reference.scatter_px:
+        return None
+    views, again, share = best
+    whole = replace(change, x=share * change.x, effect=share * change.effect)
+    return views, again, whole
+
+
+def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
+    """Changes of one parameter with those that only add to them: of the same subject, from the same frame on."""
+    kept: list[ChangePoint] = []
+    for one in found:
+        same = [
+            k for k, other in enumerate(kept)
+            if len(one.x) == 1 and one.hypothesis.kind == other.hypothesis.kind
+            and one.hypothesis.subject == other.hypothesis.subject and one.after == other.after
+            and abs(one.onset - other.onset) <= SAME_ONSET
+        ]  # fmt: skip
+        if same:
+            other = kept[same[0]]
+            x = other.x + one.x
+            effect = other.effect * float(x[0] / other.x[0])
+            kept[same[0]] = replace(other, x=x, effect=effect, covariance=one.covariance)
+        else:
+            kept.append(one)
+    return kept
 
 
 def _learnt(views: RecordedViews) -> ReferenceModel | None:
@@ -321,6 +377,30 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
     return found
 
 
+def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
+    """Errors of the joints' readings, or of the poses, that the model found where it was learnt and scatters by."""
+    errors = {
+        one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture]))
+        for one in reference.fit.report.joints
+    }
+    if reference.fits or not errors:
+        return []
+    listed = ", ".join(f"{name} {error:.2g}" for name, error in errors.items())
+    worst = max(errors, key=lambda name: errors[name])
+    return [
+        RecordingCause(
+            "joint_errors",
+            worst,
+            f"readings of the joints (or poses) are wrong by deviations of [rad or m] {listed}, so that pixels scatter "
+            f"by {reference.scatter_px:.3g} px where the model was learnt: play, ripple, coarse encoders, or a zero that "
+            "drifted meanwhile. What would tell: the same motions once more, which repeat ripple, and play by "
+            "direction",
+            effect_px=reference.scatter_px,
+            value=errors[worst],
+        )
+    ]
+
+
 def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames) -> list[RecordingCause]:
     """What is left beside the causes, where it is no noise."""
     here = problem.residuals_at(start_state(problem))
@@ -340,8 +420,8 @@ def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames
             f"what is left is {math.sqrt(chi2 / here.size):.3g} times the expected noise and no single change explains "
             f"it: most in camera {views.cameras[worst].name} ({by_camera[worst]:.3g} times), the largest at frame "
             f"{onset.frame} of camera {onset.camera} ({math.sqrt(float(frame[one])):.3g} times). Detections that are "
-            "worse than stated, play or errors of the joints (or of the poses), stamps that scatter; a marker that stands "
-            "still, and frames at rest, would tell pictures from joints",
+            "worse than stated, play or errors of the joints (or of the poses), stamps that scatter; a marker that "
+            "stands still, and frames at rest, would tell pictures from joints",
             onset,
             _rms(_residuals_px(problem)),
         )

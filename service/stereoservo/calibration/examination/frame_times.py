@@ -1,5 +1,5 @@
-"""What frames tell by themselves, without a model: those that a camera dropped, by its numbers where it counts them, else
-by gaps between stamps; and where its pixels jump beside what the joints do.
+"""What frames tell by themselves, without a model: those that a camera dropped, by its numbers where it counts them,
+else by gaps between stamps; and where its pixels jump beside what the joints do.
 """
 
 from __future__ import annotations

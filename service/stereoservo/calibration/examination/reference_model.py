@@ -26,7 +26,8 @@ AS_GOOD = 1.1
 """The whole is taken where it scatters no more than so many times the best half."""
 GOOD = 1.5
 """A model that scatters more than so many times the noise is asked whether something happened while it was learnt."""
-MENDS = 3
+MENDS = 2
+"""Times that something is taken back."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,8 @@ def _single_joint_stretch(views: RecordedViews) -> tuple[int, int]:
         raise CalibrationError(
             "too_few_stops",
             f"joint {', '.join(missing)} never moves alone over four stops or more in this recording, and where an "
-            "arm's axes are not known they are learnt from that. Move each joint by itself once, or give the hand's poses in "
-            "place of joints",
+            "arm's axes are not known they are learnt from that. Move each joint by itself once, or give the hand's "
+            "poses in place of joints",
             joints=missing,
         )
     stops = np.unique(instant[instant >= 0])
