@@ -392,8 +392,8 @@ def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
             "joint_errors",
             worst,
             f"readings of the joints (or poses) are wrong by deviations of [rad or m] {listed}, so that pixels scatter "
-            f"by {reference.scatter_px:.3g} px where the model was learnt: play, ripple, coarse encoders, or a zero that "
-            "drifted meanwhile. What would tell: the same motions once more, which repeat ripple, and play by "
+            f"by {reference.scatter_px:.3g} px where the model was learnt: play, ripple, coarse encoders, or a zero "
+            "that drifted meanwhile. What would tell: the same motions once more, which repeat ripple, and play by "
             "direction",
             effect_px=reference.scatter_px,
             value=errors[worst],
