@@ -289,6 +289,10 @@ def _onset(views: RecordedViews, frame: int, span: tuple[int, int], camera: int)
     )  # fmt: skip
 
 
+def _stamp(views: RecordedViews, onset: Onset) -> str:
+    return f"{onset.time_s:.3f} s" if views.timed else f"index {onset.time_s:g}"
+
+
 def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float | None, str]:
     """Size, deviation and unit of a change: of a turn its angle, of the earlier frames seen from the later ones."""
     x, covariance = change.x, change.covariance
@@ -324,7 +328,7 @@ def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> Recor
         own = one.kind in ("camera", "stamps") and one.subject
         camera = names.index(one.subject) if own else int(views.camera[change.onset])
         onset = _onset(views, change.onset, change.span, camera)
-        text += f", from frame {onset.frame} of camera {onset.camera} on ({onset.time_s:.3f} s)"
+        text += f", from frame {onset.frame} of camera {onset.camera} on ({_stamp(views, onset)})"
     or_else = tells = ""
     if change.runner_up is not None:
         or_else = _sentence(model, change.runner_up, None, None)
@@ -366,7 +370,7 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
                 "dropped_frames",
                 camera.name,
                 f"camera {camera.name} dropped {total} frames in {len(holes)} gaps, the first before its frame "
-                f"{onset.frame} ({onset.time_s:.3f} s)",
+                f"{onset.frame} ({_stamp(views, onset)})",
                 onset,
                 value=float(total),
                 deviation=0.0,
