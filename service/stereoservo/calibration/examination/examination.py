@@ -36,6 +36,7 @@ from stereoservo.calibration.examination.reference_model import (
     ReferenceModel,
     learn_reference,
 )
+from stereoservo.calibration.shutter_offset import LEAST_DEVIATION_S
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
@@ -299,7 +300,7 @@ def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float 
     one = change.hypothesis
     sign = 1.0 if change.after else -1.0
     if one.kind == "stamps":
-        return sign * float(x[0]), float(np.sqrt(covariance[0, 0])), "s"
+        return sign * float(x[0]), max(float(np.sqrt(covariance[0, 0])), LEAST_DEVIATION_S), "s"
     if one.kind == "joint":
         kind = model.joint_kinds[model.joint_names.index(one.subject)]
         return sign * float(x[0]), float(np.sqrt(covariance[0, 0])), "rad" if kind == "revolute" else "m"
@@ -492,10 +493,10 @@ def _by_camera(
                 and one.hypothesis.subject in ("", camera.name)
             ]  # fmt: skip
             if known:
-                own = max(float(np.sqrt(one.covariance[0, 0])) for one in known)
+                own = max(LEAST_DEVIATION_S, *(float(np.sqrt(one.covariance[0, 0])) for one in known))
                 offset = sum(float(one.x[0]) for one in known), own
             elif deviation <= UNKNOWN_S:
-                offset = float(estimate.x[0]), deviation
+                offset = float(estimate.x[0]), max(deviation, LEAST_DEVIATION_S)
         answers[camera.name] = CameraResiduals(
             int((views.camera == c).sum()), _rms(left[mine]), _count(dropped[camera.name]), *offset
         )
