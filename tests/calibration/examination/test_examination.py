@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,8 +22,8 @@ from stereoservo_sim.experiments.cameras.examined_recordings import (
     run_examined_recordings,
 )
 
-BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, DRIFTED_IN_TRIALS, POSES = 5, 11, 8, 2, 7, 12
-"""Seeds of cases."""
+BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, STOP_MISTAKEN, DRIFTED_IN_TRIALS, POSES = 5, 11, 8, 2, 22, 7, 12
+"""Seeds of cases; of one the fit's refusal names a stop that is wrong by five."""
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,7 @@ BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, DRIFTED_IN_TRIALS, POSES = 5, 11, 8, 2, 7
         (LATE, ["late_stamps"]),
         (QUIET, []),
         (BUMPED_IN_TRIALS, ["camera_moved"]),
+        (STOP_MISTAKEN, ["camera_moved"]),
         pytest.param(POSES, ["camera_moved"], marks=pytest.mark.slow),
         pytest.param(DRIFTED_IN_TRIALS, ["joint_zero", "dropped_frames"], marks=pytest.mark.slow),
     ],
@@ -71,11 +73,9 @@ def test_residuals_are_whitened_by_errors_of_the_joints_and_of_the_model() -> No
     model = learn_reference(views).fit.model
     errors = np.full(6, 1e-3)
     accuracy = JointAccuracy(errors, 0.0 * errors, errors, 0.0 * errors)
-    noisy = examined_frames(replace_accuracy(model, accuracy), views, 1.0)
-    plain = examined_frames(replace_accuracy(model, None), views, 1.0)
-    few = np.flatnonzero(plain.data.stop < 30)
-    rows = np.repeat(np.isin(np.arange(len(plain.data.stop)), few), 2)
-    keep = np.isin(np.arange(len(plain.data.stop)), few)
+    noisy = examined_frames(with_accuracy(model, accuracy), views, 1.0)
+    plain = examined_frames(with_accuracy(model, None), views, 1.0)
+    keep = plain.data.stop < 30
     noisy, plain = noisy.select(keep), plain.select(keep)
     here = plain.residuals_at(start_state(plain))
     frame = np.repeat(plain.data.stop, 2)
@@ -83,13 +83,10 @@ def test_residuals_are_whitened_by_errors_of_the_joints_and_of_the_model() -> No
     covariance = np.eye(len(here)) + plain.root @ plain.root.T
     covariance += np.where(same, noisy.joint_slopes @ noisy.joint_slopes.T, 0.0)
     white = noisy.residuals_at(start_state(noisy))
-    assert rows.sum() == len(here)
     assert white @ noisy.whitened(white) == pytest.approx(here @ np.linalg.solve(covariance, here), rel=1e-8)
 
 
-def replace_accuracy(model, accuracy):
-    import msgspec
-
+def with_accuracy(model, accuracy):
     return msgspec.structs.replace(model, joint_accuracy=accuracy)
 
 
@@ -128,9 +125,11 @@ def test_a_jump_beside_the_course_of_the_joints_is_found_to_the_frame() -> None:
     later = (views.camera == 1) & (np.arange(len(views.camera)) >= jump)
     pixels[later] += rng.normal(0.0, 2.0, 2)
     moved = replace(views, pixels=pixels)
-    onset, span = step_between(moved, 1, (int(mine[8]), int(mine[32])), (int(mine[15]), int(mine[26])))
+    onset, span, gain = step_between(moved, 1, (int(mine[8]), int(mine[32])), (int(mine[15]), int(mine[26])))
     assert onset == jump
     assert span[0] <= jump <= span[1]
+    still = step_between(views, 1, (int(mine[8]), int(mine[32])), (int(mine[15]), int(mine[26])))
+    assert still.gain < 0.05 * gain
 
 
 def test_the_noise_of_frames_is_that_of_the_pixels_whatever_moves() -> None:

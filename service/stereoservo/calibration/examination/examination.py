@@ -27,7 +27,7 @@ from stereoservo.calibration.examination.examined_frames import (
     examined_frames,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import Gap, gaps, step_between
+from stereoservo.calibration.examination.frame_times import Gap, gaps, step_near
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
     AS_GOOD,
@@ -444,9 +444,8 @@ def _not_learnt(
     if isinstance(stop, int) and 0 <= stop < len(failed.stops.frames):
         frames = failed.stops.frames
         c = names.index(camera) if camera in names else int(views.camera[frames[stop]])
-        around = frames[max(0, stop - 3)], frames[min(stop + 3, len(frames) - 1)]
-        between = frames[max(0, stop - 1)], frames[stop]
-        onset = _onset(views, *step_between(views, c, around, between), c)
+        step = step_near(views, c, frames, stop)
+        onset = _onset(views, step.onset, step.span, c)
     kind: RecordingCauseKind = "not_learnt"
     if error.code == "camera_moved":
         kind = "camera_moved"

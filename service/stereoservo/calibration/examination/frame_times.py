@@ -16,6 +16,10 @@ GAP, JITTERS = 1.5, 6.0
 REGULAR, NEAR = 0.8, 0.25
 """Share of the intervals that must be within a share of the period for there to be one."""
 
+STOPS_AROUND, NEAR_STOPS = 3, 6
+"""Stops to either side that a step is told from, and in which it is looked for."""
+CLEAR = 100.0
+"""Chi-square from which a step is one."""
 LASTING = 3
 """Frames beside the terms of a course from which a step can be told from it."""
 CREDIBLE = 9.2
@@ -27,6 +31,16 @@ class Gap(NamedTuple):
 
     frame: int
     missing: int
+
+
+class Step(NamedTuple):
+    """A step of a camera's pixels at frame ``onset`` (among all), the ``span`` of frames that are not excluded, and its
+    ``gain``: chi-square that it explains, in the noise that it leaves.
+    """
+
+    onset: int
+    span: tuple[int, int]
+    gain: float
 
 
 def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
@@ -60,9 +74,9 @@ def _missing(intervals: FloatArray, same: np.ndarray[tuple[int], np.dtype[np.boo
 
 def step_between(
     views: RecordedViews, camera: int, around: tuple[int, int], between: tuple[int, int]
-) -> tuple[int, tuple[int, int]]:
+) -> Step:
     """Frame after ``between[0]``, up to ``between[1]``, from which on a camera's pixels are best explained by a step
-    beside quadratics of the joints, by the frames ``around``; and the span of such frames that are not excluded.
+    beside cubics of the joints, by the frames ``around``; and the span of such frames that are not excluded.
     """
     first, last = (int(one) for one in between)
     mine = np.flatnonzero(views.camera == camera)
@@ -73,9 +87,9 @@ def step_between(
     spread = np.ptp(joints, axis=0)
     moved = joints[:, spread > ALONE]
     moved = (moved - moved.mean(axis=0)) / np.maximum(np.ptp(moved, axis=0), 1e-12)
-    terms = np.hstack([np.ones((len(mine), 1)), moved, moved**2])
+    terms = np.hstack([np.ones((len(mine), 1)), moved, moved**2, moved**3])
     if len(onsets) < 2 or len(mine) < terms.shape[1] + LASTING:
-        return last, (min(first + 1, last), last)
+        return Step(last, (min(first + 1, last), last), 0.0)
     costs = []
     for onset in onsets.tolist():
         design = np.hstack([terms, (mine >= onset).astype(np.float64)[:, None]])
@@ -85,7 +99,25 @@ def step_between(
     rows = 2 * int(views.seen[mine].sum())
     level = max(float(costs[best]) / rows, 1e-12)
     near = onsets[np.array(costs) <= costs[best] + CREDIBLE * level]
-    return int(onsets[best]), (int(near[0]), int(near[-1]))
+    without = sum(_misfit(terms, views, mine, marker) for marker in range(views.pixels.shape[1]))
+    return Step(int(onsets[best]), (int(near[0]), int(near[-1])), (without - float(costs[best])) / level)
+
+
+def step_near(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
+    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,); where there is none, the
+    clearest before another stop near it.
+    """
+    last = len(frames) - 1
+
+    def before(k: int) -> Step:
+        around = int(frames[max(0, k - STOPS_AROUND)]), int(frames[min(k + STOPS_AROUND, last)])
+        return step_between(views, camera, around, (int(frames[max(0, k - 1)]), int(frames[k])))
+
+    stated = before(stop)
+    if stated.gain >= CLEAR:
+        return stated
+    near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, last) + 1)
+    return max([stated, *map(before, near)], key=lambda one: one.gain)
 
 
 def _misfit(design: FloatArray, views: RecordedViews, frames: IntArray, marker: int) -> float:

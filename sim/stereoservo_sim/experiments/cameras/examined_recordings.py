@@ -170,7 +170,11 @@ def _recorded(truth: _Truth, kind: str, rng: np.random.Generator) -> RecordedVie
         drift = _drift(cell, joint, size, shown[0, later])
         truth.faults.append(
             TrueFault(
-                "joint_zero", "" if truth.poses else cell.joint_names[joint], frame, float(drift[joint])
+                "joint_zero",
+                "" if truth.poses else cell.joint_names[joint],
+                frame,
+                float(drift[joint]),
+                float(times[frame]) - 1e-6,
             )
         )
     pixels = np.empty((2, len(times), len(cell.body), 2))
