@@ -117,6 +117,18 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     assert told(capsys, str(tmp_path / "flight.mcap"))[0] == 1
 
 
+def test_a_flight_without_trial_motions_is_judged_by_the_model_in_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    flight = Path(__file__).parents[1] / "recordings" / "flight-1.mcap"
+    code, report = told(capsys, str(flight))
+    assert code == 0
+    assert report["learnt_from"] is None
+    assert report["stratum"] == "metric"
+    assert report["causes"] == []
+    assert 0.05 < report["rms_px"] < 0.2
+
+
 def real_set() -> Path | None:
     """The recorded set, where it lies beside the repository or below ``$STEREOSERVO_DATA``."""
     roots = [Path(__file__).resolve().parents[2] / ".." / "shared" / "data"]

@@ -70,7 +70,7 @@ def test_a_recording_without_single_joint_motions_says_which_joints_lack_them() 
 def test_residuals_are_whitened_by_errors_of_the_joints_and_of_the_model() -> None:
     """Chi-square against the explicit covariance, rows of a frame coupled by its joints' errors."""
     views = examined_case(BUMPED).views.select(np.arange(4, 520))
-    model = learn_reference(views).fit.model
+    model = learn_reference(views).model
     errors = np.full(6, 1e-3)
     accuracy = JointAccuracy(errors, 0.0 * errors, errors, 0.0 * errors)
     noisy = examined_frames(with_accuracy(model, accuracy), views, 1.0)
@@ -111,6 +111,7 @@ def test_dropped_frames_are_counted_by_numbers_and_by_stamps() -> None:
         views, times=np.arange(200) / 30.0 + rng.normal(0.0, 1e-3, 200), numbers=np.arange(200)
     ).select(~lost)
     assert gaps(views, 0) == [(20, 3), (87, 1)]
+    assert gaps(replace(views, numbers=4 * views.numbers), 0) == [(20, 3), (87, 1)]
     assert gaps(replace(views, numbers=np.full(196, -1)), 0) == [(20, 3), (87, 1)]
     irregular = replace(views, numbers=np.full(196, -1), times=np.sort(rng.uniform(0.0, 6.0, 196)))
     assert gaps(irregular, 0) is None

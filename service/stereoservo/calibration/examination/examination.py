@@ -143,7 +143,7 @@ def examine_views(views: RecordedViews) -> RecordingReport:
         views, reference, found = _mended(views, learn_reference(views))
     except LearningError as failed:
         return _not_learnt(views, failed, lost, dropped)
-    model = reference.fit.model
+    model = reference.model
     problem = examined_frames(model, views, reference.noise_factor)
     outliers = isolated_outliers(problem)
     problem = problem.select(~outliers)
@@ -163,9 +163,13 @@ def examine_views(views: RecordedViews) -> RecordingReport:
         _rms(left), _rms(before), float(np.median(problem.data.sigmas)), model.stratum,
         _by_camera(views, problem, left, tested, found, dropped), _by_joint(views, problem, left),
         {str(e): _rms(left[views.episodes[problem.data.stop] == e]) for e in np.unique(views.episodes).tolist()},
-        tuple(sorted(causes, key=_when)), tuple(reference.fit.report.notes),
-        (reference.first, reference.last, len(reference.stops.frames)), int(outliers.sum()),
+        tuple(sorted(causes, key=_when)), () if reference.report is None else tuple(reference.report.notes),
+        _learnt_from(reference), int(outliers.sum()),
     )  # fmt: skip
+
+
+def _learnt_from(reference: ReferenceModel) -> tuple[int, int, int] | None:
+    return None if reference.stops is None else (reference.first, reference.last, len(reference.stops.frames))
 
 
 def _mended(
@@ -176,7 +180,7 @@ def _mended(
     """
     found: list[ChangePoint] = []
     while len(found) < MENDS and not reference.fits:
-        exact = msgspec.structs.replace(reference.fit.model, joint_accuracy=None)
+        exact = msgspec.structs.replace(reference.model, joint_accuracy=None)
         problem = examined_frames(exact, views, reference.noise_factor)
         tested = [one for one in hypotheses(exact, views, problem) if one.kind in ("joint", "stamps")]
         for change in likely_changes(problem, views, tested, reference.middle)[:TRIED]:
@@ -384,10 +388,8 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
 
 def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
     """Errors of the joints' readings, or of the poses, that the model found where it was learnt and scatters by."""
-    errors = {
-        one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture]))
-        for one in reference.fit.report.joints
-    }
+    joints = () if reference.report is None else reference.report.joints
+    errors = {one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture])) for one in joints}
     if reference.fits or not errors:
         return []
     listed = ", ".join(f"{name} {error:.2g}" for name, error in errors.items())

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereoservo.calibration.trial_data import TrialCamera, TrialData
+from stereoservo.kinematics.model import CellModel
 from stereoservo.kinematics.parameterization import Kind
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -37,6 +38,7 @@ class RecordedViews:
     ``times`` (f,) [s], ``numbers`` (f,) as counted by the camera, -1 where nothing counts, ``episodes`` (f,),
     ``pixels`` (f, m, 2) raw [px], NaN where a marker was not seen, ``sigmas`` (f, m) [px]. ``generators`` (n, 4, 4):
     of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
+    ``model``: one that the recording holds, for where none can be learnt.
     """
 
     joint_names: tuple[str, ...]
@@ -53,6 +55,7 @@ class RecordedViews:
     sigmas: FloatArray
     generators: FloatArray | None = None
     timed: bool = True
+    model: CellModel | None = None
 
     @property
     def seen(self) -> BoolArray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereoservo.calibration.calibration_result import CalibrationFit
+from stereoservo.calibration.calibration_result import CalibrationReport
 from stereoservo.calibration.examination.recorded_views import (
     LearningStops,
     RecordedViews,
@@ -20,6 +20,7 @@ from stereoservo.calibration.examination.recorded_views import (
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
+from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import IntArray
 
 AS_GOOD = 1.1
@@ -32,36 +33,41 @@ MENDS = 2
 
 @dataclass(frozen=True)
 class ReferenceModel:
-    """A ``fit`` to the ``stops`` of frames ``first`` to ``last``."""
+    """A ``model`` and its ``report`` from the ``stops`` of frames ``first`` to ``last``; without report and stops where
+    it was there before the recording. ``noise``: of the pixels over what is stated, as they differ from frame to frame.
+    """
 
-    fit: CalibrationFit
-    stops: LearningStops
+    model: CellModel
+    report: CalibrationReport | None
+    stops: LearningStops | None
     first: int
     last: int
+    noise: float
 
     @property
     def middle(self) -> int:
-        """A frame that the model is of."""
+        """A frame that the model is of; -1 where it was there before the first."""
         return (self.first + self.last) // 2
-
-    noise: float
-    """Noise of the pixels over what is stated, as they differ from frame to frame, 1 at least."""
 
     @property
     def noise_factor(self) -> float:
         """Noise of the pixels over what is stated, 1 at least: what they leave may be more than noise."""
-        return max(1.0, min(self.fit.report.sigma_factor, self.noise))
+        return self.noise if self.report is None else max(1.0, min(self.report.sigma_factor, self.noise))
 
     @property
     def fits(self) -> bool:
-        """Whether nothing but noise, of pixels and within it of joints, is left."""
+        """Whether nothing but noise, of pixels and within it of joints, was left where the model was learnt."""
+        if self.stops is None:
+            return True
         return self.scatter_px <= GOOD * self.noise * float(np.median(self.stops.trials.sigmas))
 
     @property
     def scatter_px(self) -> float:
         """rms deviation [px] that the model expects of a pixel at its stops, errors of the joints included."""
-        _, covariances = pixel_covariances(self.fit.model, self.stops.trials.positions)
-        own = (max(1.0, self.fit.report.sigma_factor) * float(np.median(self.stops.trials.sigmas))) ** 2
+        if self.stops is None or self.report is None:
+            return 0.0
+        _, covariances = pixel_covariances(self.model, self.stops.trials.positions)
+        own = (max(1.0, self.report.sigma_factor) * float(np.median(self.stops.trials.sigmas))) ** 2
         return float(np.sqrt(0.5 * np.trace(np.median(covariances, axis=(0, 1, 2))) + own))
 
 
@@ -80,6 +86,8 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
     if not len(views.camera):
         raise CalibrationError("too_few_stops", "the recording has no frame that shows a marker", stops=0)
     if views.generators is None:
+        if views.model is not None and _never_alone(views):
+            return ReferenceModel(views.model, None, None, -1, -1, frame_noise(views))
         return _attempt(views, *_single_joint_stretch(views))
     f = len(views.camera)
     found: list[ReferenceModel] = []
@@ -116,16 +124,22 @@ def _attempt(views: RecordedViews, first: int, last: int) -> ReferenceModel:
     stops = LearningStops(stops.trials, stops.frames + first)
     try:
         fit = fit_model(stops.trials, epoch=1)
-        return ReferenceModel(fit, stops, first, last, frame_noise(views))
+        return ReferenceModel(fit.model, fit.report, stops, first, last, frame_noise(views))
     except CalibrationError as error:
         raise LearningError(error, stops) from error
+
+
+def _never_alone(views: RecordedViews) -> list[str]:
+    """Joints that never move alone."""
+    alone = single_joint_motions(stop_positions(views, instants(views)))
+    return [name for j, name in enumerate(views.joint_names) if not (alone == j).any()]
 
 
 def _single_joint_stretch(views: RecordedViews) -> tuple[int, int]:
     """First and last frame of the motions of single joints. Raises CalibrationError (``too_few_stops``)."""
     instant = instants(views)
     alone = single_joint_motions(stop_positions(views, instant))
-    missing = [name for j, name in enumerate(views.joint_names) if not (alone == j).any()]
+    missing = _never_alone(views)
     if missing:
         raise CalibrationError(
             "too_few_stops",

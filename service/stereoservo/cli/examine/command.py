@@ -39,6 +39,11 @@ def examine(
 
 def _text(report: RecordingReport) -> str:
     lines = []
+    if report.learnt_from is None and report.rms_px is not None:
+        lines.append(
+            f"residuals {report.rms_px:.3f} px rms ({report.before_px:.3f} px with what has happened), of the "
+            f"{report.stratum} model that the recording holds: no joint motions to learn one from"
+        )
     if report.learnt_from is not None:
         first, last, stops = report.learnt_from
         lines.append(

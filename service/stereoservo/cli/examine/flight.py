@@ -10,8 +10,8 @@ import numpy as np
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.trial_data import TrialCamera
 from stereoservo.cli.output import note
-from stereoservo.core.cycle import decode_array
-from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state_encoding import StateVersionError, decode_state
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import cause_of
 from stereoservo.ports.devices import CameraObservation
 from stereoservo.recording.recorded_motion import read_motion
@@ -25,9 +25,10 @@ MOST_FRAMES = 6000
 def read_flight(path: Path) -> RecordedViews:
     """The recording in a flight (*.mcap): what the core took in of joints and cameras. Raises RecordingError."""
     motion = read_motion(path)
-    seen = _observations(path)
-    settings: CoreSettings = motion.settings
+    observations, model = _contents(path)
+    settings = motion.settings
     cameras = [camera.name for camera in settings.cameras]
+    seen = [one for one in observations if one.camera in cameras]
     every = max(1, -(-len(seen) // MOST_FRAMES))
     if every > 1:
         note(f"{len(seen)} frames: of each camera one in {every} is examined")
@@ -46,6 +47,8 @@ def read_flight(path: Path) -> RecordedViews:
         pixels[k, mine[known]] = one.pixels[known]
         sigmas[k, mine[known]] = np.sqrt(0.5 * np.trace(one.covariances, axis1=1, axis2=2))[known]
     begin = int(motion.joint_ns[0])
+    known_offsets = {} if model is None else {one.camera: one.offset_s for one in model.shutter_offsets}
+    stamps = [(one.t_shutter_ns - begin) * 1e-9 + known_offsets.get(one.camera, 0.0) for one in kept]
     # Numbers count what the camera took; where frames are left out they would tell of drops.
     numbers = [one.seq if every == 1 else -1 for one in kept]
     return RecordedViews(
@@ -53,24 +56,26 @@ def read_flight(path: Path) -> RecordedViews:
         tuple(TrialCamera(c.name, c.width, c.height, c.mount) for c in settings.cameras), ids,
         (motion.joint_ns - begin) * 1e-9, motion.positions,
         np.array([cameras.index(one.camera) for one in kept], dtype=np.int64),
-        np.array([(one.t_shutter_ns - begin) * 1e-9 for one in kept]), np.array(numbers, dtype=np.int64),
-        np.zeros(len(kept), dtype=np.int64), pixels, sigmas,
+        np.array(stamps), np.array(numbers, dtype=np.int64),
+        np.zeros(len(kept), dtype=np.int64), pixels, sigmas, model=model,
     )  # fmt: skip
 
 
-def _observations(path: Path) -> list[CameraObservation]:
+def _contents(path: Path) -> tuple[list[CameraObservation], CellModel | None]:
+    """All observations, and the first model."""
     found: list[CameraObservation] = []
-    settings: CoreSettings | None = None
+    model: CellModel | None = None
     for topic, data in recorded_messages(path):
         try:
-            if topic == "header":
-                header = msgspec.msgpack.decode(data)
-                settings = msgspec.msgpack.decode(
-                    header["settings"], type=CoreSettings, dec_hook=decode_array
-                )
+            if topic == "checkpoint" and model is None:
+                model = decode_state(msgspec.msgpack.decode(data)[1]).model
             elif topic == "step":
-                found += decode_step(data).inputs.observations
+                inputs = decode_step(data).inputs
+                found += inputs.observations
+                if model is None and inputs.model_update is not None:
+                    model = inputs.model_update.model
+        except StateVersionError:
+            continue  # a recording of another version is examined without its model
         except Exception as error:  # a decoder may raise anything
             raise RecordingError(path, 0, f"{topic} record is damaged ({cause_of(error)})") from error
-    assert settings is not None  # read_motion has found it
-    return [one for one in found if one.camera in {camera.name for camera in settings.cameras}]
+    return found, model
