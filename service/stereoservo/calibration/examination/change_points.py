@@ -146,7 +146,7 @@ def _first_order(
     problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, here: FloatArray, middle: int
 ) -> _Candidate:
     """The onset, to a block of frames, at which a hypothesis explains most: later frames changed where it is after
-    ``middle``, else earlier ones.
+    ``middle``, else earlier ones; of stamps either.
     """
     concerned = frames_concerned(one, views)
     slopes = change_jacobian(problem, (one.change,), np.zeros(one.change.size), here)
@@ -169,9 +169,11 @@ def _first_order(
     if one.kind == "stamps":
         best = _Candidate(one, True, 0, float(later[0]))
     for k, onset in enumerate(onsets.tolist()):
-        gain = float(later[k + 1] if onset > middle else before[k])
-        if gain > best.gain:
-            best = _Candidate(one, onset > middle, onset, gain)
+        # A model that is learnt at rest is of no stamps.
+        for after in (True, False) if one.kind == "stamps" else (onset > middle,):
+            gain = float(later[k + 1] if after else before[k])
+            if gain > best.gain:
+                best = _Candidate(one, after, onset, gain)
     return best
 
 
