@@ -139,7 +139,8 @@ def _score(left: FloatArray, sizes: IntArray, k: int, noise: float, count: int) 
 
 def _by_frame(problem: ExaminedFrames, frames: int, rows: FloatArray) -> FloatArray:
     """Sums (f,) of ``rows`` (2 k,) by frame."""
-    return np.bincount(np.repeat(problem.data.stop, 2), rows, minlength=frames)
+    sums: FloatArray = np.bincount(np.repeat(problem.data.stop, 2), rows, minlength=frames).astype(np.float64)
+    return sums
 
 
 def _first_order(
@@ -225,7 +226,7 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     before = part.residuals_at(start_state(part))
     ratio = float(before @ part.whitened(before)) - estimate.chi2
     return ChangePoint(
-        one.hypothesis, frames, one.after, onset, span, estimate.x, np.linalg.pinv(estimate.information), rows,
+        one.hypothesis, frames, one.after, onset, span, estimate.x, np.asarray(np.linalg.pinv(estimate.information), dtype=np.float64), rows,
         _effect(part, estimate), ratio,
     )  # fmt: skip
 

@@ -54,7 +54,7 @@ def read_flight(path: Path) -> RecordedViews:
     return RecordedViews(
         settings.joint_names, settings.joint_kinds,
         tuple(TrialCamera(c.name, c.width, c.height, c.mount) for c in settings.cameras), ids,
-        (motion.joint_ns - begin) * 1e-9, motion.positions,
+        np.asarray((motion.joint_ns - begin) * 1e-9, dtype=np.float64), motion.positions,
         np.array([cameras.index(one.camera) for one in kept], dtype=np.int64),
         np.array(stamps), np.array(numbers, dtype=np.int64),
         np.zeros(len(kept), dtype=np.int64), pixels, sigmas, model=model,

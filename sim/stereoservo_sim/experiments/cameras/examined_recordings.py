@@ -292,15 +292,27 @@ def judged_examination(seed: int) -> ExaminedVerdict:
     seconds = time.process_time() - begin
     true = tuple(one.kind for one in case.faults)
     size = case.faults[0].size if case.faults else 0.0
-    common = (case.poses, case.imperfect, case.in_trials, case.sigma, size, seconds)
+    plain = ExaminedVerdict(
+        seed,
+        true,
+        (),
+        (),
+        true,
+        (),
+        (),
+        case.poses,
+        case.imperfect,
+        case.in_trials,
+        case.sigma,
+        size,
+        seconds,
+    )
     if report is None:
-        return ExaminedVerdict(seed, true, (), (), true, (refused,), (), *common)
-    return _judged(case, report, true, common)
+        return msgspec.structs.replace(plain, falsely=(refused,))
+    return _judged(case, report, plain)
 
 
-def _judged(
-    case: ExaminedCase, report: RecordingReport, true: tuple[str, ...], common: tuple[Any, ...]
-) -> ExaminedVerdict:
+def _judged(case: ExaminedCase, report: RecordingReport, plain: ExaminedVerdict) -> ExaminedVerdict:
     left = list(report.causes)
     found, late_by, missed, unsure, sizes = [], [], [], [], []
     for fault in case.faults:
@@ -324,9 +336,9 @@ def _judged(
     drifted = any(fault.kind == "joint_zero" for fault in case.faults)
     left = [cause for cause in left if cause.kind != "joint_errors" or not (case.imperfect or drifted)]
     falsely = tuple(f"{cause.kind} {cause.subject}".strip() for cause in left)
-    return ExaminedVerdict(
-        case.seed, true, tuple(found), tuple(late_by), tuple(missed), falsely, tuple(unsure), *common,
-        report.rms_px, tuple(round(one, 2) for one in sizes),
+    return msgspec.structs.replace(
+        plain, found=tuple(found), late_by=tuple(late_by), missed=tuple(missed), falsely=falsely, unsure=tuple(unsure),
+        rms_px=report.rms_px, sizes_in_deviations=tuple(round(one, 2) for one in sizes),
     )  # fmt: skip
 
 
