@@ -225,8 +225,9 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     estimate = estimate_changes(part, (change,), x)
     before = part.residuals_at(start_state(part))
     ratio = float(before @ part.whitened(before)) - estimate.chi2
+    covariance: FloatArray = np.linalg.pinv(estimate.information).astype(np.float64)
     return ChangePoint(
-        one.hypothesis, frames, one.after, onset, span, estimate.x, np.asarray(np.linalg.pinv(estimate.information), dtype=np.float64), rows,
+        one.hypothesis, frames, one.after, onset, span, estimate.x, covariance, rows,
         _effect(part, estimate), ratio,
     )  # fmt: skip
 
