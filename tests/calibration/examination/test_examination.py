@@ -69,7 +69,7 @@ def test_a_recording_without_single_joint_motions_says_which_joints_lack_them() 
 
 def test_residuals_are_whitened_by_errors_of_the_joints_and_of_the_model() -> None:
     """Chi-square against the explicit covariance, rows of a frame coupled by its joints' errors."""
-    views = examined_case(BUMPED).views.select(np.arange(4, 520))
+    views = examined_case(BUMPED).views.select(np.arange(4, 656))
     model = learn_reference(views).model
     errors = np.full(6, 1e-3)
     accuracy = JointAccuracy(errors, 0.0 * errors, errors, 0.0 * errors)
