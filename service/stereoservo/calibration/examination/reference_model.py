@@ -107,7 +107,7 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
 
 def frame_noise(views: RecordedViews) -> float:
     """Noise of the pixels over the stated one: median second difference of each marker from frame to frame of a camera,
-    1 at least; too large where most frames are of motion that turns from frame to frame.
+    1 at least. An upper bound: too large by what most frames accelerate.
     """
     apart = []
     for c in range(len(views.cameras)):
