@@ -44,6 +44,7 @@ COMMANDS: dict[str, str] = {
     "record": "record:record",
     "replay": "replay:replay",
     "export": "export:export",
+    "examine": "examine.command:examine",
     "ik": "ik:ik",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",

@@ -15,7 +15,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "Run": ("run", "status", "ls", "enable", "disable", "reset", "hold", "resume", "stop"),
     "Move": ("calibrate", "teach", "goal", "ik", "acknowledge", "cancel", "jog", "home", "auxiliary"),
-    "Look": ("watch", "web", "record", "replay", "export"),
+    "Look": ("watch", "web", "record", "replay", "export", "examine"),
     "Simulate and measure": ("demo", "emulate", "simulate", "reproduce", "bench"),
 }
 """Headings and their commands, in the order in which they are needed; any other command stands below ``OTHERS``."""
@@ -52,6 +52,7 @@ EXAMPLES: dict[str, str] = {
     "record": "record mycell --images --seconds 60",
     "replay": "replay flight.mcap",
     "export": "export flight.mcap",
+    "examine": "examine flight.mcap",
     "demo": "demo --lockstep",
     "emulate": "emulate drives hil-can",
     "simulate": "simulate TASKS.csv --law cartesian3",

@@ -154,6 +154,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(10),),
         ),
         Experiment(
+            "examined-recordings",
+            "recordings with a bumped camera, drifted zero, late stamps, dropped frames or nothing: what examine tells",
+            "cameras.examined_recordings",
+            (repetitions(12),),
+        ),
+        Experiment(
             "mobile-cameras",
             "fig. 9.1: four cameras before one tool, two of them carried about: every pair, all, and all on the move",
             "cameras.mobile_cameras",

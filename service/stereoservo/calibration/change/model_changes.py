@@ -57,7 +57,7 @@ class ModelChange:
 @dataclass(frozen=True)
 class LinearisedProblem:
     """Model and pixels of a check: ``rig`` in its Euclidean frame where it has one, its ``data``, and ``uncertainty``
-    B (2 k, p) of the covariance that the model's own uncertainty adds to the residuals (see ``_bound``).
+    B (2 k, p) of the covariance that the model's own uncertainty adds to the residuals (see `bounded`).
     """
 
     rig: RigModel
@@ -80,11 +80,11 @@ class LinearisedProblem:
 
     def select(self, keep: npt.NDArray[np.bool_]) -> LinearisedProblem:
         """The problem with only the pixels where ``keep`` (k,) holds."""
-        root = _unbound(self.uncertainty)
-        return replace(self, data=self.data.select(keep), uncertainty=_bound(root[np.repeat(keep, 2)]))
+        root = unbounded(self.uncertainty)
+        return replace(self, data=self.data.select(keep), uncertainty=bounded(root[np.repeat(keep, 2)]))
 
 
-def _bound(A: FloatArray) -> FloatArray:
+def bounded(A: FloatArray) -> FloatArray:
     """Matrix ``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``: an uncertainty ``A`` of any size as one of norm below 1."""
     if not A.shape[1]:
         return A
@@ -93,8 +93,8 @@ def _bound(A: FloatArray) -> FloatArray:
     return bound
 
 
-def _unbound(B: FloatArray) -> FloatArray:
-    """Inverse of :func:`_bound`, up to a rotation: ``A Aᵀ = B (I - Bᵀ B)⁻¹ Bᵀ``."""
+def unbounded(B: FloatArray) -> FloatArray:
+    """Inverse of :func:`bounded`, up to a rotation: ``A Aᵀ = B (I - Bᵀ B)⁻¹ Bᵀ``."""
     if not B.shape[1]:
         return B
     triangle = np.linalg.cholesky(np.eye(B.shape[1]) - B.T @ B)
@@ -144,7 +144,7 @@ def linearised_problem(
         )
     else:
         uncertainty = np.zeros((2 * len(data.camera), 0))
-    return LinearisedProblem(rig, data, _bound(uncertainty), order)
+    return LinearisedProblem(rig, data, bounded(uncertainty), order)
 
 
 def with_corrected_zeros(
@@ -157,7 +157,7 @@ def with_corrected_zeros(
     return replace(
         problem,
         data=data,
-        uncertainty=_bound(_stated_uncertainty(model, model.covariance, data, problem.order)),
+        uncertainty=bounded(_stated_uncertainty(model, model.covariance, data, problem.order)),
     )
 
 
@@ -210,9 +210,9 @@ def _curvature_uncertainty(
     sizes = np.linalg.norm(triangle, axis=0)
     sizes[sizes == 0.0] = 1.0
     # A direction that the calibration left open has a large finite deviation here instead of none.
-    bounded = np.linalg.qr(np.vstack([triangle / sizes, 1e-7 * np.eye(charts.size)]), mode="r")
+    finite = np.linalg.qr(np.vstack([triangle / sizes, 1e-7 * np.eye(charts.size)]), mode="r")
     slopes = jacobian(rig, charts, np.zeros(charts.size), data) / sizes
-    uncertainty: FloatArray = slopes @ np.linalg.inv(np.asarray(bounded))
+    uncertainty: FloatArray = slopes @ np.linalg.inv(np.asarray(finite))
     return uncertainty
 
 

@@ -341,7 +341,7 @@ def _found_cause(model: CellModel, problem: LinearisedProblem, found: ChangeEsti
         value = float(np.linalg.norm(x[:3]))
         deviation = float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0))
     effect = found.effects_px[i]
-    text = _SENTENCES[cause.kind](model, cause.subject, value, deviation)
+    text = SENTENCES[cause.kind](model, cause.subject, value, deviation)
     return FoundCause(
         cause.kind, cause.subject, ratio, cause.size, effect, f"{text}, {effect:.3g} px rms in the images", value,
         deviation,
@@ -364,7 +364,7 @@ def _joint_sentence(model: CellModel, subject: str, value: float | None, deviati
     return f"zero of joint {subject} drifted by {amount}{also}"
 
 
-_SENTENCES: dict[str, Callable[[CellModel, str, float | None, float | None], str]] = {
+SENTENCES: dict[str, Callable[[CellModel, str, float | None, float | None], str]] = {
     "camera": lambda model, subject, value, deviation: f"camera {subject} moved{_turned(value, deviation)}",
     "cameras": lambda model, subject, value, deviation: (
         f"the cameras moved together, or the arm's base did{_turned(value, deviation)}"
@@ -379,6 +379,7 @@ _SENTENCES: dict[str, Callable[[CellModel, str, float | None, float | None], str
     "marker": lambda model, subject, value, deviation: f"marker {subject} slipped",
     "joint": _joint_sentence,
 }
+"""What each kind of change is in words, of a model, the subject, and value and deviation where there are any."""
 
 
 def _unexplained(

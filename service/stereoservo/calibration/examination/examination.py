@@ -1,0 +1,512 @@
+"""Examination of a recording of joints and pictures: a model learnt from it, and what has happened to cameras, joints,
+stamps and frames, each with its onset, size and deviation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.change.hypothesis_test import is_unexplained
+from stereoservo.calibration.change.model_changes import change_jacobian, estimate_changes, start_state
+from stereoservo.calibration.change.model_check import NOISE_MARGIN, SENTENCES, isolated_outliers
+from stereoservo.calibration.examination.change_points import (
+    FALSE_ALARM,
+    ChangePoint,
+    best_change,
+    likely_changes,
+)
+from stereoservo.calibration.examination.examined_frames import (
+    ExaminedFrames,
+    Hypothesis,
+    corrected_views,
+    examined_frames,
+    hypotheses,
+)
+from stereoservo.calibration.examination.frame_times import Gap, gaps, step_near
+from stereoservo.calibration.examination.recorded_views import RecordedViews
+from stereoservo.calibration.examination.reference_model import (
+    AS_GOOD,
+    MENDS,
+    LearningError,
+    ReferenceModel,
+    learn_reference,
+)
+from stereoservo.calibration.shutter_offset import LEAST_DEVIATION_S
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+MOST_CHANGES = 8
+TRIED = 2
+"""Changes that are taken back to see whether the model is better without."""
+SAME_ONSET = 4
+"""Frames within which two onsets are one."""
+AWAY = 0.2
+"""Share of its largest distance from its median from which a joint is away from it."""
+MOST_GAPS = 20
+"""Gaps of a camera's frames that are listed."""
+UNKNOWN_S = 0.05
+"""Deviation [s] from which the offset of a camera's stamps is not known."""
+
+RecordingCauseKind = Literal[
+    "camera_moved", "cameras_moved", "body_moved", "marker_slipped", "joint_zero", "late_stamps", "dropped_frames",
+    "joint_errors", "unexplained", "not_learnt",
+]  # fmt: skip
+_KINDS: dict[str, RecordingCauseKind] = {
+    "camera": "camera_moved", "cameras": "cameras_moved", "body": "body_moved", "marker": "marker_slipped",
+    "joint": "joint_zero", "stamps": "late_stamps",
+}  # fmt: skip
+
+_Gaps = dict[str, list[Gap] | None]
+
+
+class Onset(msgspec.Struct, frozen=True):
+    """First frame of what has happened: ``frame`` counts those of ``camera`` from 0, ``earliest`` and ``latest``
+    (likewise) are those that the data do not exclude. ``after_s``: stamp of the camera's last frame before it; both
+    [s] as stamped.
+    """
+
+    camera: str
+    frame: int
+    time_s: float
+    after_s: float | None
+    earliest: int
+    latest: int
+    episode: int
+
+
+class RecordingCause(msgspec.Struct, frozen=True):
+    """What has happened. ``onset``: None where it is there throughout. ``until``: the recording is different *before*
+    the onset from what the model was learnt from. ``value`` with ``deviation`` [``unit``]; ``effect_px``: rms change of
+    the pixels. ``or_else``: what explains the data nearly as well, and ``tells_apart`` what would decide.
+    """
+
+    kind: RecordingCauseKind
+    subject: str
+    message: str
+    onset: Onset | None = None
+    effect_px: float | None = None
+    value: float | None = None
+    deviation: float | None = None
+    unit: str = ""
+    or_else: str = ""
+    tells_apart: str = ""
+    gaps: tuple[tuple[int, int], ...] = ()
+
+
+class CameraResiduals(msgspec.Struct, frozen=True):
+    """Of a camera: its ``frames``, residuals rms [px] beside the causes, ``dropped`` frames (None: cannot be told), and
+    by how much later [s] than stamped its pictures are, with the deviation; None where no motion shows it.
+    """
+
+    frames: int
+    rms_px: float | None
+    dropped: int | None
+    offset_s: float | None = None
+    offset_deviation_s: float | None = None
+
+
+class RecordingReport(msgspec.Struct, frozen=True):
+    """Result of an examination. Residuals rms [px] an axis beside the causes found, ``before_px`` with them.
+
+    ``joints``: of the frames in which a joint is away from its median. ``learnt_from``: first and last frame (of all),
+    stops.
+    ``false_alarm``: probability that a recording to which nothing has happened is said to have any change.
+    """
+
+    rms_px: float | None
+    before_px: float | None
+    sigma_px: float | None
+    stratum: str
+    cameras: dict[str, CameraResiduals]
+    joints: dict[str, float]
+    episodes: dict[str, float]
+    causes: tuple[RecordingCause, ...]
+    notes: tuple[str, ...]
+    learnt_from: tuple[int, int, int] | None
+    outliers: int
+    false_alarm: float = FALSE_ALARM
+
+
+def examine_views(views: RecordedViews) -> RecordingReport:
+    """The report on a recording. Raises CalibrationError (``bad_data``, ``too_few_stops``, ``too_few_cameras``) for one
+    that nothing can be learnt from.
+    """
+    lost = _dropped(views)
+    dropped = {camera.name: gaps(views, c) for c, camera in enumerate(views.cameras)}
+    try:
+        views, reference, found = _mended(views, learn_reference(views))
+    except LearningError as failed:
+        return _not_learnt(views, failed, lost, dropped)
+    model = reference.model
+    problem = examined_frames(model, views, reference.noise_factor)
+    outliers = isolated_outliers(problem)
+    problem = problem.select(~outliers)
+    before = _residuals_px(problem)
+    tested = hypotheses(model, views, problem)
+    while len(found) < MOST_CHANGES:
+        change = best_change(problem, views, tested, reference.middle)
+        if change is None:
+            break
+        found.append(change)
+        problem = _without(problem, change)
+    found = _merged(found)
+    causes = [_cause(model, views, change) for change in found] + lost
+    causes += _joint_errors(reference) + _unexplained(model, views, problem)
+    left = _residuals_px(problem)
+    return RecordingReport(
+        _rms(left), _rms(before), float(np.median(problem.data.sigmas)), model.stratum,
+        _by_camera(views, problem, left, tested, found, dropped), _by_joint(views, problem, left),
+        {str(e): _rms(left[views.episodes[problem.data.stop] == e]) for e in np.unique(views.episodes).tolist()},
+        tuple(sorted(causes, key=_when)), () if reference.report is None else tuple(reference.report.notes),
+        _learnt_from(reference), int(outliers.sum()),
+    )  # fmt: skip
+
+
+def _learnt_from(reference: ReferenceModel) -> tuple[int, int, int] | None:
+    return None if reference.stops is None else (reference.first, reference.last, len(reference.stops.frames))
+
+
+def _mended(
+    views: RecordedViews, reference: ReferenceModel
+) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
+    """Recording and model without what happened to joints and stamps while the model was learnt: a change that, taken
+    back, makes the model scatter less.
+    """
+    found: list[ChangePoint] = []
+    while len(found) < MENDS and not reference.fits:
+        exact = msgspec.structs.replace(reference.model, joint_accuracy=None)
+        problem = examined_frames(exact, views, reference.noise_factor)
+        tested = [one for one in hypotheses(exact, views, problem) if one.kind in ("joint", "stamps")]
+        for change in likely_changes(problem, views, tested, reference.middle)[:TRIED]:
+            better = _taken_back(views, reference, change)
+            if better is not None:
+                break
+        else:
+            break
+        views, reference, change = better
+        found.append(change)
+    return views, reference, found
+
+
+def _taken_back(
+    views: RecordedViews, reference: ReferenceModel, change: ChangePoint
+) -> tuple[RecordedViews, ReferenceModel, ChangePoint] | None:
+    """Recording and model with a change taken back, and the change as it then was; None where the model is no better.
+
+    The model was learnt with the change in it and hides a part of it: the square of its scatter is a parabola of what
+    is taken back.
+    """
+    x, squares = float(change.x[0]), [reference.scatter_px**2]
+    best: tuple[RecordedViews, ReferenceModel, float] | None = None
+    for share in (1.0, 2.0, 0.0):
+        if share == 0.0:
+            bend = squares[0] - 2.0 * squares[1] + squares[2]
+            if not bend > 0.0:
+                break
+            share = 1.0 + 0.5 * (squares[0] - squares[2]) / bend
+        mended = corrected_views(views, change.hypothesis, change.frames, share * x)
+        again = None if mended is None else _learnt(mended)
+        if mended is None or again is None:
+            break
+        squares.append(again.scatter_px**2)
+        if not again.scatter_px < reference.scatter_px:
+            break
+        if best is None or again.scatter_px < best[1].scatter_px:
+            best = mended, again, share
+    if best is None or not best[1].scatter_px * AS_GOOD < reference.scatter_px:
+        return None
+    views, again, share = best
+    whole = replace(change, x=share * change.x, effect=share * change.effect)
+    return views, again, whole
+
+
+def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
+    """Changes of one parameter with those that only add to them: of the same subject, from the same frame on."""
+    kept: list[ChangePoint] = []
+    for one in found:
+        same = [
+            k for k, other in enumerate(kept)
+            if len(one.x) == 1 and one.hypothesis.kind == other.hypothesis.kind
+            and one.hypothesis.subject == other.hypothesis.subject and one.after == other.after
+            and abs(one.onset - other.onset) <= SAME_ONSET
+        ]  # fmt: skip
+        if same:
+            other = kept[same[0]]
+            x = other.x + one.x
+            effect = other.effect * float(x[0] / other.x[0])
+            kept[same[0]] = replace(other, x=x, effect=effect, covariance=one.covariance)
+        else:
+            kept.append(one)
+    return kept
+
+
+def _learnt(views: RecordedViews) -> ReferenceModel | None:
+    try:
+        return learn_reference(views)
+    except (LearningError, CalibrationError):
+        return None
+
+
+def _when(cause: RecordingCause) -> float:
+    return -math.inf if cause.onset is None else cause.onset.time_s
+
+
+def _residuals_px(problem: ExaminedFrames) -> FloatArray:
+    """Residuals (k, 2) [px], predicted less observed, errors of the joints included."""
+    plain = super(ExaminedFrames, problem).residuals_at(start_state(problem)).reshape(-1, 2)
+    return np.asarray(plain * problem.data.sigmas[:, None])
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
+
+
+def _without(problem: ExaminedFrames, change: ChangePoint) -> ExaminedFrames:
+    """The problem with the effect of a change removed, its parameters left free."""
+    part = problem.select(change.rows)
+    q = len(change.x)
+    slopes = np.zeros((2 * len(problem.data.camera), q))
+    here = part.residuals_at(start_state(part))
+    values, vectors = np.linalg.eigh(change.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    slopes[np.repeat(change.rows, 2)] = (
+        change_jacobian(part, (change.hypothesis.change,), change.x, here) @ root
+    )
+    return problem.explained(change.rows, change.effect, slopes)
+
+
+# -- causes in words ------------------------------------------------------------------------------------------
+
+
+def _onset(views: RecordedViews, frame: int, span: tuple[int, int], camera: int) -> Onset:
+    """An onset at ``frame`` among all frames, told in those of a camera."""
+    mine = np.flatnonzero(views.camera == camera)
+    k, first, last = (min(int(np.searchsorted(mine, one)), len(mine) - 1) for one in (frame, *span))
+    before = float(views.times[mine[k - 1]]) if k > 0 else None
+    return Onset(
+        views.cameras[camera].name, k, float(views.times[mine[k]]), before, first, last, int(views.episodes[mine[k]])
+    )  # fmt: skip
+
+
+def _stamp(views: RecordedViews, onset: Onset) -> str:
+    return f"{onset.time_s:.3f} s" if views.timed else f"index {onset.time_s:g}"
+
+
+def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float | None, str]:
+    """Size, deviation and unit of a change: of a turn its angle, of the earlier frames seen from the later ones."""
+    x, covariance = change.x, change.covariance
+    one = change.hypothesis
+    sign = 1.0 if change.after else -1.0
+    if one.kind == "stamps":
+        return sign * float(x[0]), max(float(np.sqrt(covariance[0, 0])), LEAST_DEVIATION_S), "s"
+    if one.kind == "joint":
+        kind = model.joint_kinds[model.joint_names.index(one.subject)]
+        return sign * float(x[0]), float(np.sqrt(covariance[0, 0])), "rad" if kind == "revolute" else "m"
+    if len(x) == 6:
+        return float(np.linalg.norm(x[:3])), float(np.sqrt(np.trace(covariance[:3, :3]) / 3.0)), "rad"
+    return None, None, ""
+
+
+def _sentence(model: CellModel, one: Hypothesis, value: float | None, deviation: float | None) -> str:
+    if one.kind != "stamps":
+        return SENTENCES[one.kind](model, one.subject, value, deviation)
+    if value is None or deviation is None:
+        return f"stamps of {'camera ' + one.subject if one.subject else 'all cameras, or of the joints,'} are wrong"
+    of = f"pictures of camera {one.subject}" if one.subject else "the pictures of all cameras"
+    by = f"{1e3 * abs(value):.1f} ± {1e3 * deviation:.1g} ms"
+    return f"{of} are {by} {'later' if value > 0.0 else 'earlier'} than their stamps tell, against those of the joints"
+
+
+def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> RecordingCause:
+    value, deviation, unit = _amount(model, change)
+    one = change.hypothesis
+    text = _sentence(model, one, value, deviation)
+    onset = None
+    if not change.throughout and not (one.kind == "stamps" and change.onset == 0):
+        names = [camera.name for camera in views.cameras]
+        own = one.kind in ("camera", "stamps") and one.subject
+        camera = names.index(one.subject) if own else int(views.camera[change.onset])
+        onset = _onset(views, change.onset, change.span, camera)
+        text += f", from frame {onset.frame} of camera {onset.camera} on ({_stamp(views, onset)})"
+    or_else = tells = ""
+    if change.runner_up is not None:
+        or_else = _sentence(model, change.runner_up, None, None)
+        tells = _tells_apart(one, change.runner_up)
+        text += f"; or {or_else}: the recording does not tell. What would: {tells}"
+    return RecordingCause(
+        _KINDS[one.kind], one.subject, f"{text}; {change.effect_px:.3g} px rms", onset, change.effect_px,
+        value, deviation, unit, or_else, tells,
+    )  # fmt: skip
+
+
+def _tells_apart(one: Hypothesis, other: Hypothesis) -> str:
+    kinds = {one.kind, other.kind}
+    if "stamps" in kinds:
+        return "frames with the arm at rest, which a late stamp does not move"
+    if "marker" in kinds:
+        return "the other markers of the body in more of the frames"
+    if "joint" in kinds and "body" not in kinds and "camera" not in kinds:
+        return (
+            "a marker that stands still before the cameras, and motion of that joint over more of its range"
+        )
+    if "camera" in kinds or "cameras" in kinds:
+        return "a marker that stands still before the cameras"
+    return "motion of the joints concerned over more of their ranges, with the others elsewhere"
+
+
+def _dropped(views: RecordedViews) -> list[RecordingCause]:
+    """Causes of frames that cameras dropped."""
+    found = []
+    for c, camera in enumerate(views.cameras):
+        holes = gaps(views, c)
+        if not holes:
+            continue
+        ranks = views.ranks
+        total = sum(hole.missing for hole in holes)
+        onset = _onset(views, holes[0].frame, (holes[0].frame, holes[0].frame), c)
+        found.append(
+            RecordingCause(
+                "dropped_frames",
+                camera.name,
+                f"camera {camera.name} dropped {total} frames in {len(holes)} gaps, the first before its frame "
+                f"{onset.frame} ({_stamp(views, onset)})",
+                onset,
+                value=float(total),
+                deviation=0.0,
+                unit="frames",
+                gaps=tuple((int(ranks[hole.frame]), hole.missing) for hole in holes[:MOST_GAPS]),
+            )
+        )
+    return found
+
+
+def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
+    """Errors of the joints' readings, or of the poses, that the model found where it was learnt and scatters by."""
+    joints = () if reference.report is None else reference.report.joints
+    errors = {one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture])) for one in joints}
+    if reference.fits or not errors:
+        return []
+    listed = ", ".join(f"{name} {error:.2g}" for name, error in errors.items())
+    worst = max(errors, key=lambda name: errors[name])
+    return [
+        RecordingCause(
+            "joint_errors",
+            worst,
+            f"readings of the joints (or poses) are wrong by deviations of [rad or m] {listed}, so that pixels scatter "
+            f"by {reference.scatter_px:.3g} px where the model was learnt: play, ripple, coarse encoders, or a zero "
+            "that drifted meanwhile. What would tell: the same motions once more, which repeat ripple, and play by "
+            "direction",
+            effect_px=reference.scatter_px,
+            value=errors[worst],
+        )
+    ]
+
+
+def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames) -> list[RecordingCause]:
+    """What is left beside the causes, where it is no noise."""
+    here = problem.residuals_at(start_state(problem))
+    chi2 = float(here @ problem.whitened(here))
+    if not is_unexplained(chi2, here.size, math.log(FALSE_ALARM), NOISE_MARGIN**2 * here.size):
+        return []
+    squares = (here.reshape(-1, 2) ** 2).mean(axis=1)
+    by_camera = [float(np.sqrt(squares[problem.data.camera == c].mean())) for c in range(len(views.cameras))]
+    worst = int(np.argmax(by_camera))
+    frame = np.bincount(problem.data.stop, squares) / np.maximum(np.bincount(problem.data.stop), 1)
+    one = int(np.argmax(frame))
+    onset = _onset(views, one, (one, one), int(views.camera[one]))
+    return [
+        RecordingCause(
+            "unexplained",
+            views.cameras[worst].name,
+            f"what is left is {math.sqrt(chi2 / here.size):.3g} times the expected noise and no single change explains "
+            f"it: most in camera {views.cameras[worst].name} ({by_camera[worst]:.3g} times), the largest at frame "
+            f"{onset.frame} of camera {onset.camera} ({math.sqrt(float(frame[one])):.3g} times). Detections that are "
+            "worse than stated, play or errors of the joints (or of the poses), stamps that scatter; a marker that "
+            "stands still, and frames at rest, would tell pictures from joints",
+            onset,
+            _rms(_residuals_px(problem)),
+        )
+    ]
+
+
+def _not_learnt(
+    views: RecordedViews, failed: LearningError, lost: list[RecordingCause], dropped: _Gaps
+) -> RecordingReport:
+    """The report where no model can be learnt: the refusal of the fit is the cause, with the frame of its stop."""
+    error = failed.error
+    onset: Onset | None = None
+    names = [camera.name for camera in views.cameras]
+    stop, camera = error.data.get("stop"), error.data.get("camera")
+    if isinstance(stop, int) and 0 <= stop < len(failed.stops.frames):
+        frames = failed.stops.frames
+        c = names.index(camera) if camera in names else int(views.camera[frames[stop]])
+        step = step_near(views, c, frames, stop)
+        onset = _onset(views, step.onset, step.span, c)
+    kind: RecordingCauseKind = "not_learnt"
+    if error.code == "camera_moved":
+        kind = "camera_moved"
+    elif error.code == "marker_slipped":
+        kind = "marker_slipped"
+    cause = RecordingCause(kind, str(camera or error.data.get("joint", "")), error.message, onset)
+    cameras = {
+        name: CameraResiduals(int((views.camera == c).sum()), None, _count(dropped[name]))
+        for c, name in enumerate(names)
+    }
+    return RecordingReport(
+        None, None, None, "", cameras, {}, {}, (cause, *lost),
+        ("no model could be learnt, so that nothing else was examined",), None, 0,
+    )  # fmt: skip
+
+
+# -- figures --------------------------------------------------------------------------------------------------
+
+
+def _count(holes: list[Gap] | None) -> int | None:
+    return None if holes is None else sum(hole.missing for hole in holes)
+
+
+def _by_camera(
+    views: RecordedViews,
+    problem: ExaminedFrames,
+    left: FloatArray,
+    tested: list[Hypothesis],
+    found: list[ChangePoint],
+    dropped: _Gaps,
+) -> dict[str, CameraResiduals]:
+    """Residuals, offsets and dropped frames of each camera; an offset that was found throughout is part of its own."""
+    late = {one.subject: one for one in tested if one.kind == "stamps"}
+    answers = {}
+    for c, camera in enumerate(views.cameras):
+        mine = problem.data.camera == c
+        offset: tuple[float | None, float | None] = (None, None)
+        if camera.name in late and mine.any():
+            estimate = estimate_changes(problem.select(mine), (late[camera.name].change,))
+            deviation = 1.0 / math.sqrt(max(float(estimate.information[0, 0]), 1e-12))
+            known = [
+                one for one in found
+                if one.hypothesis.kind == "stamps" and one.after and one.onset == 0
+                and one.hypothesis.subject in ("", camera.name)
+            ]  # fmt: skip
+            if known:
+                own = max(LEAST_DEVIATION_S, *(float(np.sqrt(one.covariance[0, 0])) for one in known))
+                offset = sum(float(one.x[0]) for one in known), own
+            elif deviation <= UNKNOWN_S:
+                offset = float(estimate.x[0]), max(deviation, LEAST_DEVIATION_S)
+        answers[camera.name] = CameraResiduals(
+            int((views.camera == c).sum()), _rms(left[mine]), _count(dropped[camera.name]), *offset
+        )
+    return answers
+
+
+def _by_joint(views: RecordedViews, problem: ExaminedFrames, left: FloatArray) -> dict[str, float]:
+    """Residuals of the frames in which each joint is away from its median."""
+    there = views.at(views.times)
+    apart = np.abs(there - np.median(there, axis=0))
+    away: BoolArray = apart > AWAY * apart.max(axis=0)
+    return {name: _rms(left[away[problem.data.stop, j]]) for j, name in enumerate(views.joint_names)}

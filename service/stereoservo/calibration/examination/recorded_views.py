@@ -1,0 +1,208 @@
+"""A recording of joints and pictures as arrays, whatever file it comes from, and the stops and single-joint motions in
+it that a model can be learnt from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stereoservo.calibration.trial_data import TrialCamera, TrialData
+from stereoservo.kinematics.model import CellModel
+from stereoservo.kinematics.parameterization import Kind
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+
+AT_REST = 0.01
+"""[rad/s or m/s] Joint speed up to which the arm stands."""
+SAME_INSTANT_S = 1e-3
+"""Frames of several cameras are of one instant where their stamps are no further apart."""
+SPEED_OVER_S = 0.02
+"""Half of the time over which joint speeds are taken."""
+LEAST_RESTS = 12
+"""Rests from which a model is learnt from these alone: a late stamp does not matter there."""
+LEAST_RUN = 4
+"""Stops of a single joint's motion."""
+ALONE = 1e-3
+"""[rad or m] that the other joints may move meanwhile."""
+MOST_OF_RUN, MOST_FREE = 15, 40
+"""Stops of each single joint's motion, and of all joints, that a model is learnt from."""
+
+
+@dataclass(frozen=True)
+class RecordedViews:
+    """A recording, frames in the order of their stamps.
+
+    Joint samples at ``joint_times`` (j,) [s], ``positions`` (j, n) [rad or m]. Frames: ``camera`` (f,) index,
+    ``times`` (f,) [s], ``numbers`` (f,) as counted by the camera, -1 where nothing counts, ``episodes`` (f,),
+    ``pixels`` (f, m, 2) raw [px], NaN where a marker was not seen, ``sigmas`` (f, m) [px]. ``generators`` (n, 4, 4):
+    of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
+    ``model``: one that the recording holds, for where none can be learnt.
+    """
+
+    joint_names: tuple[str, ...]
+    joint_kinds: tuple[Kind, ...]
+    cameras: tuple[TrialCamera, ...]
+    marker_ids: tuple[int, ...]
+    joint_times: FloatArray
+    positions: FloatArray
+    camera: IntArray
+    times: FloatArray
+    numbers: IntArray
+    episodes: IntArray
+    pixels: FloatArray
+    sigmas: FloatArray
+    generators: FloatArray | None = None
+    timed: bool = True
+    model: CellModel | None = None
+
+    @property
+    def seen(self) -> BoolArray:
+        """(f, m): which markers each frame shows."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=-1))
+
+    @property
+    def ranks(self) -> IntArray:
+        """Number (f,) of each frame among those of its camera, from 0."""
+        found = np.zeros(len(self.camera), dtype=np.int64)
+        for c in range(len(self.cameras)):
+            mine = self.camera == c
+            found[mine] = np.arange(int(mine.sum()))
+        return found
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Positions (k, n) at ``times`` (k,) [s], interpolated; those of the ends beyond them."""
+        return np.array([np.interp(times, self.joint_times, q) for q in self.positions.T]).T
+
+    def speeds(self, times: FloatArray) -> FloatArray:
+        """Fastest joint (k,) [rad/s or m/s] about ``times`` (k,)."""
+        apart = np.abs(self.at(times + SPEED_OVER_S) - self.at(times - SPEED_OVER_S))
+        return np.asarray(apart.max(axis=1) / (2.0 * SPEED_OVER_S))
+
+    def select(self, frames: BoolArray | IntArray) -> RecordedViews:
+        """The recording with some of its frames."""
+        fields = ("camera", "times", "numbers", "episodes", "pixels", "sigmas")
+        return replace(self, **{name: getattr(self, name)[frames] for name in fields})
+
+
+def frames_apart(views: RecordedViews) -> TrialData:
+    """Every frame as a stop of its own, at its own stamp."""
+    f, m = views.sigmas.shape
+    shape = (len(views.cameras), f, m)
+    pixels, sigmas = np.full((*shape, 2), np.nan), np.ones(shape)
+    at = views.camera, np.arange(f)
+    pixels[at], sigmas[at] = views.pixels, views.sigmas
+    return _trials(views, views.at(views.times), np.full(f, -1), pixels, sigmas)
+
+
+@dataclass(frozen=True)
+class LearningStops:
+    """Trial data of some stops of a recording, and the first frame (s,) of each."""
+
+    trials: TrialData
+    frames: IntArray
+
+
+def learning_stops(views: RecordedViews) -> LearningStops:
+    """Stops that a model can be learnt from: rests, where there are enough of them, else instants at which several
+    cameras took a frame; of each, which joint moved alone.
+    """
+    instant = instants(views)
+    stops = np.unique(instant[instant >= 0])
+    positions = stop_positions(views, instant)
+    alone = single_joint_motions(positions)
+    keep = _thinned(alone)
+    shape = (len(views.cameras), len(keep), len(views.marker_ids))
+    pixels, sigmas = np.full((*shape, 2), np.nan), np.ones(shape)
+    first = np.zeros(len(keep), dtype=np.int64)
+    for k, stop in enumerate(stops[keep].tolist()):
+        of_stop = np.flatnonzero(instant == stop)
+        first[k] = of_stop[0]
+        for c in np.unique(views.camera[of_stop]).tolist():
+            _average(views, of_stop[views.camera[of_stop] == c], pixels[c, k], sigmas[c, k])
+    return LearningStops(_trials(views, positions[keep], alone[keep], pixels, sigmas), first)
+
+
+def stop_positions(views: RecordedViews, instant: IntArray) -> FloatArray:
+    """Mean positions (s, n) of the frames of each ``instant`` (f,), without those of -1."""
+    of_stop = np.flatnonzero(instant >= 0)
+    stops, which = np.unique(instant[of_stop], return_inverse=True)
+    found = np.zeros((len(stops), len(views.joint_names)))
+    np.add.at(found, which, views.at(views.times[of_stop]))
+    return np.asarray(found / np.bincount(which, minlength=len(stops))[:, None])
+
+
+def _average(views: RecordedViews, frames: IntArray, pixels: FloatArray, sigmas: FloatArray) -> None:
+    """Put the mean of some frames of a camera into ``pixels`` (m, 2), and its deviation into ``sigmas`` (m,)."""
+    known = views.seen[frames]
+    count = known.sum(axis=0)
+    some = count > 0
+    shown = np.where(known[..., None], views.pixels[frames], 0.0).sum(axis=0)
+    pixels[some] = shown[some] / count[some, None]
+    squares = np.where(known, views.sigmas[frames], 0.0) ** 2
+    sigmas[some] = np.sqrt(squares.sum(axis=0)[some]) / count[some]
+
+
+def _trials(
+    views: RecordedViews, positions: FloatArray, alone: IntArray, pixels: FloatArray, sigmas: FloatArray
+) -> TrialData:
+    return TrialData(
+        joint_names=views.joint_names,
+        joint_kinds=views.joint_kinds,
+        cameras=views.cameras,
+        marker_ids=views.marker_ids,
+        positions=positions,
+        trials=alone,
+        pixels=pixels,
+        sigmas=sigmas,
+        images=len(views.camera),
+        generators=views.generators,
+    )
+
+
+def instants(views: RecordedViews) -> IntArray:
+    """Number (f,) of the instant that each frame is of: of a rest, where there are enough, -1 in motion."""
+    if views.timed and len(views.times) > 1:
+        still = views.speeds(views.times) <= AT_REST
+        began = still & ~np.concatenate([[False], still[:-1]])
+        # From one rest to the next the arm may have moved between two frames.
+        there = views.at(views.times)
+        jumped = np.abs(np.diff(there, axis=0)).max(axis=1) > ALONE
+        began |= still & np.concatenate([[False], jumped])
+        rests = np.where(still, np.cumsum(began) - 1, -1)
+        if int(rests.max(initial=-1)) + 1 >= LEAST_RESTS:
+            return np.asarray(rests)
+    apart = np.diff(views.times, prepend=views.times[:1]) > (SAME_INSTANT_S if views.timed else 0.0)
+    return np.asarray(np.cumsum(apart))
+
+
+def single_joint_motions(positions: FloatArray) -> IntArray:
+    """Joint (s,) that moved alone about each of the stops at ``positions`` (s, n), -1 where several did or none."""
+    alone = np.full(len(positions), -1)
+    for begin, end in _runs(positions):
+        moved = np.ptp(positions[begin:end], axis=0)
+        if end - begin >= LEAST_RUN and (moved > ALONE).sum() == 1:
+            alone[begin:end] = int(moved.argmax())
+    return alone
+
+
+def _runs(positions: FloatArray) -> Iterator[tuple[int, int]]:
+    """Stretches of stops over which at most one joint moves."""
+    begin = 0
+    for k in range(1, len(positions) + 1):
+        if k == len(positions) or (np.ptp(positions[begin : k + 1], axis=0) > ALONE).sum() > 1:
+            yield begin, k
+            begin = k
+
+
+def _thinned(alone: IntArray) -> IntArray:
+    """Indices of the stops to learn from: some of each joint's motion, some of all others'."""
+    kept = []
+    for joint in np.unique(alone).tolist():
+        mine = np.flatnonzero(alone == joint)
+        most = MOST_OF_RUN if joint >= 0 else MOST_FREE
+        # Of poses and known arms all stops are free.
+        most = most if (alone >= 0).any() else 3 * MOST_FREE
+        kept.append(mine[np.unique(np.linspace(0, len(mine) - 1, min(most, len(mine))).round().astype(int))])
+    return np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)
