@@ -213,8 +213,9 @@ def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pyte
         return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({next(codes)})"])
 
     monkeypatch.setattr(supervisor, "_spawn", spawn)
-    compilation = supervisor.Compilation()
+    compilation = supervisor.Compilation(Path("/runtime"))
     assert compilation.look(0.0) == ""
+    assert began[0][-2:] == ["beside", "/runtime"]
 
     def told(now: float) -> str:
         assert compilation._process is not None

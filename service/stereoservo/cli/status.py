@@ -7,6 +7,8 @@ from __future__ import annotations
 import math
 import time
 
+import msgspec
+
 from stereoservo.cli.local_state import (
     GATEWAY_SILENT,
     SERVO_SILENT,
@@ -16,7 +18,8 @@ from stereoservo.cli.local_state import (
 )
 from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, code_of, emit
 from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionError
-from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.compilation_progress import read_progress
+from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import find_daemon
 from stereoservo.messages.wire import EventMessage, StateMessage
 
@@ -43,7 +46,21 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
         raise _failure(code_of(error), silence, newest_state(directories), json) from error
     if not state.servo_alive:
         raise _failure("servo_silent", f"the servo process is silent. {SERVO_SILENT}", state, json)
+    if directories is not None:
+        state = with_progress(state, directories)
     emit(state, "\n".join([describe(state), *causes]), json)
+
+
+def with_progress(state: StateMessage, directories: CellDirectories) -> StateMessage:
+    """A state whose reason ``COMPILING`` says how many kernels are compiled, on the cell's own host."""
+    compiling = [one for one in read_progress(directories.runtime) if one.part == "rest"]
+    reasons = tuple(
+        msgspec.structs.replace(reason, hint=f"{compiling[0].words} are compiled. {reason.hint}")
+        if compiling and reason.code == "COMPILING"
+        else reason
+        for reason in state.reasons
+    )
+    return msgspec.structs.replace(state, reasons=reasons)
 
 
 def _causes(client: Client, state: StateMessage) -> list[str]:

@@ -18,7 +18,7 @@ import msgspec
 
 from stereoservo.daemon.camera_setup import describe_camera, make_camera
 from stereoservo.daemon.ipc_messages import RunPlan, save_plan
-from stereoservo.daemon.kernel_compilation import collect_seldom, warm_up_first
+from stereoservo.daemon.kernel_compilation import collect_seldom, tell_progress, warm_up_first
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_file
 from stereoservo.ports import plugins
@@ -123,6 +123,7 @@ def main() -> int:
     die_with_parent(int(sys.argv[4]), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     collect_seldom()
+    tell_progress(runtime, "first", int(sys.argv[4]))
     try:
         plan = make_plan(cell_path, runtime, state, msgspec.json.decode(sys.argv[5], type=PlanOptions))
     except (CellFileError, DriverError, plugins.PluginError) as error:

@@ -5,8 +5,8 @@ Kernels are compiled by running an example cell: an arm with two cameras runs so
 compiled by types, not by sizes. The cameras' lenses bend, so that the lens's kernels run too. A file in the cache of
 numba tells that all are compiled, of which sources, and with which signatures; the distribution
 ``stereoservo-kernels`` (``deploy/kernels``) brings another one.
-``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside]`` compiles what is not compiled yet; ``beside``
-others that work: niced.
+``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside RUNTIME_DIRECTORY]`` compiles what is not compiled
+yet; ``beside`` others that work: niced, and telling how far it is.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.kernels import distort_pixel
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
+from stereoservo.messages.compilation_progress import CompilationProgress, progress_path
 from stereoservo.messages.files import write_atomically
 from stereoservo.messages.goals import (
     DEFAULT_LAW,
@@ -61,7 +62,7 @@ from stereoservo.messages.goals import (
     UpdateGoal,
 )
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import KERNELS, Overload, load, overloads
+from stereoservo.numerics.compilation import KERNELS, Overload, load, overloads, tell_compiled
 from stereoservo.numerics.kernel_cache import SHIPPED, file_hash, shipped_folder
 from stereoservo.planning.planner_warmup import warm_up_planner
 from stereoservo.ports.devices import CameraObservation, JointState
@@ -76,6 +77,8 @@ MODULE, RECORD, BESIDE = "stereoservo.daemon.kernel_compilation", "record", "bes
 """This module, and its second arguments: for the second part of its work, and for low priority."""
 NICE = 10
 """Of the process that compiles while cameras and arm work."""
+KERNELS_IN_ALL = 380
+"""About so many signatures the whole warm-up holds: for telling how far it is, and nothing else."""
 WAIT_S = 0.2
 """Between two looks whether another process has compiled."""
 LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
@@ -452,6 +455,17 @@ def wait_until_compiled(given_up: Callable[[], bool]) -> None:
         os.close(lock)
 
 
+def tell_progress(runtime: Path, part: str, daemon: int, total: int = 0) -> None:
+    """Have this process tell in a cell's runtime directory how many kernels it has compiled, of about ``total``."""
+    path = progress_path(runtime, part)
+
+    def tell(done: int) -> None:
+        with suppress(OSError):  # a full disk, or a directory that is gone, ends no compilation
+            path.write_bytes(msgspec.json.encode(CompilationProgress(part, daemon, done, total)))
+
+    tell_compiled(tell)
+
+
 def collect_seldom() -> None:
     """Make the garbage collector rare: what numba makes while it compiles stays, and looking through it costs a
     twentieth of the time.
@@ -467,8 +481,9 @@ def main() -> int:
     if sys.argv[2:] == [RECORD]:
         record_compiled()
     elif _has_cache():
-        if sys.argv[2:] == [BESIDE]:
+        if sys.argv[2:3] == [BESIDE]:
             os.nice(NICE)
+            tell_progress(Path(sys.argv[3]), "rest", int(sys.argv[1]), KERNELS_IN_ALL)
         _wait_for_others()
         if compiled() is None:
             shipped = _shipped()

@@ -23,6 +23,7 @@ from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load
 from stereoservo.daemon.kernel_compilation import (
     KernelLoader,
     kernels_to_come,
+    tell_progress,
     wait_until_compiled,
     warm_up,
     warm_up_first,
@@ -368,6 +369,9 @@ def main() -> int:
     runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
     die_with_parent(parent, signal.SIGTERM)
     termination = Termination()
+    tell_progress(
+        runtime, "servo", parent
+    )  # of what no other process has compiled: where no cache can be written
     try:
         run(load_plan(runtime), termination)
     except DriverError as error:

@@ -51,6 +51,7 @@ from stereoservo.daemon.process_control import Termination, child_environment, w
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
 from stereoservo.daemon.vision import Reporter
 from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.compilation_progress import PatientWait, read_progress
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock, holder
 from stereoservo.messages.run_record import begin_run, end_run, run_is_up
@@ -58,7 +59,9 @@ from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 300.0
-"""A servo process whose cache cannot be written compiles all kernels before it is ready."""
+"""So long the processes may take to be ready after the last kernel that was compiled for them."""
+TELL_EVERY_S = 5.0
+"""How often the log tells how far the compilation is, where it goes on."""
 SERVO_END_S = 6.0
 OTHERS_END_S = 4.0
 FIRST_PAUSE_S = 0.5
@@ -104,7 +107,8 @@ class Child:
 class Compilation:
     """The process that compiles what a first start lacks, niced, beside all others."""
 
-    def __init__(self) -> None:
+    def __init__(self, runtime: Path) -> None:
+        self._runtime = runtime
         self._process: subprocess.Popen[bytes] | None = None
         self._due: float | None = 0.0
 
@@ -112,7 +116,8 @@ class Compilation:
         """Start it where it is due; returns how it failed, once, else ''."""
         if self._process is None:
             if self._due is not None and now >= self._due:
-                self._process = _spawn(["stereoservo.daemon.kernel_compilation", str(os.getpid()), "beside"])
+                arguments = [str(os.getpid()), "beside", str(self._runtime)]
+                self._process = _spawn(["stereoservo.daemon.kernel_compilation", *arguments])
             return ""
         code = self._process.poll()
         if code is None:
@@ -175,7 +180,7 @@ class Supervisor:
             self.stop()
 
     def _await_ready(self, termination: Termination) -> None:
-        until = time.monotonic() + READY_TIMEOUT_S
+        wait = PatientWait(READY_TIMEOUT_S)
         while not (self.plan.directories.daemon.exists() and self.plan.directories.control_socket.exists()):
             if termination.asked:
                 return
@@ -185,8 +190,10 @@ class Supervisor:
                         f"the {child.name} process ended at its start (exit code {code}); its message "
                         f"is above"
                     )
-            if time.monotonic() > until:
-                raise StartError(f"the processes were not ready within {READY_TIMEOUT_S:g} s")
+            if wait.is_over(read_progress(self.plan.directories.runtime)):
+                raise StartError(
+                    f"the processes were not ready within {READY_TIMEOUT_S:g} s, in which no kernel was compiled either"
+                )
             time.sleep(0.02)
 
     def look(self, now: float) -> None:
@@ -277,6 +284,24 @@ def _end(children: list[Child], grace_s: float) -> None:
             process.wait()
 
 
+class ProgressLines:
+    """Lines in the log on how many kernels are compiled."""
+
+    def __init__(self) -> None:
+        self._due_s = time.monotonic() + TELL_EVERY_S
+        self._said = ""
+
+    def look(self, runtime: Path) -> None:
+        """Tell where it is time, and there is something new."""
+        if time.monotonic() < self._due_s:
+            return
+        self._due_s = time.monotonic() + TELL_EVERY_S
+        words = ", ".join(f"{one.part}: {one.words}" for one in read_progress(runtime))
+        if words != self._said:
+            self._said = words
+            write_log("run", f"compiling kernels for this computer, once ({words})")
+
+
 def prepare(
     cell_path: Path, options: PlanOptions, directories: CellDirectories, termination: Termination
 ) -> RunPlan | None:
@@ -293,11 +318,13 @@ def prepare(
             [sys.executable, "-m", "stereoservo.daemon.cell_preparation", *arguments],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors, env=child_environment(),
         )  # fmt: skip
+        told = ProgressLines()
         while process.poll() is None:
             if termination.asked:
                 process.kill()
                 process.wait()
                 return None
+            told.look(directories.runtime)
             time.sleep(0.02)
         errors.seek(0)
         text = errors.read().decode(errors="replace").strip()
@@ -397,7 +424,7 @@ def run_cell(
         termination = Termination(grace_s=0.0)
         clean(directories)
         record_run(partial(begin_run, directories, options.boot, os.getpid()))
-        compilation = Compilation()
+        compilation = Compilation(directories.runtime)
         try:
             compilation.look(0.0)  # beside the preparation and, niced, beside the work
             plan = prepare(cell_path.absolute(), options, directories, termination)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Self
 
 import msgspec
 
+from stereoservo.messages.compilation_progress import CompilationProgress, PatientWait, read_progress
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.directories import CELL_NAME, CellDirectories, cell_directories, runtime_root
 from stereoservo.messages.files import read_bounded
@@ -22,6 +24,8 @@ from stereoservo.messages.locks import holder
 from stereoservo.messages.run_record import how_it_ended, read_run
 
 MAX_INFO_BYTES = 1 << 16
+TELL_EVERY_S = 5.0
+"""How often who starts a daemon is told how many kernels it has compiled."""
 
 
 class DaemonInfo(msgspec.Struct, frozen=True):
@@ -99,7 +103,9 @@ def last_words(directories: CellDirectories) -> str:
     """
     pid = holder(directories.daemon_lock)
     if pid is not None:
-        return f"Process {pid} has the cell and takes no requests: it starts, or ends. "
+        compiling = ", ".join(one.words for one in read_progress(directories.runtime))
+        more = f"It has compiled {compiling}. " if compiling else ""
+        return f"Process {pid} has the cell and takes no requests: it starts, or ends. {more}"
     run = read_run(directories)
     if run is None:
         return ""
@@ -137,10 +143,20 @@ class DaemonProcess:
             if stream is not None:
                 stream.close()
 
-    def wait_ready(self, timeout_s: float = 600.0) -> DaemonInfo:
-        """Wait until it accepts requests. Raises DaemonError with its output."""
-        until = time.monotonic() + timeout_s
-        while time.monotonic() < until:
+    def wait_ready(
+        self,
+        timeout_s: float = 600.0,
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> DaemonInfo:
+        """Wait until it accepts requests, as long as it compiles kernels: ``timeout_s`` counts from the last one.
+        ``tell`` gets a line where it has compiled more, each `TELL_EVERY_S`. Raises DaemonError with its output.
+        """
+        wait, due_s = PatientWait(timeout_s), time.monotonic() + TELL_EVERY_S
+        known: tuple[CompilationProgress, ...] = ()
+        while not wait.is_over(progress := self._progress()):
+            if progress != known and time.monotonic() > due_s:
+                known, due_s = progress, time.monotonic() + TELL_EVERY_S
+                tell("compiling kernels: " + ", ".join(f"{one.part} {one.words}" for one in progress))
             code = self.process.poll()
             if code is not None:
                 raise DaemonError(
@@ -152,10 +168,15 @@ class DaemonProcess:
             time.sleep(0.05)
         said = f"; it logs into {self._log}" if self._log is not None else ""
         raise DaemonError(
-            f"the daemon was not ready within {timeout_s:g} s: a busy computer, or a first start that compiles? Start "
-            f"it again: what was compiled is kept{said}",
+            f"the daemon was not ready within {timeout_s:g} s, in which it compiled no kernel either: a computer that "
+            f"is too busy? Start it again: what was compiled is kept{said}",
             None, self.output(),
         )  # fmt: skip
+
+    def _progress(self) -> tuple[CompilationProgress, ...]:
+        root = runtime_root()
+        folders = sorted(root.iterdir()) if root.is_dir() else []
+        return tuple(one for folder in folders for one in read_progress(folder, self.process.pid))
 
     def output(self) -> str:
         """Its log so far, where it logs into a file."""

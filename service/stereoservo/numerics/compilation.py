@@ -107,6 +107,26 @@ def _forget_literals(dispatcher: Any) -> None:
     dispatcher.get_call_template = get_call_template
 
 
+def tell_compiled(tell: Callable[[int], None]) -> None:
+    """Have this process call ``tell`` with the number of signatures that it holds, compiled or loaded, whenever it has
+    compiled another kernel.
+    """
+    event.register("numba:compile", _Counting(tell))
+
+
+class _Counting(event.Listener):  # type: ignore[misc]
+    def __init__(self, tell: Callable[[int], None]) -> None:
+        self._tell = tell
+
+    def on_start(self, event: Any) -> None:
+        """Nothing: a kernel counts when it is compiled."""
+
+    def on_end(self, event: Any) -> None:
+        function = event.data["dispatcher"].py_func
+        if (function.__module__, function.__qualname__) in KERNELS:
+            self._tell(sum(len(dispatcher.overloads) for dispatcher in KERNELS.values()))
+
+
 class _CompileLog(event.Listener):  # type: ignore[misc]
     """Appends to ``path``: process, kernel, types of the arguments, and CPU seconds of this thread, those of the
     kernels compiled meanwhile apart; at the end of the process its CPU seconds in all.

@@ -153,7 +153,7 @@ def conduct_live(
         )
         options = ("--seed", str(seed), "--record", str(recording))
         with DaemonProcess(cell_path, options=options, log=out / "daemon.log") as daemon:
-            daemon.wait_ready()
+            daemon.wait_ready(tell=stage.tell)
             stage.tell(f"look on: {RUNTIME_VARIABLE}={scratch / 'run'} stereoservo web {cell.cell.name}")
             runtime_dir = cell_directories(cell.cell.name).runtime
             log = TruthLog.of_directory(runtime_dir)
