@@ -77,7 +77,7 @@ MODULE, RECORD, BESIDE = "stereoservo.daemon.kernel_compilation", "record", "bes
 """This module, and its second arguments: for the second part of its work, and for low priority."""
 NICE = 10
 """Of the process that compiles while cameras and arm work."""
-KERNELS_IN_ALL = 380
+KERNELS_IN_ALL = 300
 """About so many signatures the whole warm-up holds: for telling how far it is, and nothing else."""
 WAIT_S = 0.2
 """Between two looks whether another process has compiled."""

@@ -7,7 +7,6 @@ missed is missing later; a plant obeys those that are addressed to its own sessi
 
 from __future__ import annotations
 
-import math
 import os
 import struct
 import time
@@ -158,6 +157,7 @@ class PlantDriver:
         self._orders = Orders(
             0, first, False, first, 0, 0, first, np.zeros(joints), np.full(len(self._names), np.nan)
         )
+        self._zeros = np.zeros(joints)
         self._state: PlantState | None = None
         self._failures = 0
         self._closed = False
@@ -244,16 +244,20 @@ class PlantDriver:
         """Order velocities (n,); what was sent, and why, is of the order before. Raises DriverError."""
         orders = self._orders
         asked = np.array(qd, dtype=np.float64)
-        if asked.shape != orders.velocities.shape or not all(map(math.isfinite, asked.tolist())):
+        # a product with zeros is not zero where something is infinite or NaN
+        if asked.shape != orders.velocities.shape or asked.dot(self._zeros) != 0.0:
             raise DriverError(
                 "shape",
                 f"write_velocity() got {asked.tolist()}; {orders.velocities.size} finite velocities are valid",
             )
         self._raise_failure(self._state_of_session())
-        self._send(velocities=asked, velocity_number=orders.velocity_number + 1)
+        orders.velocities = asked
+        orders.velocity_number = number = orders.velocity_number + 1
+        if not self._closed:
+            self._writer.write(orders.encoded())
         remarks = self._remarks
         sent = np.array(remarks.sent) if remarks.sent and asked.any() else asked
-        return CommandReport(self._orders.velocity_number, self._clock.now_ns(), asked, sent, remarks.reasons)
+        return CommandReport(number, self._clock.now_ns(), asked, sent, remarks.reasons)
 
     def stop(self) -> None:
         """Order the drives to brake. Any state; never raises."""

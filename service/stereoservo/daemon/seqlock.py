@@ -25,6 +25,10 @@ _MAGIC_WORD, _LAYOUT_WORD, _CAPACITY_WORD, _PID_WORD, _EPOCH_WORD, _SEQUENCE_WOR
     range(8)
 )
 
+_STATE = struct.Struct("@3Q")  # native: whole words, as the memory views write them
+"""Sequence number, length and CRC of a record, which lie one behind the other from `_STATE_AT` on."""
+_STATE_AT = 8 * _SEQUENCE_WORD
+
 _STOP_MAGIC = 0x53_53_54_4F_50_31  # "SSTOP1"
 _STOP_BYTES = 32
 _LARGEST_WORD = (1 << 64) - 1
@@ -137,6 +141,7 @@ class SlotWriter:
     def __init__(self, path: Path, capacity: int, layout: str) -> None:
         create_slot(path, capacity, layout)
         self._mapping, self._capacity = map_slot(path, layout)
+        self._words, self._bytes = self._mapping.words, self._mapping.bytes
         self._path = path
         try:
             fcntl.flock(self._mapping.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -159,17 +164,14 @@ class SlotWriter:
             raise SlotError(
                 self._path, "too_large", f"record of {length} bytes; the slot holds up to {self._capacity}"
             )
-        words = self._mapping.words
-        sequence = self._sequence + 2
-        words[_SEQUENCE_WORD] = sequence - 1
-        self._mapping.bytes[_HEADER_BYTES : _HEADER_BYTES + length] = record
-        words[_LENGTH_WORD] = length
-        words[_CRC_WORD] = _crc(sequence, record)
-        words[_SEQUENCE_WORD] = sequence
-        self._sequence = sequence
+        self._sequence = sequence = self._sequence + 2
+        self._words[_SEQUENCE_WORD] = sequence - 1
+        self._bytes[_HEADER_BYTES : _HEADER_BYTES + length] = record
+        _STATE.pack_into(self._bytes, _STATE_AT, sequence, length, zlib.crc32(record, sequence & 0xFFFFFFFF))
 
     def close(self) -> None:
         """Release the mapping; the file stays. Idempotent."""
+        self._words = self._bytes = memoryview(b"")
         self._mapping.close()
 
     def __enter__(self) -> Self:
@@ -190,6 +192,7 @@ class SlotReader:
 
     def __init__(self, path: Path, layout: str, *, retries: int = 8) -> None:
         self._mapping, self._capacity = map_slot(path, layout)
+        self._words, self._bytes = self._mapping.words, self._mapping.bytes
         self._retries = retries
         self._seen = 0
         self.torn = 0
@@ -214,25 +217,24 @@ class SlotReader:
         return self._read(skip=0)
 
     def _read(self, skip: int) -> bytes | None:
-        words, data = self._mapping.words, self._mapping.bytes
+        words = self._words
         for _ in range(self._retries):
-            sequence = words[_SEQUENCE_WORD]
-            if sequence in (skip, 0):
+            if words[_SEQUENCE_WORD] in (skip, 0):
                 return None
-            if not sequence & 1:
-                length = words[_LENGTH_WORD]
-                if length <= self._capacity:
-                    record = bytes(data[_HEADER_BYTES : _HEADER_BYTES + length])
-                    crc = words[_CRC_WORD]
-                    if words[_SEQUENCE_WORD] == sequence and crc == _crc(sequence, record):
-                        self._seen = sequence
-                        return record
+            sequence, length, crc = _STATE.unpack_from(self._bytes, _STATE_AT)
+            if not sequence & 1 and length <= self._capacity:
+                record = self._bytes[_HEADER_BYTES : _HEADER_BYTES + length].tobytes()
+                # A writer that was here meanwhile has left another number, or bytes that do not fit.
+                if zlib.crc32(record, sequence & 0xFFFFFFFF) == crc and words[_SEQUENCE_WORD] == sequence:
+                    self._seen = sequence
+                    return record
             self.torn += 1
         self.missed += 1
         return None
 
     def close(self) -> None:
         """Release the mapping. Idempotent."""
+        self._words = self._bytes = memoryview(b"")
         self._mapping.close()
 
     def __enter__(self) -> Self:
@@ -242,10 +244,6 @@ class SlotReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _crc(sequence: int, record: bytes) -> int:
-    return zlib.crc32(record, sequence & 0xFFFFFFFF)
 
 
 def create_stop_slot(path: Path) -> None:
