@@ -60,7 +60,7 @@ from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 300.0
 """So long the processes may take to be ready after the last kernel that was compiled for them."""
-TELL_EVERY_S = 5.0
+TELL_EVERY_S = 10.0
 """How often the log tells how far the compilation is, where it goes on."""
 SERVO_END_S = 6.0
 OTHERS_END_S = 4.0

@@ -24,7 +24,7 @@ from stereoservo.messages.locks import holder
 from stereoservo.messages.run_record import how_it_ended, read_run
 
 MAX_INFO_BYTES = 1 << 16
-TELL_EVERY_S = 5.0
+TELL_EVERY_S = 10.0
 """How often who starts a daemon is told how many kernels it has compiled."""
 
 

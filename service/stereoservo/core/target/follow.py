@@ -14,6 +14,7 @@ from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.resolve import camera_index, ideal_pixels, marker_indices
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
+from stereoservo.core.sources.progress import error_of_run
 from stereoservo.core.state import Followed, ServoGoal
 from stereoservo.core.target.motion import TargetBody, find_pose, find_shape, pixel_rates, target_body
 from stereoservo.core.target.track import FEWEST, FEWEST_TO_FIND, IDENTITY, displacements_of, pose_at
@@ -139,16 +140,16 @@ def follow_target(source: ServoGoal, context: StepContext) -> Reason | None:
     By events it tells when the target is seen, is lost, and is met while it moves.
     """
     waits = _brought(source, context)
-    followed = source.followed
+    followed, run = source.followed, context.state.block.numbers.run
     assert followed is not None
     if waits is not None:
-        source.held = 0  # what was held, was held on a target that was seen
+        run.held = 0  # what was held, was held on a target that was seen
         if followed.told in ("target_seen", "target_met"):
             _tell("target_unseen", f"{waits.hint}; the arm waits until it is there again", source, context)
     elif followed.told in ("", "target_unseen"):
         _tell("target_seen", "the target is seen: the goal goes with it", source, context)
-    elif followed.told == "target_seen" and source.held >= source.hold_frames and source.error_px is not None:
-        message = f"error {source.error_px:.4f} px on the target as it moves, for {source.held} frames"
+    elif followed.told == "target_seen" and run.held >= source.hold_frames and run.measured:
+        message = f"error {run.newest_px:.4f} px on the target as it moves, for {run.held} frames"
         _tell("target_met", message, source, context)
     return waits
 
@@ -159,7 +160,9 @@ def _tell(
     assert source.followed is not None
     source.followed.told = kind
     ids = ", ".join(str(marker) for marker in source.goal.follow_markers)
-    context.emit(kind, id=source.goal.id, name=ids, message=message, error_px=source.error_px)
+    context.emit(
+        kind, id=source.goal.id, name=ids, message=message, error_px=error_of_run(context.state.block)
+    )
 
 
 def _brought(source: ServoGoal, context: StepContext) -> Reason | None:
