@@ -136,6 +136,31 @@ assert set(overloads()) == before, set(overloads()) - before
 """
 
 
+FOLLOWING = """
+import sys
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from core.conftest import make_bench
+from core.test_moving_target import following, slide
+from stereoservo.daemon import kernel_compilation
+from stereoservo.numerics.compilation import overloads
+
+kernel_compilation.warm_up()
+before = set(overloads())
+bench, _ = following(make_bench, 0)
+for way in (0.02, 0.2):  # a slow slide, then a jump
+    slide(bench, lambda t: np.array([0.0, way * (t + 1.0), 0.0]))
+    bench.run(1.0)
+assert bench.core.state.target is not None
+assert set(overloads()) == before, set(overloads()) - before
+"""
+
+
+def test_a_target_that_is_followed_needs_no_kernels_that_the_example_did_not() -> None:
+    tests = Path(__file__).parents[1]
+    subprocess.run([sys.executable, "-c", FOLLOWING, str(tests)], check=True, timeout=280)
+
+
 @pytest.mark.slow
 def test_a_large_body_needs_no_kernels_that_the_example_did_not() -> None:
     subprocess.run([sys.executable, "-c", LARGE_BODY], check=True, timeout=120)

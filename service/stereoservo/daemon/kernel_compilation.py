@@ -46,6 +46,7 @@ from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.kernels import distort_pixel
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
+from stereoservo.messages.cell_file import Mount
 from stereoservo.messages.compilation_progress import CompilationProgress, progress_path
 from stereoservo.messages.files import write_atomically
 from stereoservo.messages.goals import (
@@ -116,6 +117,8 @@ def warm_up() -> None:
     _warm_up_goals()
     warm_up_incidences()
     rehearse_mobile()
+    for mount in ("eye_in_hand", "eye_to_hand"):
+        _warm_up_following(mount)
     model = example_model()
     matrices = np.array([camera.matrix for camera in model.cameras])
     find_groups(model.marker_points, matrices, FLAT_PX, model.generators, exhaustive=0)
@@ -164,6 +167,47 @@ def _warm_up_goals() -> None:
             core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
 
 
+OTHERS = tuple(range(20, 26))
+"""Markers of a target that the arm does not carry."""
+
+
+def _warm_up_following(mount: Mount) -> None:
+    """A core follows a target, the body before cameras on the arm or another one before cameras that stand: it is
+    found, moves on, jumps, and is brought in from where a goal was shown.
+    """
+    model, settings = msgspec.structs.replace(example_model(), mount=mount), example_settings()
+    cameras = tuple(msgspec.structs.replace(c, mount=mount, mobile=False) for c in settings.cameras)
+    settings = msgspec.structs.replace(settings, cameras=cameras)
+    others = model.marker_points + np.array([0.15, 0.1, 0.1, 0.0])
+    ids = MARKERS if mount == "eye_in_hand" else OTHERS
+    shown = {name: _by_marker(OTHERS, seen) for name, seen in zip(CAMERAS, _seen(model, others), strict=True)}
+    wanted = {
+        name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, _example_pixels(model), strict=True)
+    }
+    for follow_seen in ({}, shown)[: 1 if ids is MARKERS else 2]:
+        core = ServoCore(settings)
+        for step in range(1, STEPS):
+            way = np.array([1e-4 * step + (0.05 if step > STEPS // 2 else 0.0), 0.0, 0.0, 0.0])
+            body = model.marker_points + (way if ids is MARKERS else 0.0 * way)
+            pixels = np.concatenate([_seen(model, body), _seen(model, others + way)], axis=1)
+            inputs = _inputs(step, pixels, model, MARKERS + OTHERS)
+            goal = Goal(
+                "00000000-0000",
+                FeatureTarget(wanted),
+                law=DEFAULT_LAW,
+                follow_markers=ids,
+                follow_seen=follow_seen,
+            )
+            requests = (Request(1, "warmup", RunGoal(goal)),) if step == 5 else ()
+            core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
+        if core.state.target is None:
+            raise AssertionError("the example cell was to follow a target, and does not")
+
+
+def _by_marker(ids: tuple[int, ...], pixels: FloatArray) -> dict[int, tuple[float, float]]:
+    return {marker: (float(u), float(v)) for marker, (u, v) in zip(ids, pixels, strict=True)}
+
+
 def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
     """Run the core on frames of a camera that was moved: fault isolation runs at no other time."""
     settings = example_settings()
@@ -176,10 +220,12 @@ def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
         raise AssertionError("the example cell's camera was moved, and the core did not detect it")
 
 
-def _inputs(step: int, pixels: FloatArray, model: CellModel) -> StepInputs:
+def _inputs(step: int, pixels: FloatArray, model: CellModel, ids: tuple[int, ...] = MARKERS) -> StepInputs:
     """Inputs of a step: the arm at rest, a frame (c, m, 2) of every camera, the model in the second step."""
     now_ns = 1_000_000_000 + step * PERIOD_NS
-    frames = tuple(_observation(name, seen, step, now_ns) for name, seen in zip(CAMERAS, pixels, strict=True))
+    frames = tuple(
+        _observation(name, ids, seen, step, now_ns) for name, seen in zip(CAMERAS, pixels, strict=True)
+    )
     return StepInputs(
         now_ns=now_ns,
         period_ns=PERIOD_NS,
@@ -189,15 +235,22 @@ def _inputs(step: int, pixels: FloatArray, model: CellModel) -> StepInputs:
     )
 
 
-def _observation(camera: str, pixels: FloatArray, step: int, now_ns: int) -> CameraObservation:
-    covariances = np.tile(0.01 * np.eye(2), (len(MARKERS), 1, 1))
+def _observation(
+    camera: str, ids: tuple[int, ...], pixels: FloatArray, step: int, now_ns: int
+) -> CameraObservation:
+    covariances = np.tile(0.01 * np.eye(2), (len(ids), 1, 1))
     shutter_ns = now_ns - PERIOD_NS // 2
-    return CameraObservation(camera, step, shutter_ns, now_ns, np.array(MARKERS), pixels.copy(), covariances)
+    return CameraObservation(camera, step, shutter_ns, now_ns, np.array(ids), pixels.copy(), covariances)
 
 
 def _example_pixels(model: CellModel) -> FloatArray:
     """Raw pixels (c, m, 2) of the markers."""
-    return np.stack([distort(LENS, _project(camera.matrix, model.marker_points)) for camera in model.cameras])
+    return _seen(model, model.marker_points)
+
+
+def _seen(model: CellModel, points: FloatArray) -> FloatArray:
+    """Raw pixels (c, m, 2) of ``points`` (m, 4)."""
+    return np.stack([distort(LENS, _project(camera.matrix, points)) for camera in model.cameras])
 
 
 def _project(matrix: FloatArray, points: FloatArray) -> FloatArray:
