@@ -39,9 +39,10 @@ from stereoservo.control.marker_groups import FLAT_PX, find_groups
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.monitors.moving_camera import rehearse as rehearse_mobile
-from stereoservo.core.prediction import joints_at, rows_of
+from stereoservo.core.prediction import camera_chi2, joint_step, joints_at, rows_of
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
+from stereoservo.core.sources.law import adaptive_gain
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.kernels import distort_pixel
@@ -138,6 +139,9 @@ def _warm_up_goals() -> None:
     spread_in_images(few, pixels, seen, 3)
     distort_pixel(LENS, 1.0, 1.0)  # for set-points that are said anew in a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
+    adaptive_gain(1.0, 2.0, 1.0, 1.0)
+    joint_step(np.ones((8, 7)), np.ones(8), np.ones(8), 1.0)  # of joints that may stand beside their readings
+    camera_chi2(np.zeros((1, 2)), np.eye(2)[None], np.ones(1), 1.0)  # of frames that may be late
     runs: list[tuple[str, PointSource]] = [(DEFAULT_LAW, "triangulated")]
     runs.extend((law, "predicted") for law in LAWS)
     for law, points in runs:
