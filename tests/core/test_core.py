@@ -504,7 +504,7 @@ def test_a_state_of_version_11_is_taken_up(bench: Any) -> None:
     moving(bench)
     data = encode_state(bench.core.state)
     assert bench.core.state.block.numbers.run.moved_s > 0.0
-    assert bench.core.state.block.friction_sent.any()
+    assert bench.core.state.block.friction_from.any()
     assert encode_state(decode_state(msgspec.msgpack.encode(before_version_12(data)))) == data
 
 

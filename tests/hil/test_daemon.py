@@ -225,7 +225,8 @@ def test_looking_around_with_a_wildcard_reads_everything_and_stops_nothing(clien
     for reply in client.session.get(f"{client.keys.prefix}/**", timeout=2.0):
         if reply.ok is not None:
             found[str(reply.ok.key_expr)] = reply.ok.payload.to_bytes()
-    assert set(found) == {client.keys.state, client.keys.info, client.keys.event, client.keys.model}
+    keys = client.keys
+    assert set(found) == {keys.state, keys.info, keys.event, keys.model, keys.goals}
     client.session.put(f"{client.keys.prefix}/command/*", b"{}")
     assert client.goal({"j1": client.status().joints["j1"]}).reached(30.0)
     assert not {"STOPPED", "HELD"} & {reason.code for reason in client.status().reasons}
@@ -239,7 +240,7 @@ def test_a_put_stops_too(client: Client) -> None:
 
 def test_schemas_are_served(client: Client) -> None:
     assert b"set_points" in client.schema("goal")
-    assert b"there are: goal, state" in client.schema("gaol")
+    assert b"no schema 'gaol'; there are: goal, " in client.schema("gaol")
 
 
 # -- bad input ----------------------------------------------------------------------------------------------

@@ -60,6 +60,8 @@ class Derived:
     """What the status last said of each camera, by name: of which estimates, their innovation, the markers visible."""
     friction_bounds: tuple[CellModel | None, FloatArray, FloatArray] | None = None
     """Largest compensation and least travel of the joints (n,), as of `core.move`, and the model by which they are."""
+    monitors: tuple[tuple[Any, ...], bool] | None = None
+    """`core.monitor.MONITORS` as they last were, and whether `core.fast_path` knows them all."""
     model_health: tuple[tuple[object, ...], bytes, tuple[ModelDiagnosis, Health]] | None = None
     """The diagnosis and the health that the status last showed: of what, and with which markers left out."""
 

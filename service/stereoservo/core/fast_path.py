@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from stereoservo.core import monitor
 from stereoservo.core.block import HISTORY
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.estimate import fold_frame
@@ -86,8 +87,13 @@ def _plain_state(context: StepContext) -> bool:
     """Whether there is nothing that a stage would have to look after in this step."""
     state, derived = context.state, context.derived
     told, watching = derived.model_health, state.watching
+    monitors = derived.monitors
+    if monitors is None or monitors[0] is not monitor.MONITORS:
+        known = all(entry.in_fast_path for entry in monitor.MONITORS)
+        monitors = derived.monitors = monitor.MONITORS, known
     return (
-        derived.arrays is not None
+        monitors[1]
+        and derived.arrays is not None
         and told is not None
         and told[2][0].kind == "ok"
         and watching.verdict.kind == "ok"

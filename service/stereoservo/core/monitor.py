@@ -74,10 +74,14 @@ Findings = Iterable[Finding]
 
 
 class Monitor(NamedTuple):
-    """A monitor: ``watch`` accounts for one step and gives what it has found."""
+    """A monitor: ``watch`` accounts for one step and gives what it has found. ``in_fast_path``: whether
+    `core.fast_path` leaves each step in which it would find anything to the stages; where it is of one monitor not
+    known to, every step goes by the stages.
+    """
 
     name: str
     watch: Callable[[StepContext], Findings]
+    in_fast_path: bool = False
 
 
 def monitor(context: StepContext) -> tuple[Finding, ...]:
@@ -579,13 +583,13 @@ def _monitor_relocalization(context: StepContext) -> Findings:
 
 
 MONITORS: tuple[Monitor, ...] = (
-    Monitor("stop", _monitor_stop),
-    Monitor("requests", _answer_requests),
-    Monitor("inputs", _monitor_inputs),
-    Monitor("collision", monitor_collision),
-    Monitor("following error", monitor_following),
-    Monitor("teaching", _monitor_teaching),
-    Monitor("innovations", _monitor_innovations),
-    Monitor("model", _monitor_model),
-    Monitor("relocalization", _monitor_relocalization),
+    Monitor("stop", _monitor_stop, in_fast_path=True),
+    Monitor("requests", _answer_requests, in_fast_path=True),
+    Monitor("inputs", _monitor_inputs, in_fast_path=True),
+    Monitor("collision", monitor_collision, in_fast_path=True),
+    Monitor("following error", monitor_following, in_fast_path=True),
+    Monitor("teaching", _monitor_teaching, in_fast_path=True),
+    Monitor("innovations", _monitor_innovations, in_fast_path=True),
+    Monitor("model", _monitor_model, in_fast_path=True),
+    Monitor("relocalization", _monitor_relocalization, in_fast_path=True),
 )

@@ -137,7 +137,7 @@ def _late(views: RecordedViews, problem: ExaminedFrames, subject: str, frames: B
         apart = np.where(frames[:, None], views.at(views.times + float(x[0])) - there, 0.0)
         return state[0], state[1] + apart[:, order]
 
-    return Hypothesis("stamps", subject, ModelChange("joint", subject, 1, apply))
+    return Hypothesis(kind="stamps", subject=subject, change=ModelChange("joint", subject, 1, apply))
 
 
 def corrected_views(
