@@ -41,6 +41,8 @@ SINGULAR = 0.01
 """Smallest over largest singular value of the arm's motion: below it the controller stops."""
 LIMIT_MARGIN = 0.01
 """From a joint's limit the controller stops [rad or m]."""
+CONTROLLER_US = 1000.0
+"""What the controller's kinematics may take of a call, beside the arm's own."""
 LONGEST_CYCLE_S = 0.01
 """Time that the ramp of a twist takes in at most, between two calls."""
 
@@ -221,7 +223,7 @@ class TwistJointDriver(CartesianJointDriver):
         home = positions_of(tool_pose(cell.robot, decoded.tool.matrix, start), attitude, np.zeros(6))
         description = cartesian_description(
             self.driver, limits_of(decoded, cell), rate_hz=decoded.rate_hz, timeout_s=decoded.command_timeout_s,
-            budget_us=inner.call_budget_us, home=tuple(home.tolist()), simulated=True,
+            budget_us=inner.call_budget_us + CONTROLLER_US, home=tuple(home.tolist()), simulated=True,
         )  # fmt: skip
         description = msgspec.structs.replace(description, auxiliary=decoded.auxiliary)
         super().__init__(
