@@ -117,6 +117,9 @@ class Desk:
             name = Path(words[1]).stem  # a shipped cell, by its name alone, is played by a fake as well
             self.started(name, self.folder / f"{name}.toml", *words[2:])
             return 0, ""
+        if "flight.mcap" in words and not (self.folder / "flight.mcap").exists():
+            _, said = self.invoked(["record", "mycell", "--seconds", "1", "--json"])
+            shutil.copy(json.loads(said.splitlines()[-1])["file"], self.folder / "flight.mcap")
         if words[0] in SERVERS:
             return self.served([sys.executable, "-m", "stereoservo.cli.main", *words])
         if words[0] == "init":
@@ -126,9 +129,6 @@ class Desk:
             words += ["--answers", "answers.toml"]
         if "--rig" in words and not (self.folder / "pictures").exists():
             rendered_pictures(5, self.folder / "pictures", places=9)
-        if "flight.mcap" in words and not (self.folder / "flight.mcap").exists():
-            _, said = self.invoked(["record", "mycell", "--seconds", "1", "--json"])
-            shutil.copy(json.loads(said.splitlines()[-1])["file"], self.folder / "flight.mcap")
         if words[0] == "acknowledge":  # once the goal waits, which `--no-wait` has not waited for
             eventually("an acknowledgement", lambda: self.invoked(words)[0] == 0)
             return 0, ""
