@@ -108,16 +108,17 @@ class Numbers(ctypes.Structure):
 JOINTS = ("joints",)
 Shapes = Mapping[str, tuple[str | int, ...]]
 ARRAYS: Shapes = {
-    "history_ns": (HISTORY,), "history_positions": (HISTORY, "joints"),
     "velocities": JOINTS, "command": JOINTS, "correction": JOINTS,
     "missing_travel": JOINTS, "untold_travel": JOINTS, "last_positions": JOINTS,
     "silent_from": JOINTS, "silent_travel": JOINTS, "silent_s": JOINTS,
     "delay_s": JOINTS, "delay_samples": (DELAY_SAMPLES, "joints"), "delay_onset": (7, "joints"),
-    "delay_sent": JOINTS, "delay_past": ("past", "joints"), "delay_velocity": JOINTS, "delay_under_way": JOINTS,
+    "delay_sent": JOINTS, "delay_velocity": JOINTS, "delay_under_way": JOINTS,
     "delay_accounted": JOINTS, "delay_missing": JOINTS,
     "friction": JOINTS, "friction_from": JOINTS, "friction_sent": JOINTS, "friction_s": JOINTS,
-    "mean_efforts": JOINTS, "effort_excess": ("window", "joints"), "following_excess": ("window", "joints"),
-    "contact_low": (2, "joints"), "contact_high": (2, "joints"), "efforts": JOINTS, "following_errors": JOINTS,
+    "mean_efforts": JOINTS, "contact_low": (2, "joints"), "contact_high": (2, "joints"), "efforts": JOINTS,
+    "following_errors": JOINTS,
+    "history_ns": (HISTORY,), "history_positions": (HISTORY, "joints"), "delay_past": ("past", "joints"),
+    "effort_excess": ("window", "joints"), "following_excess": ("window", "joints"),
     "innovation": ("cameras", "markers", 2), "sigma": ("cameras", "markers"), "seen_ns": ("cameras", "markers"),
     "frame_innovation": ("cameras", "rows", 2), "frame_spread": ("cameras", "rows", 2, 2),
     "frame_seen": ("cameras", "rows"), "frame_velocity": ("cameras", "rows", 2), "frame_q": ("cameras", "joints"),
@@ -167,6 +168,12 @@ def views(record: np.ndarray[Any, Any], arrays: Shapes, counts: Mapping[str, int
 
 
 BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, {part: kind for part, (kind, _) in CAMERAS.items()})
+
+
+def head_of(record: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The bytes (k,) of a ``record`` (1,) before its large arrays, from ``history_ns`` on, as a view."""
+    assert BLOCK.fields is not None
+    return record.view(np.uint8)[: BLOCK.fields["history_ns"][1]]
 
 
 class Block:

@@ -1,4 +1,4 @@
-"""The first six stages of a step in which nothing but the ordinary happens, as two kernel calls around the law's own:
+"""The first six stages of a step in which nothing but the ordinary happens, as a few kernel calls around the law's own:
 the arm rests, or a law with a kernel drives it. Each image is one call more.
 
 The kernels call those of the stages, in their order, so that a step has the same bits by either way. Where one of them
@@ -12,15 +12,15 @@ import math
 import numpy as np
 
 from stereoservo.core import monitor
-from stereoservo.core.block import HISTORY
+from stereoservo.core.block import HISTORY, head_of
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.estimate import fold_frame
 from stereoservo.core.goals.marker_body import MIN_MARKERS
-from stereoservo.core.ingest import fill_sample, observations_of, take_sample
+from stereoservo.core.ingest import new_sample, observations_of, take_sample, takes
 from stereoservo.core.limit import FRESH, SafetyLimits, SafetyResult, limit, limit_velocity
 from stereoservo.core.monitor import FOLLOWS, NOISE, QUIET, account_following, account_loads, judge_round
-from stereoservo.core.move import add_friction, foresee, friction_bounds
-from stereoservo.core.prediction import SUSPECT_FRAMES, present
+from stereoservo.core.move import add_friction, at_velocity, foresee, friction_bounds
+from stereoservo.core.prediction import SUSPECT_FRAMES, present, round_complete
 from stereoservo.core.sources.law import adaptive_gain, aim_at, measure_goal, output_of, show_face
 from stereoservo.core.sources.progress import GOES_ON, account_run, error_of_run
 from stereoservo.core.state import Holding, ServoGoal
@@ -58,29 +58,29 @@ def _put_back(context: StepContext, rounds: int) -> None:
     """The state is as before `_look`."""
     state = context.state
     if context.looked:
-        _copy_changing(context.derived.room.spare, state.block.record, bool(context.observations))
+        _copy(context.derived.room.spare, state.block.record, bool(context.observations))
     state.watching.rounds, state.watching.due, context.observations = rounds, False, ()
 
 
+def _copy(record: Record, into: Record, frames: bool) -> None:
+    """Copy what a step changes of a block's ``record`` (1,), with ``frames`` or without."""
+    head_of(into)[:] = head_of(record)
+    copy_large(record, into, frames)
+
+
 def _plain_inputs(context: StepContext) -> bool:
-    """Whether the inputs hold joints at most, in time; these are in the workspace then."""
-    inputs, numbers, sample = context.inputs, context.state.block.numbers, context.inputs.joints
-    if (
+    """Whether the inputs ask for nothing, and come in time."""
+    inputs, last_ns = context.inputs, context.state.block.numbers.last_step_ns
+    return not (
         inputs.stop
         or inputs.compiling
         or inputs.sent is not None
         or inputs.model_update is not None
         or inputs.driver_fault is not None
         or not inputs.driver_configured
-        or not 0 <= (context.now_ns - numbers.last_step_ns) * 1e-9 <= context.derived.longest_gap_s
+        or not 0 <= (context.now_ns - last_ns) * 1e-9 <= context.derived.longest_gap_s
         or context.state.lifecycle is not (Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE)
-    ):
-        return False
-    if sample is None:
-        return True
-    age_s = (context.now_ns - sample.t_ns) * 1e-9
-    in_time = 0.0 <= age_s <= context.settings.limits.joint_timeout_s
-    return in_time and fill_sample(sample, context.derived.room.sample)
+    )
 
 
 def _plain_state(context: StepContext) -> bool:
@@ -149,23 +149,19 @@ def _drive(goal: ServoGoal, context: StepContext) -> SourceOutput | None:
 
 def _look(context: StepContext, aims: bool) -> bool:
     """Whether the stages before the motion find nothing; then the ``context`` has what they know."""
-    state, room, sample = context.state, context.derived.room, context.inputs.joints
-    block, settings, watching = state.block, context.settings, state.watching
-    told = (
-        sample is not None
-        and sample.seq != block.numbers.last_joints_seq
-        and sample.t_ns > block.numbers.last_joints_ns
-    )
+    state, room, sample = context.state, context.derived.room, new_sample(context)
+    block, settings, watching, told = state.block, context.settings, state.watching, sample is not None
     t_ns, seq, efforts, following = (0, 0, False, False)
-    if told:
-        assert sample is not None
+    if sample is not None:
+        if not takes(sample, context):
+            return False
         t_ns, seq = sample.t_ns, sample.seq
         efforts, following = sample.efforts is not None, sample.following_errors is not None
     frames = _plain_frames(context) if context.inputs.observations else ()
     if frames is None:
         return False
     context.observations, active = tuple([seen for _, seen in frames]), state.lifecycle is Lifecycle.ACTIVE
-    _copy_changing(block.record, room.spare, bool(frames))
+    _copy(block.record, room.spare, bool(frames))
     context.looked = True
     if not begin_step(block.record, room.record, told, t_ns, seq, active, bool(frames), context.q):
         return False
@@ -215,10 +211,7 @@ def _command(
         state.lifecycle is Lifecycle.ACTIVE, velocity, positions, limited, limits.found,
     )  # fmt: skip
     if added:
-        motion = SourceOutput(
-            velocity, motion.needs_features, motion.speed_scale, False, False, motion.error_px, motion.task_error,
-            motion.reasons,
-        )  # fmt: skip
+        motion = at_velocity(motion, velocity)
     if quiet:
         return motion, SafetyResult(motion.velocity, limited)
     context.outermost = positions
@@ -233,10 +226,7 @@ def begin_step(
     is something for the stages to do.
     """
     memory = block[0]
-    unseen = True
-    for c in range(memory.cameras):
-        unseen = unseen and not memory.sightings[c].looked
-    if unseen and not frames:  # a round is complete
+    if not frames and round_complete(block):
         return False
     if not take_sample(block, room, told, t_ns, seq, active, q):
         return False
@@ -271,15 +261,11 @@ def end_step(
         if not active:
             memory.silence_known = 0
     found = WITHOUT_ROUND
-    if frames:
-        complete = True
-        for c in range(memory.cameras):
-            complete = complete and not memory.sightings[c].looked
-        if complete or due:
-            looked_at, odd, any_masked = judge_round(block, room, now_ns, masked, 0)
-            if odd or any_masked:
-                return UNUSUAL
-            found = WITH_ROUND if looked_at else found
+    if frames and (due or round_complete(block)):
+        looked_at, odd, any_masked = judge_round(block, room, now_ns, masked, 0)
+        if odd or any_masked:
+            return UNUSUAL
+        found = WITH_ROUND if looked_at else found
     newest_ns = 0
     for c in range(memory.cameras):
         newest_ns = max(newest_ns, memory.estimates[c].accepted_ns)
@@ -335,87 +321,24 @@ def command_within(
 
 
 @kernel
-def _copy_changing(block: Record, into: Record, frames: bool) -> None:
-    """Copy what a step changes of a ``block``, with ``frames`` or without."""
+def copy_large(block: Record, into: Record, frames: bool) -> None:
+    """Copy the large arrays that a step changes of a ``block``, with ``frames`` or without."""
     memory, other = block[0], into[0]
-    n, window = memory.joints, memory.window
-    for c in range(memory.cameras):
-        other.sightings[c].fresh = memory.sightings[c].fresh
-    if frames:
-        _copy_cameras(block, into)
-    other.joints, other.window, other.past, other.delay_steps = n, window, memory.past, memory.delay_steps
-    other.last_step_ns, other.last_joints_ns = memory.last_step_ns, memory.last_joints_ns
-    other.last_joints_seq, other.last_followed_ns = memory.last_joints_seq, memory.last_followed_ns
-    other.history_count, other.followed = memory.history_count, memory.followed
-    other.silence_known, other.loads_ns, other.leave_s = memory.silence_known, memory.loads_ns, memory.leave_s
-    other.tells_efforts, other.tells_following = memory.tells_efforts, memory.tells_following
-    run, there = memory.run, other.run
-    there.moved_s, there.held, there.last_frames = run.moved_s, run.held, run.last_frames
-    there.measured, there.newest_px = run.measured, run.newest_px
+    n, window, past = memory.joints, memory.window * memory.joints, memory.past * memory.joints
     other.history_ns[:] = memory.history_ns
     other.history_positions[: HISTORY * n] = memory.history_positions[: HISTORY * n]
-    past = memory.past * n
     other.delay_past[:past] = memory.delay_past[:past]
-    other.delay_onset[: 7 * n], other.delay_samples[: 5 * n] = (
-        memory.delay_onset[: 7 * n],
-        memory.delay_samples[: 5 * n],
-    )
-    other.effort_excess[: window * n] = memory.effort_excess[: window * n]
-    other.following_excess[: window * n] = memory.following_excess[: window * n]
-    other.contact_low[: 2 * n], other.contact_high[: 2 * n] = (
-        memory.contact_low[: 2 * n],
-        memory.contact_high[: 2 * n],
-    )
-    for j in range(n):
-        other.velocities[j], other.correction[j] = memory.velocities[j], memory.correction[j]
-        other.missing_travel[j], other.untold_travel[j] = memory.missing_travel[j], memory.untold_travel[j]
-        other.last_positions[j], other.silent_from[j] = memory.last_positions[j], memory.silent_from[j]
-        other.silent_travel[j], other.silent_s[j] = memory.silent_travel[j], memory.silent_s[j]
-        other.delay_s[j], other.delay_sent[j] = memory.delay_s[j], memory.delay_sent[j]
-        other.delay_velocity[j], other.delay_under_way[j] = (
-            memory.delay_velocity[j],
-            memory.delay_under_way[j],
-        )
-        other.delay_accounted[j], other.delay_missing[j] = memory.delay_accounted[j], memory.delay_missing[j]
-        other.mean_efforts[j], other.efforts[j] = memory.mean_efforts[j], memory.efforts[j]
-        other.following_errors[j] = memory.following_errors[j]
-
-
-@kernel
-def _copy_cameras(block: Record, into: Record) -> None:
-    """Copy what is known of the cameras, and their newest frames."""
-    memory, other = block[0], into[0]
-    c, m, rows = memory.cameras, memory.markers, memory.rows
-    other.cameras, other.markers, other.rows = c, m, rows
-    for k in range(c):
-        one, to = memory.estimates[k], other.estimates[k]
-        to.last_seq, to.last_visible, to.accepted_ns, to.frames = (
-            one.last_seq,
-            one.last_visible,
-            one.accepted_ns,
-            one.frames,
-        )
-        to.rejected_frames, to.agreeing_frames = one.rejected_frames, one.agreeing_frames
-        to.rms_px, to.offset_ns = one.rms_px, one.offset_ns
-        frame, kept = memory.sightings[k], other.sightings[k]
-        kept.t_ns, kept.looked, kept.chi2, kept.rms_px = frame.t_ns, frame.looked, frame.chi2, frame.rms_px
-        kept.worst, kept.worst_px = frame.worst, frame.worst_px
-        kept.timing.product, kept.timing.square = frame.timing.product, frame.timing.square
-        kept.timing.seen_ns = frame.timing.seen_ns
-    other.innovation[: 2 * c * m], other.sigma[: c * m] = (
-        memory.innovation[: 2 * c * m],
-        memory.sigma[: c * m],
-    )
-    other.seen_ns[: c * m], other.frame_q[: c * memory.joints] = (
-        memory.seen_ns[: c * m],
-        memory.frame_q[: c * memory.joints],
-    )
-    k = c * rows
-    other.frame_innovation[: 2 * k], other.frame_spread[: 4 * k] = (
-        memory.frame_innovation[: 2 * k],
-        memory.frame_spread[: 4 * k],
-    )
-    other.frame_seen[:k], other.frame_velocity[: 2 * k] = (
-        memory.frame_seen[:k],
-        memory.frame_velocity[: 2 * k],
-    )
+    other.effort_excess[:window] = memory.effort_excess[:window]
+    other.following_excess[:window] = memory.following_excess[:window]
+    if not frames:
+        return
+    c = memory.cameras
+    sights, rows = c * memory.markers, c * memory.rows
+    other.innovation[: 2 * sights] = memory.innovation[: 2 * sights]
+    other.sigma[:sights] = memory.sigma[:sights]
+    other.seen_ns[:sights] = memory.seen_ns[:sights]
+    other.frame_q[: c * n] = memory.frame_q[: c * n]
+    other.frame_innovation[: 2 * rows] = memory.frame_innovation[: 2 * rows]
+    other.frame_spread[: 4 * rows] = memory.frame_spread[: 4 * rows]
+    other.frame_seen[:rows] = memory.frame_seen[:rows]
+    other.frame_velocity[: 2 * rows] = memory.frame_velocity[: 2 * rows]

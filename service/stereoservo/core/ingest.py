@@ -261,19 +261,31 @@ def _take_joints(context: StepContext) -> tuple[JointState | None, Reason | None
     """The joint sample, which is in the history now, or why it is refused; neither where there is none or it was here
     before.
     """
-    state, sample = context.state, context.inputs.joints
-    block, room = state.block, context.derived.room
-    numbers, q = block.numbers, context.q
-    if sample is None or sample.seq == numbers.last_joints_seq or sample.t_ns <= numbers.last_joints_ns:
+    block, room, sample, q = context.state.block, context.derived.room, new_sample(context), context.q
+    if sample is None:
         take_sample(block.record, room.record, False, 0, 0, False, q)
         return None, None
-    age_s = (context.now_ns - sample.t_ns) * 1e-9
-    in_time = 0.0 <= age_s <= context.settings.limits.joint_timeout_s
-    told = in_time and fill_sample(sample, room.sample)
-    active = state.lifecycle == Lifecycle.ACTIVE
+    told, active = takes(sample, context), context.state.lifecycle == Lifecycle.ACTIVE
     if take_sample(block.record, room.record, told, sample.t_ns, sample.seq, active, q) and told:
         return sample, None
-    return None, _late(sample, age_s, context) if not in_time else _wrong(sample, context)
+    return None, _wrong(sample, context) if _in_time(sample, context) else _late(sample, context)
+
+
+def new_sample(context: StepContext) -> JointState | None:
+    """The joint sample of the step; None where there is none, or it was here before."""
+    sample, numbers = context.inputs.joints, context.state.block.numbers
+    if sample is None or sample.seq == numbers.last_joints_seq or sample.t_ns <= numbers.last_joints_ns:
+        return None
+    return sample
+
+
+def takes(sample: JointState, context: StepContext) -> bool:
+    """Whether a sample is in time, and tells of every joint; then its values are in the workspace."""
+    return _in_time(sample, context) and fill_sample(sample, context.derived.room.sample)
+
+
+def _in_time(sample: JointState, context: StepContext) -> bool:
+    return 0.0 <= (context.now_ns - sample.t_ns) * 1e-9 <= context.settings.limits.joint_timeout_s
 
 
 def fill_sample(sample: JointState, values: FloatArray) -> bool:
@@ -291,8 +303,8 @@ def fill_sample(sample: JointState, values: FloatArray) -> bool:
     return True
 
 
-def _late(sample: JointState, age_s: float, context: StepContext) -> Reason:
-    timeout_s = context.settings.limits.joint_timeout_s
+def _late(sample: JointState, context: StepContext) -> Reason:
+    age_s, timeout_s = (context.now_ns - sample.t_ns) * 1e-9, context.settings.limits.joint_timeout_s
     what = (
         f"{age_s:.3f} s old, {timeout_s:g} s is allowed" if age_s > 0.0 else f"{-age_s:.6g} s in the future"
     )

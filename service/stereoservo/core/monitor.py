@@ -56,6 +56,7 @@ from stereoservo.core.prediction import (
     camera_chi2,
     gate_threshold,
     improbable,
+    round_complete,
     rows_in_use,
     used_rows,
 )
@@ -442,10 +443,8 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     watching = state.watching
     if arrays is None:
         return None
-    if not watching.due:
-        for sighting in watching.sightings:
-            if sighting.looked:
-                return None
+    if not (watching.due or round_complete(state.block.record)):
+        return None
     if state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED:
         return None  # joints that a faulty drive tells are no measure of cameras
     watching.due = False

@@ -267,6 +267,11 @@ def compensate_friction(output: SourceOutput, subject: str, context: StepContext
         velocity,
     ):  # fmt: skip
         return output
+    return at_velocity(output, velocity)
+
+
+def at_velocity(output: SourceOutput, velocity: FloatArray) -> SourceOutput:
+    """An output with another ``velocity`` (n,)."""
     return SourceOutput(
         velocity, output.needs_features, output.speed_scale, output.finished, output.reached, output.error_px,
         output.task_error, output.reasons,

@@ -211,6 +211,15 @@ def rows_in_use(seen: FloatArray, masked: FloatArray) -> FloatArray:
 
 
 @kernel
+def round_complete(block: Record) -> bool:
+    """Whether every camera has given a frame that no round has looked at yet."""
+    memory, complete = block[0], True
+    for c in range(memory.cameras):
+        complete = complete and not memory.sightings[c].looked
+    return complete
+
+
+@kernel
 def camera_chi2(
     innovation: FloatArray, spread: FloatArray, used: FloatArray, model_px: float
 ) -> tuple[float, float, int, float, int]:
