@@ -33,7 +33,7 @@ from stereoservo_sim.demonstration.progress import DemoFailedError, Demonstratio
 from stereoservo_sim.demonstration.scenario import Calibrated, ShownGoal, perform, shown_goals
 from stereoservo_sim.demonstration.truth import TruthLog, shown_positions, true_cell
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
-from stereoservo_sim.world.conveyor import conveyor_of
+from stereoservo_sim.world.conveyor import Conveyor, conveyor_of
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
@@ -66,12 +66,7 @@ def conduct_lockstep(
     goals: Sequence[ShownGoal] | None = None,
 ) -> Demonstration:
     """Run in one process in virtual time; deterministic given the seed. ``goals``: by default those of the arm."""
-    cell = load_cell_file(cell_path)
-    truth = true_cell(cell, cell_path.parent)
-    conveyor = conveyor_of(cell)
-    goals = shown_goals(truth, on_belt=conveyor is not None) if goals is None else goals
-    recording = out / "flight.mcap"
-    recording.unlink(missing_ok=True)  # of an earlier demonstration
+    cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals)
     with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
         history = TrueJointHistory.in_memory(len(truth.base), capacity=1 << 16)
         with LockstepCell(
@@ -91,23 +86,41 @@ def conduct_lockstep(
                 belt,
             )
             times, positions = log.end()
-    save_model(calibrated.model, out / "model.json")
-    return Demonstration(
-        cell,
-        names,
-        calibrated,
-        outcomes,
-        times,
-        positions,
-        recording,
-        out,
-        None,
-        seed,
-        True,
-        truth,
-        goals,
-        belt,
+    return _kept(
+        Demonstration(
+            cell,
+            names,
+            calibrated,
+            outcomes,
+            times,
+            positions,
+            recording,
+            out,
+            None,
+            seed,
+            True,
+            truth,
+            goals,
+            belt,
+        )
     )
+
+
+def _shown(
+    cell_path: Path, out: Path, goals: Sequence[ShownGoal] | None
+) -> tuple[CellFile, SimulatedCell, Conveyor | None, Sequence[ShownGoal], Path]:
+    """A cell with its truth, its conveyor, the goals that it is shown, and the place of a recording, which is free."""
+    cell = load_cell_file(cell_path)
+    truth, conveyor, recording = true_cell(cell, cell_path.parent), conveyor_of(cell), out / "flight.mcap"
+    recording.unlink(missing_ok=True)  # of an earlier demonstration
+    shown = shown_goals(truth, on_belt=conveyor is not None) if goals is None else goals
+    return cell, truth, conveyor, shown, recording
+
+
+def _kept(demonstration: Demonstration) -> Demonstration:
+    """A demonstration with its model saved beside the recording."""
+    save_model(demonstration.calibrated.model, demonstration.out / "model.json")
+    return demonstration
 
 
 def _every(steps: int, act: Callable[[], None]) -> Callable[[object, object], None]:
@@ -132,13 +145,8 @@ def conduct_live(
     """Run with real processes: a daemon in directories of its own, and a client over zenoh. ``goals``: by default those
     of the arm.
     """
-    cell = load_cell_file(cell_path)
-    truth = true_cell(cell, cell_path.parent)
-    conveyor = conveyor_of(cell)
-    goals = shown_goals(truth, on_belt=conveyor is not None) if goals is None else goals
+    cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals)
     configurations = shown_positions(cell, truth)
-    recording = out / "flight.mcap"
-    recording.unlink(missing_ok=True)  # of an earlier demonstration
     with ExitStack() as ends:
         scratch = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="stereoservo-")))
         os.environ[RUNTIME_VARIABLE] = str(scratch / "run")
@@ -174,22 +182,23 @@ def conduct_live(
             code = daemon.stop()
             if code != 0:
                 raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
-    save_model(calibrated.model, out / "model.json")
-    return Demonstration(
-        cell,
-        names,
-        calibrated,
-        outcomes,
-        times,
-        positions,
-        recording,
-        out,
-        loop,
-        seed,
-        False,
-        truth,
-        goals,
-        belt,
+    return _kept(
+        Demonstration(
+            cell,
+            names,
+            calibrated,
+            outcomes,
+            times,
+            positions,
+            recording,
+            out,
+            loop,
+            seed,
+            False,
+            truth,
+            goals,
+            belt,
+        )
     )
 
 
