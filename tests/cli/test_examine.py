@@ -96,6 +96,18 @@ def test_a_folder_of_tables_is_judged(tmp_path: Path, capsys: pytest.CaptureFixt
             lambda folder: (folder / "markers.csv").write_text("camera,t,u,v\nleft,0,1,2\n"),
             "lacks columns marker",
         ),
+        (
+            lambda folder: (folder / "markers.csv").write_text("camera,t,marker,u,v\nleft,0,1e30,2,3\n"),
+            "line 2, column marker: '1e30'; needed: a whole number from 0",
+        ),
+        (
+            lambda folder: (folder / "markers.csv").write_text("camera,t,marker,u,v\nleft,0,1,2\n"),
+            "line 2: 5 cells are needed",
+        ),
+        (
+            lambda folder: (folder / "cameras.csv").write_text("camera,width,height\nleft,0,480\n"),
+            "line 2, column width: '0'",
+        ),
     ],
 )
 def test_a_wrong_folder_is_refused_with_what_would_be_right(

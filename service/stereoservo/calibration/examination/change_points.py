@@ -34,6 +34,7 @@ from stereoservo.calibration.examination.examined_frames import (
     Hypothesis,
     frames_concerned,
 )
+from stereoservo.calibration.examination.frame_times import CREDIBLE
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -45,8 +46,6 @@ BLOCKS = 150
 """Onsets that are tried to first order."""
 LASTING = 3
 """Frames that a change must last."""
-CREDIBLE = 9.2
-"""Difference of chi-square within which another onset is not excluded: odds of 100 to 1."""
 SETTLED = 3
 """Times that the onset is estimated again."""
 

@@ -44,6 +44,8 @@ UNITS: dict[str, tuple[Kind, float]] = {
 """By suffix of a joint's column: its kind and the size of its unit."""
 STATED_PX = 0.1
 """Deviation that is stated of a pixel without one; what the pixels scatter is estimated."""
+LARGEST = 10**9
+"""Of whole numbers: markers, sizes, counts of frames."""
 UNIT = 1e-2
 """How far from 1 the length of a quaternion may be."""
 
@@ -88,7 +90,7 @@ class _Frames:
         if camera not in self.sizes:
             raise _wrong(path, line, "camera", camera, f"one of {', '.join(self.sizes)}")
         number, episode = (
-            int(_number(path, line, row, name)) if row.get(name) else none
+            _whole(path, line, row, name) if row.get(name) else none
             for name, none in (("number", -1), ("episode", 0))
         )
         return self.seen.setdefault((camera, stamp), (number, episode, {}))[2]
@@ -175,7 +177,7 @@ def _poses(
 def _marker_frames(folder: Path, rows: Rows, key: str) -> _Frames:
     path, listed = folder / MARKERS, folder / CAMERAS
     sizes = {
-        row["camera"]: (int(_number(listed, k, row, "width")), int(_number(listed, k, row, "height")))
+        row["camera"]: (_whole(listed, k, row, "width", 1), _whole(listed, k, row, "height", 1))
         for k, row in enumerate(_table(listed, ("camera", "width", "height")), 2)
     }  # fmt: skip
     _require(path, rows, ("camera", "marker", "u", "v"))
@@ -187,8 +189,11 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> _Frames:
         sigma = _number(path, line, row, "sigma") if row.get("sigma") else STATED_PX
         if not sigma > 0.0:
             raise _wrong(path, line, "sigma", row["sigma"], "a positive number [px]")
-        marker = int(_number(path, line, row, "marker"))
-        seen[marker] = _number(path, line, row, "u"), _number(path, line, row, "v"), sigma
+        seen[_whole(path, line, row, "marker")] = (
+            _number(path, line, row, "u"),
+            _number(path, line, row, "v"),
+            sigma,
+        )
     return frames
 
 
@@ -244,12 +249,16 @@ def _detector(path: Path, camera: str) -> Detector:
 
 def _table(path: Path, needed: tuple[str, ...] = ()) -> Rows:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows: Rows = [dict(row) for row in csv.DictReader(file, skipinitialspace=True)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CommandError("dataset", f"{path} cannot be read: {error}") from error
     if not rows:
         raise CommandError("dataset", f"{path} holds no row below its header")
+    names = [name for name in rows[0] if name is not None]
+    for line, row in enumerate(rows, 2):
+        if None in row or None in row.values():
+            raise CommandError("dataset", f"{path}, line {line}: {len(names)} cells are needed", line=line)
     _require(path, rows, needed)
     return rows
 
@@ -281,6 +290,13 @@ def _number(path: Path, line: int, row: Mapping[str, str], column: str) -> float
     if not math.isfinite(value):
         raise _wrong(path, line, column, str(text), "a finite number")
     return value
+
+
+def _whole(path: Path, line: int, row: Mapping[str, str], column: str, least: int = 0) -> int:
+    value = _number(path, line, row, column)
+    if not (least <= value <= LARGEST and value == int(value)):
+        raise _wrong(path, line, column, str(row[column]), f"a whole number from {least} to {LARGEST}")
+    return int(value)
 
 
 def _wrong(path: Path, line: int, column: str, value: str, valid: str) -> CommandError:
