@@ -27,21 +27,18 @@ class Belt:
 
     def clear(self) -> None:
         """Take the part off the belt."""
-        self._put(AWAY)
+        self.place(AWAY)
 
     def put(self) -> None:
         """Put a part onto the belt, which stands."""
-        self._put(self.conveyor.begin)
+        self.place(self.conveyor.begin)
 
     def run(self) -> None:
         """Switch the belt on."""
-        self._put(self.conveyor.running(self._now_ns()))
+        self.place(self.conveyor.running(self._now_ns()))
 
     def place(self, moved: Moved) -> None:
         """Let the part stand, or move, as ``moved``."""
-        self._put(moved)
-
-    def _put(self, moved: Moved) -> None:
         self._since.append(self._now_ns())
         self._moved.append(moved)
         self._file.write(moved)

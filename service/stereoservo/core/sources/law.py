@@ -521,11 +521,8 @@ def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
 
 
 def _plain_traits(source: LawRun, context: StepContext) -> Traits:
-    gain, left_s = (
-        gain_now(source, error_of_run(context.state.block)),
-        run_progress(source, context)[1],
-    )
-    return Traits(gain, left_s or 0.0)
+    gain = gain_now(source, error_of_run(context.state.block))
+    return Traits(gain, run_progress(source, context)[1] or 0.0)
 
 
 def progress_reasons(
@@ -536,18 +533,9 @@ def progress_reasons(
 ) -> tuple[Reason, ...]:
     """What a law's run shows over time beside the reasons ``told`` in this step; kept between two examinations."""
     follow_error(context.state.block.record, source.tolerance_px, context.dt_s)
-    if looks_at_progress(context.state.step, context.dt_s):
+    every = max(1, round(LOOK_EVERY_S / context.dt_s))
+    if context.state.step % every == 0:
         source.reasons = examine_progress(source, context, told, traits(source, context))
-    return found_before(source, told)
-
-
-def looks_at_progress(step: int, dt_s: float) -> bool:
-    """Whether a run's progress is examined in this step."""
-    return step % max(1, round(LOOK_EVERY_S / dt_s)) == 0
-
-
-def found_before(source: LawRun, told: tuple[Reason, ...]) -> tuple[Reason, ...]:
-    """What was found when the progress was last examined, but for what is ``told`` anyway."""
     if not source.reasons:
         return ()
     codes = {reason.code for reason in told}
