@@ -11,11 +11,12 @@ import msgspec
 import pytest
 
 from stereoservo.client import Client, ClientError, EventWatch, InvalidReplyError, NoReplyError, RefusedError
+from stereoservo.client.client import with_newest_markers
 from stereoservo.client.session import client_config, close_session, open_session
 from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.keys import KeySpace
-from stereoservo.messages.wire import EventList, EventMessage, Reply, encode
+from stereoservo.messages.wire import EventList, EventMessage, FeaturesMessage, Reply, StateMessage, encode
 
 pytestmark = pytest.mark.process
 
@@ -148,6 +149,13 @@ def test_a_strange_event_is_the_clients_own_error(
             pytest.raises(InvalidReplyError, match=f"{KEYS.event} is not of"),
         ):
             watch.wait(lambda event: True, "an event", 10.0)
+
+
+def test_who_looks_now_and_then_is_given_each_cameras_newest_markers_and_all_else() -> None:
+    seen = [("left", 0, FeaturesMessage), ("event", 1, EventMessage), ("left", 2, FeaturesMessage),
+            ("right", 3, FeaturesMessage), ("event", 4, EventMessage), ("state", 5, StateMessage)]  # fmt: skip
+    assert [payload for _, payload, _ in with_newest_markers(seen)] == [1, 2, 3, 4, 5]
+    assert with_newest_markers([]) == []
 
 
 def test_a_page_of_events_that_were_not_asked_for_is_the_clients_own_error(

@@ -6,6 +6,7 @@ Every call either succeeds or raises; "no reply" means refused.
 
 from __future__ import annotations
 
+import itertools
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -51,6 +52,7 @@ from stereoservo.messages.wire import (
 )
 
 DRAIN = 32
+"""Messages of a kind in one look: events that a caller causes do not starve the others."""
 GOAL_TIMEOUT_S = 7.0
 """A goal is planned before it is answered; the daemon itself gives up after five seconds."""
 RESET_TIMEOUT_S = 12.0
@@ -267,9 +269,14 @@ class Client(Connection):
 
     # -- watching -------------------------------------------------------------------------------------------
 
-    def watch(self, *, features: bool = False) -> Iterator[StateMessage | EventMessage | FeaturesMessage]:
+    def watch(
+        self, *, features: bool = False, every_s: float = 0.0
+    ) -> Iterator[StateMessage | EventMessage | FeaturesMessage]:
         """Iterate over all messages of the cell, without end; raises DaemonLostError when the daemon goes away,
         InvalidReplyError.
+
+        With ``every_s`` [s] it looks only so often, and gives of each camera the newest markers alone: what is watched
+        by eye takes little of a processor then.
         """
         kinds: list[tuple[str, type[Any], int]] = [
             (self.keys.event, EventMessage, 1024),
@@ -283,19 +290,29 @@ class Client(Connection):
         last_heard_s = time.monotonic()
         try:
             while True:
-                idle = True
-                for subscriber, kind in subscribers:
-                    for _ in range(DRAIN):  # bounded: a caller that causes events must not starve the others
-                        sample = subscriber.try_recv()
-                        if sample is None:
-                            break
-                        idle = False
-                        last_heard_s = time.monotonic()
-                        yield read_message(str(sample.key_expr), sample.payload.to_bytes(), kind)
-                if idle:
-                    if time.monotonic() - last_heard_s > 2.0:
-                        raise DaemonLostError(f"cell {self.cell!r} has been silent for 2 s")
-                    time.sleep(POLL_S)
+                arrived = [
+                    (str(sample.key_expr), sample.payload, kind)
+                    for subscriber, kind in subscribers
+                    for sample in itertools.islice(iter(subscriber.try_recv, None), DRAIN)
+                ]
+                if arrived:
+                    last_heard_s = time.monotonic()
+                elif time.monotonic() - last_heard_s > 2.0:
+                    raise DaemonLostError(f"cell {self.cell!r} has been silent for 2 s")
+                for key, payload, kind in with_newest_markers(arrived) if every_s else arrived:
+                    yield read_message(key, payload.to_bytes(), kind)
+                if every_s or not arrived:
+                    time.sleep(every_s or POLL_S)
         finally:
             for subscriber, _ in subscribers:
                 subscriber.undeclare()
+
+
+def with_newest_markers(arrived: list[tuple[str, Any, type[Any]]]) -> list[tuple[str, Any, type[Any]]]:
+    """Of messages (key, payload, kind), the oldest first: of markers the last of each key alone, and all others."""
+    last = {key: k for k, (key, _, _) in enumerate(arrived)}
+    return [
+        (key, payload, kind)
+        for k, (key, payload, kind) in enumerate(arrived)
+        if kind is not FeaturesMessage or last[key] == k
+    ]

@@ -5,6 +5,7 @@ one line each; and shows them to Foxglove and Rerun.
 from __future__ import annotations
 
 import math
+import os
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,8 +24,10 @@ if TYPE_CHECKING:
     from stereoservo.cli.watch.rerun_viewer import RerunViewer
 
 STATE_EVERY_S = 1.0
-MARKERS_EVERY_NS = 60_000_000
-"""Of a camera, for viewers: what an eye follows; each frame at 30 Hz would double what `watch` takes of a core."""
+RUNTIME = "(rx: (handover: app), app: (worker_threads: 1))"
+"""Threads of zenoh: what comes is read by the one that hands it on; two more are woken for each message else."""
+LOOK_EVERY_S = 0.1
+"""Unless each frame is asked for: what an eye follows; all at 30 Hz would take twice as much of a core."""
 
 
 def watch(
@@ -47,18 +50,18 @@ def watch(
     """Print what the cell publishes, one line each (with --json: JSON Lines), until Ctrl-C."""
     if save is not None and not rerun:
         raise CommandError("argument", "--save goes with --rerun")
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
     with Client(cell, endpoint=endpoint) as client, ExitStack() as opened:
         viewers = _viewers(client.cell, port if foxglove else None, rerun, save, opened)
         until = time.monotonic() + seconds
         last_state = 0.0
-        thinned = Thinned()
-        for message in client.watch(features=features or bool(viewers)):
+        every_s = 0.0 if features else LOOK_EVERY_S
+        for message in client.watch(features=features or bool(viewers), every_s=every_s):
             now = time.monotonic()
             if now > until:
                 return
-            if viewers and thinned.shows(message):
-                for viewer in viewers:
-                    viewer.show(message)
+            for viewer in viewers:
+                viewer.show(message)
             if isinstance(message, FeaturesMessage) and not features:
                 continue
             if isinstance(message, StateMessage) and not json:
@@ -67,23 +70,6 @@ def watch(
                 last_state = now
             kind = type(message).__name__.removesuffix("Message").lower()
             emit({"kind": kind, kind: message}, _line(message), json)
-
-
-class Thinned:
-    """Of each camera's markers those that viewers are shown: none sooner than ``MARKERS_EVERY_NS`` after the last."""
-
-    def __init__(self) -> None:
-        self._shown_ns: dict[str, int] = {}
-
-    def shows(self, message: StateMessage | EventMessage | FeaturesMessage) -> bool:
-        """Whether a message is to be shown, the next one of its kind in order of time."""
-        if not isinstance(message, FeaturesMessage):
-            return True
-        last_ns = self._shown_ns.get(message.camera)
-        if last_ns is not None and 0 <= message.t_shutter_ns - last_ns < MARKERS_EVERY_NS:
-            return False
-        self._shown_ns[message.camera] = message.t_shutter_ns
-        return True
 
 
 def _viewers(

@@ -6,11 +6,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import numpy as np
 import rerun
 
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
-SEND_S = 0.25
+SEND_S = 0.4
 """Messages are handed over in columns so often: one by one, each wakes the threads of the library."""
 SERIES = ("joints", "velocities", "command", "innovation_px")
 
@@ -74,7 +75,7 @@ class RerunViewer:
             scalars = rerun.Scalars.columns(scalars=[value for _, values in rows for value in values])
             self._stream.send_columns(
                 entity,
-                [rerun.TimeColumn("wall", timestamp=[t_wall for t_wall, _ in rows])],
+                [_times([t_wall for t_wall, _ in rows])],
                 scalars.partition([len(values) for _, values in rows]),
             )
         frames, self._frames = self._frames, {}
@@ -85,7 +86,7 @@ class RerunViewer:
             )
             self._stream.send_columns(
                 f"camera/{camera}/markers",
-                [rerun.TimeColumn("wall", timestamp=[frame.t_wall for frame in seen])],
+                [_times([frame.t_wall for frame in seen])],
                 points.partition([len(frame.ids) for frame in seen]),
             )
 
@@ -101,3 +102,8 @@ class RerunViewer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _times(t_wall: list[float]) -> rerun.TimeColumn:
+    """Times [s since 1970] of rows; as an array, because the library converts a list's one by one."""
+    return rerun.TimeColumn("wall", timestamp=np.rint(np.array(t_wall) * 1e9).astype("datetime64[ns]"))
