@@ -11,9 +11,8 @@ from typing import Any
 
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.discovery import FoundCamera
-from stereoservo_drivers.video.mjpeg import MjpegSource
+from stereoservo_drivers.video.live import live_source
 from stereoservo_drivers.video.options import decode_video_options
-from stereoservo_drivers.video.sources import CaptureSource, LiveSource
 
 CLASS = Path("/sys/class/video4linux")
 BY_ID = Path("/dev/v4l/by-id")
@@ -136,11 +135,7 @@ def probed(options: Mapping[str, Any]) -> Mode:
     decoded, place = decode_video_options({"width": 640, "height": 480, **options}, Path())
     if not place.live:
         raise place.error("option", "is a recording; `stereoservo setup` takes cameras")
-    source: LiveSource
-    if place.kind == "http":
-        source = MjpegSource(place, decoded, MonotonicClock())
-    else:
-        source = CaptureSource(place, decoded, MonotonicClock())
+    source = live_source(place, decoded, MonotonicClock())
     try:
         source.open()
         pictures = [picture for _ in range(PROBED_PICTURES) if (picture := source.read()) is not None]

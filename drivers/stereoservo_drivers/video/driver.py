@@ -14,11 +14,11 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.ports.discovery import FoundCamera
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
-from stereoservo_drivers.video.mjpeg import MjpegSource
+from stereoservo_drivers.video.live import live_source
 from stereoservo_drivers.video.options import DRIVER, decode_video_options
 from stereoservo_drivers.video.playback import Playback
 from stereoservo_drivers.video.reader import Reader
-from stereoservo_drivers.video.sources import CaptureSource, LiveSource, Settings
+from stereoservo_drivers.video.sources import Settings
 from stereoservo_drivers.video.stream_monitor import Watch
 
 LIVE_BUDGET_US = 1000.0
@@ -122,11 +122,7 @@ class VideoCameraDriver:
         place, options, context = self._place, self._options, self._context
         if not place.live:
             return Playback(place, options, context.camera, self._watch, context.clock)
-        source: LiveSource
-        if place.kind == "http":
-            source = MjpegSource(place, options, context.clock)
-        else:
-            source = CaptureSource(place, options, context.clock)
+        source = live_source(place, options, context.clock)
         return Reader(source, place, options, context.camera, self._watch)
 
     def activate(self) -> None:

@@ -19,7 +19,7 @@ DRIVER = "video"
 Channel = Literal["gray", "red", "green", "blue"]
 Flip = Literal["none", "horizontal", "vertical", "rotate180"]
 Pace = Literal["recorded", "every"]
-SourceKind = Literal["device", "file", "sequence", "http", "rtsp"]
+SourceKind = Literal["device", "file", "sequence", "http", "rtsp", "genicam"]
 Pixels = Annotated[int, Meta(ge=16, le=16384)]
 Seconds = Annotated[float, Meta(ge=0.05, le=60)]
 
@@ -31,7 +31,7 @@ _NUMBER = re.compile(r"%(0\d+)?d")
 _NO_URL = urlsplit("")
 VALID_SOURCES = (
     "a device number (0) or path (/dev/video0), a file (.avi, .mkv, .mp4), numbered pictures (left-%04d.png), "
-    "http://, https:// (MJPEG), rtsp://"
+    "http://, https:// (MJPEG), rtsp://, genicam:// (GigE Vision, USB3 Vision)"
 )
 
 
@@ -45,10 +45,10 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     the time of reception (recordings with stamps of their own carry it already). ``pixel_format``: four letters
     such as ``MJPG``, which many USB cameras need for their full rate.
 
-    Controls of a device (V4L2), each left alone where it is not stated, and read back: ``exposure`` [0.1 ms with UVC
-    cameras], ``gain`` and ``focus`` in units of the device, ``white_balance`` [K]; a number locks it, ``"auto"`` lets
-    the camera choose. ``power_line_hz``: the flicker filter, 0 for none. ``rate_priority``: automatic exposure must not
-    lower the frame rate.
+    Controls of a device (V4L2, GenICam), each left alone where it is not stated, and read back: ``exposure`` [0.1 ms
+    with UVC cameras, µs with GenICam], ``gain`` [GenICam: dB] and ``focus`` in units of the device, ``white_balance``
+    [K]; a number locks it, ``"auto"`` lets the camera choose. ``power_line_hz``: the flicker filter, 0 for none.
+    ``rate_priority``: automatic exposure must not lower the frame rate.
 
     ``channel``: gray, or one colour's own. ``flip``: how the picture is turned before anything sees it.
     ``open_timeout_s``: from connecting to the first picture. ``read_timeout_s``: without a picture for so long the
@@ -95,7 +95,7 @@ class Place:
     @property
     def live(self) -> bool:
         """Whether the source delivers images by itself."""
-        return self.kind in ("device", "http", "rtsp")
+        return self.kind in ("device", "http", "rtsp", "genicam")
 
     def error(self, code: str, what: str, *, retry: bool = False, **data: Any) -> DriverError:
         """A DriverError about this source."""
@@ -118,6 +118,9 @@ def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[Vi
         for name in ("focus", "white_balance", "power_line_hz", "rate_priority"):
             if getattr(decoded, name) is not None:
                 raise _wrong(name, getattr(decoded, name), f"is for devices; source is {place.shown}")
+    if place.kind == "genicam" and (decoded.channel != "gray" or decoded.pixel_format):
+        name = "pixel_format" if decoded.pixel_format else "channel"
+        raise _wrong(name, getattr(decoded, name), "pictures of genicam:// are read as Mono8: leave it out")
     if decoded.read_timeout_s * decoded.rate_hz < 2.0:
         raise _wrong(
             "read_timeout_s",
@@ -174,6 +177,8 @@ def _url(source: str) -> Place:
     shown = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))
     if url.scheme in ("http", "https"):
         return Place("http", shown, url=url)
+    if url.scheme == "genicam":
+        return Place("genicam", shown, url=url)
     if url.scheme in ("rtsp", "rtsps"):
         return Place("rtsp", shown, url=url)
     raise _wrong("source", shown, f"valid: {VALID_SOURCES}")

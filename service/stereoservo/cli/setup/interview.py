@@ -81,7 +81,7 @@ def _cameras(dialogue: Dialogue) -> list[CameraSection]:
         dialogue.say(f"   {k}: {camera.name}, {camera.options['source']}; {modes or 'modes unknown'}")
     if not found:
         dialogue.say(
-            "   no camera is at this computer's ports; network cameras have an address (http://, rtsp://)"
+            "   no camera is at this computer's ports; network cameras have an address (http://, rtsp://, genicam://)"
         )
     default = " ".join(str(k) for k in range(2)) if len(found) >= 2 else None
     chosen = dialogue.ask(
