@@ -14,14 +14,12 @@ import numpy as np
 
 from stereoservo.ports.devices import Clock
 from stereoservo_drivers.video.options import Place, VideoOptions
-from stereoservo_drivers.video.sources import Settings, SourcePicture
+from stereoservo_drivers.video.sources import OLDEST_NS, Settings, SourcePicture
 
 LIBRARY = "libaravis-0.8.so.0"
 BUFFERS = 8
 WAIT_US = 100_000
 """A wait for a picture ends so often, to see whether it was interrupted."""
-OLDEST_NS = 1_000_000_000
-"""A picture that the library says began to arrive longer ago has a stamp that is not believed."""
 FRAME_NUMBERS = 65535
 """GigE Vision 1 counts pictures 1 to 65535 and begins again."""
 AUTO_OFF, AUTO_CONTINUOUS = 0, 2

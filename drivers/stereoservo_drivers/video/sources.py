@@ -14,6 +14,8 @@ from stereoservo.ports.devices import Clock
 from stereoservo_drivers.video import v4l2
 from stereoservo_drivers.video.options import Place, VideoOptions
 
+OLDEST_NS = 1_000_000_000
+"""A picture that is said to have come longer ago has a stamp that is not believed."""
 Settings = dict[str, tuple[float | None, float | None]]
 
 
@@ -154,6 +156,8 @@ class CaptureSource:
                 "connection_lost", "gives no more pictures: unplugged, ended, or silent too long", retry=True
             )
         received_ns = self._clock.now_ns()
+        if self._place.kind == "device":
+            received_ns = kernel_stamp(capture.get(cv2.CAP_PROP_POS_MSEC), received_ns)
         whole, image = capture.retrieve()
         return SourcePicture(image, received_ns) if whole else None
 
@@ -164,6 +168,14 @@ class CaptureSource:
         """Release the device or the stream."""
         if self._capture is not None:
             self._capture.release()
+
+
+def kernel_stamp(told_ms: float, now_ns: int) -> int:
+    """When the kernel received a picture [ns, monotonic], by the time ``told_ms`` that OpenCV passes on; ``now_ns``
+    where that is none of this clock (UVC devices' is): in the future, or more than ``OLDEST_NS`` ago.
+    """
+    age_ns = now_ns - told_ms * 1e6
+    return now_ns - round(age_ns) if 0.0 <= age_ns < OLDEST_NS else now_ns
 
 
 def apply_controls(ioctl: v4l2.Ioctl, options: VideoOptions) -> Settings:

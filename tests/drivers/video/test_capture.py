@@ -23,7 +23,7 @@ from stereoservo_drivers.video.reader import Reader
 from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
 from stereoservo_drivers.video.stream_monitor import Watch
 
-from .conftest import HEIGHT, WIDTH, number_of, picture
+from .conftest import HEIGHT, WIDTH, number_of, picture, poll_until
 
 
 def options(**more):
@@ -290,6 +290,32 @@ def test_structures_requests_and_controls_are_those_of_the_kernels_header(tmp_pa
         [str(tmp_path / "header")], check=True, capture_output=True, text=True
     ).stdout.split()
     assert dict(zip(expected, map(int, printed), strict=True)) == expected
+
+
+@pytest.mark.parametrize(
+    ("told", "believed"), [("ago", True), ("never", False), ("future", False), ("old", False)]
+)
+def test_a_picture_has_the_time_at_which_the_kernel_took_it(camera, device, monkeypatch, told, believed):
+    """One that waited in the queue of a busy computer is as old as it is."""
+    stamps = []
+
+    def get(what):
+        if what != cv2.CAP_PROP_POS_MSEC:
+            return device.values.get(what, -1.0)
+        now_ms = time.monotonic_ns() * 1e-6
+        stamps.append(
+            {"ago": now_ms - 40.0, "never": -1.0, "future": now_ms + 2e3, "old": now_ms - 2e3}[told]
+        )
+        return stamps[-1]
+
+    monkeypatch.setattr(device, "get", get)
+    device.values |= {cv2.CAP_PROP_FRAME_WIDTH: WIDTH, cv2.CAP_PROP_FRAME_HEIGHT: HEIGHT}
+    driver = camera(0)
+    driver.configure()
+    driver.activate()
+    (frame,) = poll_until(driver, 1)
+    received_ms = frame.t_received_ns * 1e-6
+    assert any(abs(received_ms - stamp) < 1e-3 for stamp in stamps) is believed
 
 
 def test_an_unplugged_device_is_lost(camera, device):

