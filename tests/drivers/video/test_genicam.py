@@ -97,7 +97,6 @@ def test_pictures_come_whole_and_those_that_do_not_are_counted(
             driver.close()
     numbers = np.array([frame.seq for frame in frames])
     assert np.all(np.diff(numbers) > 0)
-    assert statistics.frames + statistics.dropped > numbers[-1]
     assert all(frame.image.shape == (512, 512) and frame.image.any() for frame in frames)
     assert (statistics.dropped > 5) is bool(lost)
     assert statistics.settings["exposure"] == (5000.0, 5000.0)
