@@ -34,6 +34,18 @@ except KeyboardInterrupt:
 """
 
 
+def test_a_reader_that_goes_away_ends_a_command_by_an_exit_code_and_no_signal() -> None:
+    """A library's socket that its peer closed must not kill a command, which SIGPIPE by default would."""
+    ours, theirs = os.pipe()
+    os.close(ours)
+    with os.fdopen(theirs, "w") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", "stereoservo.cli.main", "drivers"], check=False, stdout=closed,
+            stderr=subprocess.PIPE, text=True, timeout=120,
+        )  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_an_interrupt_that_a_destructor_swallowed_is_remembered() -> None:
     done = subprocess.run(
         [sys.executable, "-c", SWALLOWS], capture_output=True, text=True, timeout=60, check=False

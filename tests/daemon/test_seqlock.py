@@ -79,6 +79,24 @@ def test_a_half_written_record_of_a_crashed_writer_is_not_read_and_the_next_writ
             assert reader.epoch == 2
 
 
+def test_zeros_of_a_writer_that_was_interrupted_are_no_empty_record(tmp_path: Path) -> None:
+    """`struct.pack_into` clears what it writes to; the CRC of no bytes under number 0 is 0."""
+    path = tmp_path / "a.slot"
+    with SlotWriter(path, 100, LAYOUT) as writer, SlotReader(path, LAYOUT) as reader:
+        writer.write(b"whole")
+        held = reader._words
+        sequence = held[5]
+        cleared = bytearray(path.read_bytes())
+        cleared[40:64] = bytes(24)
+        path.write_bytes(cleared)  # between the look at the number and the reading
+        numbers = iter([sequence])
+        reader._words = type("Words", (), {"__getitem__": lambda self, k: next(numbers, held[k])})()  # type: ignore[assignment]
+        assert reader.poll() is None
+        reader._words = held
+        writer.write(b"next")
+        assert reader.poll() == b"next"
+
+
 def test_the_same_bytes_under_another_sequence_number_are_not_the_same_record(tmp_path: Path) -> None:
     path = tmp_path / "a.slot"
     with SlotWriter(path, 100, LAYOUT) as writer, SlotReader(path, LAYOUT) as reader:

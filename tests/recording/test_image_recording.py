@@ -133,6 +133,29 @@ def test_a_disk_that_is_too_slow_costs_frames_which_are_counted_and_never_time(
     assert told == result.left_out
 
 
+def test_a_writer_slower_than_the_camera_ends_with_its_order(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy computer there is always a frame that waits; those after the end are none of the recording's."""
+    append = ImageWriter.append
+    written = threading.Semaphore(0)
+
+    def slow(self: ImageWriter, frame: Frame, left_out: int = 0) -> None:
+        assert written.acquire(timeout=20.0)
+        append(self, frame, left_out)
+
+    monkeypatch.setattr(ImageWriter, "append", slow)
+    bench.begin()
+    bench.recorder.take([bench.frame() for _ in range(WAITING_FRAMES)])
+    bench.order.unlink()
+    bench.look()
+    for _ in range(3 * WAITING_FRAMES):
+        bench.recorder.take([bench.frame()])
+        written.release()
+    result = bench.finished()
+    assert (result.frames, result.left_out) == (WAITING_FRAMES, 0)
+
+
 def test_a_full_disk_ends_the_recording_and_not_the_camera(tmp_path: Path) -> None:
     bench = Bench(tmp_path, ImageLimits(max_seconds=4.5e-6, keep_free_bytes=0))
     bench.begin()

@@ -5,7 +5,6 @@ before the libraries of the commands are loaded.
 from __future__ import annotations
 
 import os
-import signal
 import sys
 
 from stereoservo.cli import interruption
@@ -34,7 +33,6 @@ def _go_first() -> None:
 
 def main() -> None:
     """Entry point of the command line."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     interruption.install()
     if sys.argv[1:2] == ["stop"]:
         _go_first()

@@ -13,12 +13,14 @@ from typing import Any
 import msgspec
 import zenoh
 
+from stereoservo.client.errors import ClientError
+
 MAX_MESSAGE_BYTES = 1 << 18
 MAX_SESSIONS = 64
 CLOSE_TIMEOUT_S = 2.0
 
 
-class SessionError(Exception):
+class SessionError(ClientError):
     """A zenoh session cannot be opened; names the endpoint and the cause."""
 
 

@@ -222,7 +222,8 @@ class SlotReader:
             if words[_SEQUENCE_WORD] in (skip, 0):
                 return None
             sequence, length, crc = _STATE.unpack_from(self._bytes, _STATE_AT)
-            if not sequence & 1 and length <= self._capacity:
+            # a writer that was interrupted has left zeros, of which the CRC is zero too
+            if sequence and not sequence & 1 and length <= self._capacity:
                 record = self._bytes[_HEADER_BYTES : _HEADER_BYTES + length].tobytes()
                 # A writer that was here meanwhile has left another number, or bytes that do not fit.
                 if zlib.crc32(record, sequence & 0xFFFFFFFF) == crc and words[_SEQUENCE_WORD] == sequence:

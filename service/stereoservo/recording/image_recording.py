@@ -79,7 +79,9 @@ class ImageRecorder:
     def take(self, delivered: list[Frame] | list[CameraObservation]) -> None:
         """Queue a copy of the frames that the camera delivered; never waits for the thread."""
         recording = self._recording
-        if recording is None:
+        if (
+            recording is None or recording.ending
+        ):  # what came later would keep a slow disk or computer from its end
             return
         for frame in delivered:
             if not isinstance(frame, Frame):

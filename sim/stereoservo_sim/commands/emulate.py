@@ -60,9 +60,6 @@ def emulate(
         raise typer.BadParameter(
             f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT"
         )
-    signal.signal(
-        signal.SIGPIPE, signal.SIG_IGN
-    )  # a master that hangs up in the middle of a write ends nothing
     if parent:
         die_with_parent(parent, signal.SIGTERM)
     termination = Termination(grace_s=GRACE_S)

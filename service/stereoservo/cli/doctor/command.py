@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import resource
 import shutil
-import signal
 import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -102,9 +101,6 @@ def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPla
     yield ExaminationFinding("drivers", True, _drivers(plan))
     for check in CHECKS:
         yield check(plan, directories)
-    signal.signal(
-        signal.SIGPIPE, signal.SIG_IGN
-    )  # an adapter that hangs up is a finding, no end without a word
     return plan, directories
 
 

@@ -176,7 +176,8 @@ def step(context: StepContext) -> None:
         ):
             _carry_over(run, context)
         elif (context.now_ns - run.phase_ns) * 1e-9 > ANSWER_S:
-            _fail(run, context, "no model came: is the gateway alive? See the daemon's log", ANSWER_S, "s")
+            why = "no model came: the computer is overloaded (`uptime`), or the gateway hangs; see the daemon's log"
+            _fail(run, context, why, ANSWER_S, "s")
     elif run.phase == "verify":
         _verify(run, context)
     elif run.phase == "failed" and resting and (context.now_ns - run.phase_ns) * 1e-9 > AGAIN_S:
