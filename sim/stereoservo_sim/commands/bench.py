@@ -54,7 +54,7 @@ def _idle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]
 
 
 def _ik(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.ik import run_ik
+    from stereoservo_sim.experiments.arms.learnt_postures import run_ik
 
     return run_ik(repetitions, seed, progress)
 
