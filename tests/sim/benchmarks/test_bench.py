@@ -138,6 +138,6 @@ def test_unknown_names_are_refused_with_the_list(capfd):
 
 def test_postures_of_a_learnt_arm_are_counted_beside_those_of_the_true_one():
     row = family("gantry", synthetic.gantry(), 3, np.random.default_rng(0))
-    assert (row["refused"], row["true_pose_found"], row["postures_found"], row["postures"]) == (0, 3, 3, 3)
+    assert (row["refused"], row["poses_found"], row["postures_found"], row["postures"]) == (0, 3, 3, 3)
     assert row["wall_ms"]["repetitions"] == 3
     assert row["cpu_ms"]["median"] > 0.0
