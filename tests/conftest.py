@@ -25,7 +25,6 @@ FAST = ("control", "core", "geometry", "kinematics", "messages", "planning")
 """Folders whose tests have the marker `fast`, slow ones aside."""
 NOT_FAST = {
     "control/test_cartesian2.py",
-    "control/test_image_moved_cameras.py",
     "control/test_pd.py",
     "control/test_sight.py",
     "core/test_goal_attacks.py",

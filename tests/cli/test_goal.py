@@ -74,6 +74,7 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
         (("pick", "--adaptive-gain", "4"), "NEAR:FAR or NEAR:FAR:SLOPE is valid"),
         (("pick", "--adaptive-gain", "4:nan"), "gain.far is nan"),
         (("pick", "--adaptive-gain", "4:1", "--gain", "2"), "one of them"),
+        (("pick", "--damping", "1"), "damping"),
         (
             ("pick", "--jacobian", "last"),
             "jacobian: Invalid enum value 'last'; valid: current, desired, fixed-depth, mean",

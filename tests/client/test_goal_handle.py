@@ -125,12 +125,13 @@ def test_goals_are_made_from_shorthands_and_strictly() -> None:
     assert Client.make_goal({"j1": 0.5}).target == JointTarget({"j1": 0.5})
     assert Client.make_goal({"left": {"0": (1, 2)}}).target == TARGET
     goal = Client.make_goal(
-        TARGET, law="cartesian3", centre=Centre((0,)), gain=AdaptiveGain(4, 1), blend_px=3.0
+        TARGET, law="cartesian3", centre=Centre((0,)), gain=AdaptiveGain(4, 1), damping=0.3, blend_px=3.0
     )
-    assert (goal.law, goal.centre, goal.gain, goal.blend_px) == (
+    assert (goal.law, goal.centre, goal.gain, goal.damping, goal.blend_px) == (
         "cartesian3",
         Centre((0,)),
         AdaptiveGain(4, 1),
+        0.3,
         3.0,
     )
     assert goal.id != Client.make_goal(TARGET).id

@@ -1,11 +1,16 @@
-"""PD tracking: the damping term, and that a target in sinusoidal motion is followed as the closed form predicts."""
+"""PD tracking: the damping term, the gain at which it swings, and that a target in sinusoidal motion is followed as the
+closed form predicts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.law import Task
-from stereoservo.control.pd import damped_rates, joint_feature_rates, pd_task, tracking_error
+from stereoservo.control.pd import damped_velocity, largest_gain
 from stereoservo.kinematics.kernels import image_jacobian
 from stereoservo.numerics.linear import damped_least_squares
 
@@ -15,50 +20,61 @@ HELD = LAG + 0.5 * DT
 """A velocity held for a step is late by half of it."""
 
 
-def test_damped_rates_by_their_formula():
+def tracking_error(
+    omega: float, gain: float, lag_s: float, damping: float = 0.0, feed_forward: bool = True
+) -> float:
+    """Amplitude of the tracking error over that of a target in sinusoidal motion, by the transfer functions."""
+    p = 1j * omega
+    characteristic = lag_s * p**2 + (1.0 + damping) * p + gain
+    left = lag_s * p**2 + (0.0 if feed_forward else p * (1.0 + damping))
+    return float(abs(left / characteristic))
+
+
+def test_damping_of_joints_is_that_of_the_features() -> None:
+    """``J⁺(−λe + ṡ* − κ(J q̇ − ṡ*))``, the thesis's, by an independent least squares."""
     rng = np.random.default_rng(1)
-    rates, measured = rng.normal(size=(2, 3, 4, 2))[:, :2, :3]
-    there = np.array([[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
-    measured[1, 2] = np.nan
-    found = damped_rates(rates, measured, there, 0.4)
-    expected = rates - 0.4 * (measured - rates)
-    expected[0, 1], expected[1, 2] = rates[0, 1], rates[1, 2]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
-    np.testing.assert_array_equal(damped_rates(rates, measured, there, 0.0), rates)
-
-
-def test_joint_feature_rates_are_the_jacobian_times_the_velocity():
-    rng = np.random.default_rng(2)
-    J, v = rng.normal(size=(2, 4, 2, 6)), rng.normal(size=6)
-    np.testing.assert_allclose(joint_feature_rates(J, v), J @ v, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("damping", [-0.1, 1.0, np.nan])
-def test_unstable_damping_is_refused(damping):
-    zero = np.zeros((1, 1, 2))
-    task = Task(
-        zero,
-        zero[..., 0],
-        zero,
-        np.zeros((1, 4)),
-        np.zeros(1),
-        np.zeros(4),
-        np.zeros(4),
-        np.zeros(3, np.int64),
+    J, e, measured, expected = (
+        rng.normal(size=(16, 6)),
+        rng.normal(size=16),
+        rng.normal(size=6),
+        rng.normal(size=6),
     )
-    with pytest.raises(ValueError, match="damping"):
-        pd_task(task, zero, zero[..., 0], damping)
+    features = -2.0 * e + J @ expected - 0.4 * (J @ measured - J @ expected)
+    law = np.linalg.lstsq(J, -2.0 * e + J @ expected)[0]
+    found = damped_velocity(law, expected, measured, 0.4)
+    np.testing.assert_allclose(found, np.linalg.lstsq(J, features)[0], rtol=0, atol=1e-12)
 
 
-def follow(virtual, omega, gain, damping, feed_forward):
+def late_loop(gain: float, damping: float, late_s: float, dt_s: float) -> float:
+    """Largest error in the last tenth of a long run, over the first: an arm that obeys ``late_s`` later."""
+    back = round(late_s / dt_s)
+    x, commands = 1.0, [0.0] * (back + 1)
+    seen = []
+    for _ in range(round(60.0 / gain / dt_s)):
+        speed = commands[-back - 1]
+        commands.append(-gain * x - damping * speed)
+        x += speed * dt_s
+        seen.append(abs(x))
+    return max(seen[-len(seen) // 10 :])
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3, 0.6])
+def test_the_largest_gain_is_where_a_late_loop_begins_to_swing(damping: float) -> None:
+    late_s, dt_s = 0.15, 1e-3
+    gain = largest_gain(damping, late_s + 0.5 * dt_s)
+    assert late_loop(0.9 * gain, damping, late_s, dt_s) < 0.3
+    assert late_loop(1.1 * gain, damping, late_s, dt_s) > 3.0
+
+
+def follow(virtual: Any, omega: float, gain: float, damping: float, feed_forward: bool) -> float:
     """Amplitude of the tracking error over that of the target [px/px]: an arm whose joints lag, a swinging plate."""
     world = virtual.rx90(np.random.default_rng(3))
     middle, axis = world.q.copy(), np.array([0.02, -0.015, 0.02, 0.03, -0.02, 0.04])
 
-    def at(q):
+    def at(q: np.ndarray) -> Any:
         return world.pixels(world.markers(q))
 
-    def target(t):
+    def target(t: float) -> tuple[Any, Any]:
         """Where the plate would be with the joints at a swing, and the pixels' velocity there."""
         ahead = at(middle + axis * np.sin(omega * (t + 1e-5)))
         behind = at(middle + axis * np.sin(omega * (t - 1e-5)))
@@ -72,26 +88,21 @@ def follow(virtual, omega, gain, damping, feed_forward):
     for k in range(steps):
         set_points, rates = target(k * DT)
         pixels = at(q)
-        J = image_jacobian(world.operators(q), world.matrices, world.hidden(world.markers(q)))
-        task = Task(
-            set_points, np.ones((2, 4)), rates if feed_forward else np.zeros_like(rates), np.zeros((4, 4)), np.zeros(4),
-            np.zeros(4), np.zeros(4), np.zeros(3, np.int64),
-        )  # fmt: skip
-        task = pd_task(task, joint_feature_rates(J, velocity), np.ones((2, 4)), damping)
-        wanted = task.rates - gain * (pixels - set_points)
-        command = damped_least_squares(J.reshape(-1, 6), wanted.ravel(), np.ones(16), 1e-12)[0]
+        J = image_jacobian(world.operators(q), world.matrices, world.hidden(world.markers(q))).reshape(-1, 6)
+        law = damped_least_squares(J, -gain * (pixels - set_points).ravel(), np.ones(16), 1e-12)[0]
+        expected = damped_least_squares(J, rates.ravel(), np.ones(16), 1e-12)[0] if feed_forward else 0.0
+        command = damped_velocity(law + expected, expected, velocity, damping)
         # first-order lag, exactly over the step
         q = q + command * DT + (velocity - command) * LAG * (1 - keep)
         velocity = command + (velocity - command) * keep
         if k >= steps - window:
             errors.append(pixels - set_points)
             motions.append(set_points)
-    errors, motions = np.array(errors), np.array(motions)
-    return np.linalg.norm(errors.std(axis=0)) / np.linalg.norm(motions.std(axis=0))
+    return float(np.linalg.norm(np.std(errors, axis=0)) / np.linalg.norm(np.std(motions, axis=0)))
 
 
 @pytest.mark.parametrize("hertz", [0.5, 1.0])
-def test_a_swinging_target_is_followed_as_predicted(virtual, hertz):
+def test_a_swinging_target_is_followed_as_predicted(virtual: Any, hertz: float) -> None:
     omega, gain = 2 * np.pi * hertz, 4.0
     found = {
         (damping, forward): follow(virtual, omega, gain, damping, forward)
@@ -106,10 +117,10 @@ def test_a_swinging_target_is_followed_as_predicted(virtual, hertz):
     assert factor > np.sqrt(1 + 1 / (omega * HELD) ** 2)
 
 
-def test_damping_lets_the_gain_be_raised(virtual):
+def test_damping_lets_the_gain_be_raised(virtual: Any) -> None:
     """At λT = 1.2 the damping ratio is 0.46 without, 0.73 with κ = 0.6: less overshoot after a step of the target."""
 
-    def overshoot(damping):
+    def overshoot(damping: float) -> float:
         world = virtual.free_arm(
             np.random.default_rng(4), virtual.pose(Rotation.from_euler("x", 15, degrees=True), [0, 0, 1.0])
         )
@@ -118,18 +129,16 @@ def test_damping_lets_the_gain_be_raised(virtual):
         for _ in range(300):
             pixels = world.pixels(world.markers(q))
             J = image_jacobian(world.operators(q), world.matrices, world.hidden(world.markers(q)))
-            rates = damped_rates(
-                np.zeros_like(pixels), joint_feature_rates(J, velocity), np.ones((2, 4)), damping
-            )
-            wanted = rates - 20.0 * (pixels - set_points)
-            command = damped_least_squares(J.reshape(-1, 6), wanted.ravel(), np.ones(16), 1e-12)[0]
+            wanted = -20.0 * (pixels - set_points).ravel()
+            law = damped_least_squares(J.reshape(-1, 6), wanted, np.ones(16), 1e-12)[0]
+            command = damped_velocity(law, 0.0, velocity, damping)
             q = q + command * DT + (velocity - command) * LAG * (1 - keep)
             velocity = command + (velocity - command) * keep
             farthest = max(farthest, q[0] / 0.03 - 1.0)
         return farthest
 
-    def predicted(ratio):
-        return np.exp(-np.pi * ratio / np.sqrt(1 - ratio**2))
+    def predicted(ratio: float) -> float:
+        return float(np.exp(-np.pi * ratio / np.sqrt(1 - ratio**2)))
 
     ratios = [(1 + k) / (2 * np.sqrt(20.0 * LAG)) for k in (0.0, 0.6)]
     assert overshoot(0.0) == pytest.approx(predicted(ratios[0]), abs=0.05)

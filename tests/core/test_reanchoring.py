@@ -179,6 +179,29 @@ def test_bumped_camera_is_named_in_three_frames_and_the_goal_goes_on(
     assert cell.status.health.verdict == "ok"
 
 
+@pytest.mark.parametrize(("stratum", "law"), [("affine", "cartesian3"), ("projective", "image")])
+def test_without_a_metric_a_bumped_camera_is_found_anew_and_the_goal_goes_on(
+    cells: Any, stratum: str, law: str
+) -> None:
+    """As a whole matrix from eight markers that are known to the kinematics (8.27, 8.28), in the model's own frame."""
+    cell = cells(1)
+    model = msgspec.structs.replace(
+        cell.bench.truth.model, stratum=stratum, projective_to_euclidean=None, epoch=8
+    )
+    cell.bench.step(model_update=ModelUpdate(model))
+    cell.run(0.3)
+    target = cell.bench.q + DISPLACED
+    goal = cell.goal(target, law=law)
+    cell.run(0.3)
+    cell.bump(1)
+    assert cell.until("health", 0.5).cameras == ("right",)
+    assert cell.until("reanchored", 8.0).id == goal.id
+    assert cell.until(TERMINAL, 30.0).kind == "goal_reached"
+    assert final_error(cell, target) < cell.bench.settings.tolerance_px
+    cell.run(1.0)
+    assert cell.status.health.verdict == "ok"
+
+
 def final_error(cell: Cell, target: np.ndarray) -> float:
     """Noise-free reprojection [px] of where the arm is against where it should be, rms, mean of a second."""
     errors = []

@@ -267,6 +267,7 @@ def test_targets_that_cannot_be_say_what_would_have_been_valid(target: Any, expe
         (SEEN, {"blend_px": 5.0, "acknowledge_s": 9.0}, "acknowledge_s: 9 makes the arm stop and wait, blend_px 5"),
         (JointTarget({"j1": 0.1}), {"blend_px": 5.0}, "blend_px: 5.0 belongs to an image law"),
         (JointTarget({"j1": 0.1}), {"gain": AdaptiveGain(4.0, 1.0)}, 'gain: {"near":4.0,"far":1.0'),
+        (JointTarget({"j1": 0.1}), {"damping": 0.3}, "damping: 0.3 belongs to an image law"),
         (incidence("point-on-point", PIN, HOLE), {"law": "stereo"}, "law: 'stereo' belongs to a target that"),
     ],
 )  # fmt: skip

@@ -128,6 +128,9 @@ def test_the_command_writes_it_with_the_limits_of_the_cell_and_asks_for_a_length
     assert invoke(["export", str(tmp_path / "m.json"), "--dh", "--cell", str(stated), "--json"]) == 0
     told = msgspec.json.decode(capsys.readouterr().out)
     assert told["known"]["metres"] == 0.05
+    for one in told["structure"]:
+        assert one["holds"]
+        assert set(one["joints"]) <= set(model.joint_names)
     rows = denavit_hartenberg(model, known_length_of(length))
     assert [row["a"] for row in told["denavit_hartenberg"]] == [row.a for row in rows]
     with pytest.raises(ReadOutError, match="99"):

@@ -4,8 +4,9 @@ cameras of a rig for OpenCV, ROS and Kalibr.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
@@ -18,6 +19,9 @@ from stereoservo.kinematics.urdf import metric_arm, urdf_text
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.messages.known_length import KnownLength, known_length_of
 from stereoservo.recording.flight_export import export_flight
+
+if TYPE_CHECKING:
+    from stereoservo.kinematics.inverse.recognition import Evidence
 
 SAME = 1e-9
 """Relative error up to which a replay on another processor tells the same."""
@@ -169,6 +173,13 @@ def _export_model(
             rows = denavit_hartenberg(model, known)
             told["denavit_hartenberg"] = msgspec.to_builtins(rows)
             lines += [" | ".join(cells) for cells in (DH_HEAD, *(dh_cells(row) for row in rows))]
+            from stereoservo.kinematics.inverse.recognition import structure  # statistics: for this alone
+
+            holds = structure(model)
+            told["structure"] = [
+                {**asdict(one), "joints": [model.joint_names[j] for j in one.joints]} for one in holds
+            ]
+            lines += [_words(one, model) for one in holds]
         if urdf is not None:
             arm = metric_arm(model, known)
             limits = () if cell is None else cell.safety.limit
@@ -181,6 +192,18 @@ def _export_model(
     except (ReadOutError, GeometryError) as error:
         raise CommandError(error.code, str(error)) from error
     emit(told, "\n".join(lines), json)
+
+
+def _words(one: Evidence, model: CellModel) -> str:
+    """What holds of some axes within the model's covariance, in words."""
+    *first, last = (model.joint_names[j] for j in one.joints)
+    how = "are parallel" if one.condition == "parallel" else "meet in one point"
+    held = (
+        f"deviation {one.deviation:.1g}"
+        if one.chi2 is None
+        else f"chi-square {one.chi2:.1f} of {one.freedom}, up to {one.threshold:.1f}"
+    )
+    return f"axes of {', '.join(first)} and {last} {how}, by the model's covariance: {held}"
 
 
 def _known_length(text: str, model: CellModel, cell: CellFile | None) -> KnownLength:

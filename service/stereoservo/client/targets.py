@@ -30,6 +30,7 @@ class GoalOptions(TypedDict, total=False):
     profile: ProfileName | None
     posture: dict[str, float] | None
     gain: float | AdaptiveGain | None
+    damping: float | None
     tolerance_px: float | None
     hold_frames: int | None
     speed_scale: float

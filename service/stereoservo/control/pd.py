@@ -1,8 +1,13 @@
-"""PD tracking of moving set-points (thesis 9.3): the damping term that is added to the feature rates of a control
-law's task, feature rates from measured joint velocities, and the expected tracking error.
+"""PD control and tracking (thesis 9.3): the damping term of a law's joint velocity, and the gain that it still makes
+stable.
 
-The features shall move at ``ṡ = ṡ* − λ(s − s*) − κ(ṡ_measured − ṡ*)``. A law that drives ``ṡ = rates − λ(s − s*)``
-needs no change: the damping goes into its rates (`damped_rates`).
+The features shall move at ``ṡ = ṡ* − λ(s − s*) − κ(ṡ_measured − ṡ*)``. With ``ṡ = J q̇`` and a Jacobian of full rank
+this is, whatever the law's error is measured in, its joint velocity and
+
+    q̇ = q̇_law + κ(q̇* − q̇_measured),
+
+``q̇*`` being what moves the features as their set-points move. So every law takes the term (`damped_velocity`), from the
+joints' own readings, without a filter of the features' velocities.
 
 What is to be gained: with drives that follow their velocity with a lag T [s] and a target ``s*`` of angular frequency
 ω, the transfer functions from ``s*`` to the error are, at ``p = iω``,
@@ -11,81 +16,37 @@ What is to be gained: with drives that follow their velocity with a lag T [s] an
     feed-forward:               T p²       / (T p² + p + λ)
     feed-forward and damping:   T p²       / (T p² + (1 + κ) p + λ)
 
-(`tracking_error`). Feed-forward takes the error from first to second order in ω; damping multiplies the damping ratio
-``1 / (2 √(λT))`` of the loop by ``1 + κ``, so that a higher gain may be used. The measured velocity is at least a step
-old: for drives without lag the loop is ``ṡ_{k+1} = … − κ ṡ_k``, stable for ``κ < 1`` only, and larger ones are refused.
+Damping multiplies the damping ratio ``1 / (2 √(λT))`` of the loop by ``1 + κ``, so that a higher gain may be used; an
+error without overshoot decays at ``λ / (1 + κ)``. Drives that obey a time τ later have ``p + (λ + κp) e^{−pτ}`` in the
+denominator instead, which is stable up to a gain of `largest_gain`, at most a sixth more than without damping.
 """
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
-from stereoservo.control.law import Task
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import kernel
+
+GAIN_MARGIN = 2.0
+"""Of a goal with damping: its gain times this must be stable."""
 
 
-def pd_task(task: Task, measured_rates: FloatArray, measured: FloatArray, damping: float) -> Task:
-    """``task`` with the damping term in its rates: what a law that feeds rates forward is given for PD tracking.
-
-    ``measured_rates`` (c, m, 2) [px/s]: velocity of the features, from `control.filters` or the joints' velocities
-    (`joint_feature_rates`), where ``measured`` (c, m) is not 0. ``damping`` κ in [0, 1). Raises ValueError outside.
-    """
-    check_damping(damping)
-    return task._replace(rates=damped_rates(task.rates, measured_rates, measured, damping))
-
-
-def check_damping(damping: float) -> None:
-    """Raises ValueError where ``damping`` is outside [0, 1)."""
-    if not 0.0 <= damping < 1.0:
-        raise ValueError(
-            f"damping is {damping}; at least 0 and below 1 is stable with a velocity one step old"
-        )
-
-
-@kernel
-def damped_rates(
-    rates: FloatArray, measured_rates: FloatArray, measured: FloatArray, damping: float
+def damped_velocity(
+    velocity: FloatArray, feed_forward: FloatArray | float, measured: FloatArray, damping: float
 ) -> FloatArray:
-    """``ṡ* − κ(ṡ_measured − ṡ*)`` (c, m, 2) [px/s]; ``ṡ*`` alone where ``measured`` (c, m) is 0 or no number came."""
-    out = rates.copy()
-    cameras, markers = rates.shape[0], rates.shape[1]
-    for c in range(cameras):
-        for p in range(markers):
-            if not measured[c, p] > 0.0:
-                continue
-            du = measured_rates[c, p, 0] - rates[c, p, 0]
-            dv = measured_rates[c, p, 1] - rates[c, p, 1]
-            if np.isfinite(du) and np.isfinite(dv):
-                out[c, p, 0] -= damping * du
-                out[c, p, 1] -= damping * dv
-    return out
+    """``velocity`` (n,) [rad/s or m/s] of a law, feed-forward in it, with the damping term of κ = ``damping``.
 
-
-@kernel
-def joint_feature_rates(jacobian: FloatArray, velocity: FloatArray) -> FloatArray:
-    """``ṡ = J q̇`` (c, m, 2) [px/s] of measured joint velocities (n,): as the model sees it, without a filter's delay.
-
-    ``jacobian`` (c, m, 2, n) as `kinematics.kernels.image_jacobian` gives it.
+    ``feed_forward`` (n,): what moves the body as its set-points move, 0 where they stand; ``measured`` (n,): of the
+    joints.
     """
-    cameras, markers, _, n = jacobian.shape
-    out = np.zeros((cameras, markers, 2))
-    for c in range(cameras):
-        for p in range(markers):
-            for r in range(2):
-                for j in range(n):
-                    out[c, p, r] += jacobian[c, p, r, j] * velocity[j]
-    return out
+    damped: FloatArray = velocity + damping * (feed_forward - measured)
+    return damped
 
 
-def tracking_error(
-    omega: float, gain: float, lag_s: float, damping: float = 0.0, feed_forward: bool = True
-) -> float:
-    """Amplitude of the tracking error, relative to that of a target in sinusoidal motion, in the steady state.
+def largest_gain(damping: float, late_s: float) -> float:
+    """The gain [1/s] at which a loop of drives that obey ``late_s`` > 0 later begins to swing: on the imaginary axis
+    ``p = iω`` of the denominator, ``ω = λ / √(1 − κ²)`` and ``ωτ = π/2 + asin κ``.
 
-    ``omega`` [rad/s], ``gain`` [1/s], ``lag_s`` of the drives [s]; see the head of this file.
+    ``damping`` κ in [0, 1): of 1 and more none is stable.
     """
-    p = 1j * omega
-    characteristic = lag_s * p**2 + (1.0 + damping) * p + gain
-    left = lag_s * p**2 + (0.0 if feed_forward else p * (1.0 + damping))
-    return float(abs(left / characteristic))
+    return math.sqrt(1.0 - damping**2) * (0.5 * math.pi + math.asin(damping)) / late_s

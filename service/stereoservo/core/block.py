@@ -30,6 +30,8 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 
 HISTORY = 128
 """Joint samples kept for interpolation: a third of a second at 1 kHz, half of one at 250 Hz."""
+VELOCITY_FILTER_S = 0.01
+"""Time constant of the filtered joint velocities."""
 DELAY_SAMPLES = 5
 """Of a joint's delay, of which the median counts."""
 LONGEST_DELAY_S = 0.25

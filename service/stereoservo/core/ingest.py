@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from stereoservo.core.block import HISTORY
+from stereoservo.core.block import HISTORY, VELOCITY_FILTER_S
 from stereoservo.core.context import Ingested, StepContext
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CameraSettings, CoreSettings
@@ -22,7 +22,6 @@ from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation, JointState
 
-VELOCITY_FILTER_S = 0.01
 LONGEST_GAP_S = 0.5
 """Without a step for so long the arm stops, however patient its drives are: it moves unwatched meanwhile."""
 LEAST_GAP_PERIODS = 2

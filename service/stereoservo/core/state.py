@@ -119,8 +119,8 @@ class Stream(msgspec.Struct, eq=False):
 class LawRun(Leased, eq=False, kw_only=True):
     """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
 
-    Gains [1/s] as in `messages.goals.AdaptiveGain`. ``reasons``: what was found when its progress, which is in the
-    block (`core.block.RunProgress`), was last looked at.
+    Gains [1/s] as in `messages.goals.AdaptiveGain`, ``damping`` as in `control.pd`. ``reasons``: what was found when
+    its progress, which is in the block (`core.block.RunProgress`), was last looked at.
     """
 
     goal: Goal
@@ -133,6 +133,7 @@ class LawRun(Leased, eq=False, kw_only=True):
     time_limit_s: float
     started_ns: int
     used: FloatArray
+    damping: float = 0.0
     reasons: list[Reason] = []
 
 

@@ -34,7 +34,9 @@ from stereoservo.messages.goals import (
     UpdateGoal,
 )
 
-LAW_FIELDS = ("law", "points", "jacobian", "centre", "cameras", "profile", "gain", "tolerance_px", "blend_px")
+LAW_FIELDS = (
+    "law", "points", "jacobian", "centre", "cameras", "profile", "gain", "damping", "tolerance_px", "blend_px",
+)  # fmt: skip
 INCIDENCE_FIELDS = ("law", "points", "jacobian", "centre", "profile")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import gammainccinv
 from scipy.stats import qmc
 
 from stereoservo.kinematics.joint_reprojection import (
@@ -30,6 +30,8 @@ GRID = 16
 RAY_STEPS = 25
 """Steps by rays, before those by pixels."""
 PIXEL_STEPS = 60
+SETTLED = 1e-12
+"""Relative change of the cost, or step [rad or m], at which a descent has come to its end."""
 LONGEST_STEP = 0.5
 """Largest change of a joint in one step [rad or m]."""
 AMBIGUOUS = 25.0
@@ -80,13 +82,7 @@ def measured_joints(
     """
     seen = problem.seen
     n = seen.chain.joints
-    if problem.measurements < n:
-        raise JointAnglesError(
-            "too_few",
-            f"{problem.measurements} pixel coordinates for {n} joints; more points or cameras are needed",
-            measurements=problem.measurements,
-            joints=seen.joint_names,
-        )
+    _require_enough(problem)
     bounds = _bounds(seen, limits, local=start is not None)
     if start is None:
         near = _distinct(_descent(problem.linearise_rays, _starts(bounds), RAY_STEPS)[0], seen)
@@ -94,22 +90,73 @@ def measured_joints(
         near = np.asarray(start, dtype=np.float64).reshape(1, n)
     ends, costs, front = _descent(problem.linearise, near, PIXEL_STEPS)
     if not front.any():
-        raise JointAnglesError(
-            "no_agreement", "no configuration puts the points before the cameras that see them", cost=None
-        )
+        raise _behind()
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
     _refuse_open(problem, q[ordered[0]], largest_deviation)
     found = _distinct_configurations(problem, q[ordered], costs[ordered])
     inside = tuple(angles for angles in found if _inside(angles, bounds))
     if not inside:
-        raise JointAnglesError(
-            "outside_limits",
-            f"the pixels say {np.round(found[0].q, 4).tolist()}, outside of the limits {bounds.tolist()}",
-            q=found[0].q.tolist(),
-            limits=bounds.tolist(),
-        )
+        raise _outside(found[0].q, bounds)
     return inside
+
+
+def refined_joints(
+    problem: JointProblem, starts: FloatArray, *, limits: FloatArray | None = None
+) -> tuple[JointAngles | JointAnglesError, ...]:
+    """For each of ``starts`` (s, n) the configuration near it that fits the pixels of ``problem`` best, or why there is
+    none: ``no_agreement``, ``outside_limits``; all of them descended at once.
+
+    Joints that the pixels do not tell have a large deviation. Raises JointAnglesError: ``limits``, ``too_few``.
+    """
+    seen = problem.seen
+    _require_enough(problem)
+    bounds = _bounds(seen, limits, local=True)
+    if not len(starts):
+        return ()
+    ends, costs, front = _descent(problem.linearise, np.asarray(starts, dtype=np.float64), PIXEL_STEPS)
+    ends = _wrapped(ends, bounds, seen)
+    slopes = problem.linearise(ends)[1]
+    covariances = np.linalg.pinv(slopes.swapaxes(-1, -2) @ slopes, rcond=1e-13, hermitian=True)
+    found: list[JointAngles | JointAnglesError] = []
+    for q, cost, ahead, covariance in zip(ends, costs, front, covariances, strict=True):
+        try:
+            if not ahead:
+                raise _behind()
+            _possible(problem, np.array([cost]))
+        except JointAnglesError as error:
+            found.append(error)
+            continue
+        angles = JointAngles(q, covariance, float(cost), max(0, problem.freedom))
+        found.append(angles if _inside(angles, bounds) else _outside(q, bounds))
+    return tuple(found)
+
+
+def _require_enough(problem: JointProblem) -> None:
+    """Raises JointAnglesError where there are fewer coordinates than joints."""
+    n = problem.seen.chain.joints
+    if problem.measurements < n:
+        raise JointAnglesError(
+            "too_few",
+            f"{problem.measurements} pixel coordinates for {n} joints; more points or cameras are needed",
+            measurements=problem.measurements,
+            joints=problem.seen.joint_names,
+        )
+
+
+def _behind() -> JointAnglesError:
+    return JointAnglesError(
+        "no_agreement", "no configuration puts the points before the cameras that see them", cost=None
+    )
+
+
+def _outside(q: FloatArray, bounds: FloatArray) -> JointAnglesError:
+    return JointAnglesError(
+        "outside_limits",
+        f"the pixels say {np.round(q, 4).tolist()}, outside of the limits {bounds.tolist()}",
+        q=q.tolist(),
+        limits=bounds.tolist(),
+    )
 
 
 def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]:
@@ -120,7 +167,7 @@ def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]
     freedom = max(0, problem.freedom)
     factor = max(1.0, best / max(1, freedom))
     # As many equations as joints are solved exactly or not at all.
-    chance = float(chi2_distribution.isf(MISFIT_TAIL, freedom)) if freedom else EXACT
+    chance = 2.0 * float(gammainccinv(0.5 * freedom, MISFIT_TAIL)) if freedom else EXACT  # of chi-square
     if best > MAX_SIGMA_FACTOR**2 * chance:
         raise JointAnglesError(
             "no_agreement",
@@ -320,14 +367,14 @@ def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArra
         step *= np.minimum(1.0, LONGEST_STEP / np.maximum(length, 1e-300))[:, None]
         new_error, new_slope, new_front = linearise(q[active] + step)
         new_cost = (new_error**2).sum(axis=1)
-        better = new_cost <= cost[active]
+        before = cost[active]
+        better = new_cost <= before
         won = active[better]
-        gain = cost[won] - new_cost[better]
         q[won] += step[better]
         error[won], slope[won], front[won] = new_error[better], new_slope[better], new_front[better]
-        settled = np.zeros(len(active), dtype=bool)
-        settled[better] = gain <= 1e-12 * (new_cost[better] + 1e-18)
-        settled |= np.abs(step).max(axis=1) < 1e-12
+        # At the least cost the next one is larger as often as not, by its rounding.
+        settled = np.abs(new_cost - before) <= SETTLED * (new_cost + 1e-18)
+        settled |= np.abs(step).max(axis=1) < SETTLED
         cost[won] = new_cost[better]
         damping[active] *= np.where(better, 0.1, 10.0)
         damping[active] = np.clip(damping[active], 1e-14, 1e12)

@@ -130,8 +130,8 @@ class JointProblem:
         s, n = q.shape
         k = len(self.offsets)
         H, slopes = self.seen.displacements((q[:, None] + self.offsets).reshape(s * k, n))
-        through: FloatArray = np.einsum("cij,sjl->scil", self.seen.cameras, H).reshape(s, k, -1, 3, 4)
-        turning = np.einsum("cij,snjl->scnil", self.seen.cameras, slopes, optimize=True)
+        through: FloatArray = (self.seen.cameras @ H[:, None]).reshape(s, k, -1, 3, 4)
+        turning = self.seen.cameras[:, None] @ slopes[:, None]
         images = through @ self.points.T
         changes = (turning @ self.points.T).reshape(s, k, len(self.seen.cameras), n, 3, -1)
         depths = np.where(self.roots[..., 0, 0] > 0, images[..., 2, :], 1.0)

@@ -17,6 +17,7 @@ Positive = Annotated[float, Meta(gt=0)]
 Duration = Annotated[float, Meta(gt=0, le=86_400)]
 """[s], a day at most."""
 Gain = Annotated[float, Meta(ge=1e-4, le=50)]
+Damping = Annotated[float, Meta(ge=0, lt=1)]
 Pixels = Annotated[float, Meta(ge=1e-4, le=1000)]
 Lease = Annotated[float, Meta(ge=0.3, le=3600)]
 Fraction = Annotated[float, Meta(ge=1e-4, le=1)]
@@ -165,6 +166,9 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     likewise: joint positions by name [rad or m] near which the plan ends, where the arm reaches the goal by several
     postures; joints left out are near to where they are now.
 
+    ``damping`` κ: share of the joints' measured velocity, less what a moving target or a plan asks for, that is taken
+    from the law's (thesis 9.3, `control.pd`). An error then decays at ``gain / (1 + damping)``.
+
     ``blend_px``: hand over to the next queued goal as soon as the error is below it, without stopping; without one it
     is reached as usual. ``acknowledge_s``: reached, the arm holds there and the queue waits until a client
     acknowledges (a gripper has closed), at most so long; then, and where it is not reached, the queue is cancelled.
@@ -184,6 +188,7 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     profile: ProfileName | None = None
     posture: dict[str, float] | None = None
     gain: Gain | AdaptiveGain | None = None
+    damping: Damping | None = None
     tolerance_px: Pixels | None = None
     hold_frames: Annotated[int, Meta(ge=1, le=10_000)] | None = None
     speed_scale: Fraction = 1.0

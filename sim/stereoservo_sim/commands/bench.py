@@ -53,6 +53,12 @@ def _idle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]
     return run_idle(repetitions, seed, progress)
 
 
+def _ik(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.experiments.arms.learnt_postures import run_ik
+
+    return run_ik(repetitions, seed, progress)
+
+
 def _loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.live_loop.loop import run_loop
 
@@ -120,6 +126,7 @@ BENCHES: dict[str, Bench] = {
     "faults": _faults,
     "features": _features,
     "idle": _idle,
+    "ik": _ik,
     "kills": _kills,
     "loop": _loop,
     "page": _page,

@@ -112,6 +112,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(10),),
         ),
         Experiment(
+            "damped-drives",
+            "thesis 9.3: drives that lag or obey late, goals with and without damping: time and overshoot",
+            "arms.damped_drives",
+            (repetitions(10),),
+        ),
+        Experiment(
             "preset-verdicts",
             "every preset of mechanics at work for ten virtual minutes: what the watch says where nothing has happened",
             "arms.preset_verdicts",

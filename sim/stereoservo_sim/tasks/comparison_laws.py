@@ -69,4 +69,4 @@ def _seen(scene: Scene, task: Task) -> FloatArray:
 CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {
     "stereo-block": stereo_block,
 }
-"""By name. `euclidean_points` needs a metric frame besides, `control.moved_cameras.image_of_moved_cameras` LAPACK."""
+"""By name. `euclidean_points` needs a metric frame besides."""

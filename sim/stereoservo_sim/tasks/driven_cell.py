@@ -152,8 +152,9 @@ class DrivenCell:
         return outputs
 
     def run_goal(
-        self, wanted: FloatArray, *, law: LawName | None = None, time_limit_s: float = TIME_LIMIT_S
-    ) -> GoalEnd:
+        self, wanted: FloatArray, *, law: LawName | None = None, time_limit_s: float = TIME_LIMIT_S,
+        gain: float | None = None, damping: float | None = None,
+    ) -> GoalEnd:  # fmt: skip
         """Drive to set-points (c, m, 2) [px], of which the markers in view count, until an event ends the goal."""
         ids = self.cell.marker_ids
         inside = (wanted > -0.5).all(axis=-1) & (
@@ -168,7 +169,9 @@ class DrivenCell:
             }
         )
         name = str(uuid.UUID(int=self._seq + 1))
-        outputs = self.step(RunGoal(Goal(name, target, law=law, time_limit_s=time_limit_s)))
+        outputs = self.step(
+            RunGoal(Goal(name, target, law=law, gain=gain, damping=damping, time_limit_s=time_limit_s))
+        )
         limit = round(2.0 * time_limit_s * RATE_HZ)  # what waits for its cameras is not timed by the core
         for cycle in range(limit):
             for event in outputs.events:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
+
+from stereoservo_sim.experiments.pictures.textured import Face, texture
 
 
 def rotation(x=0.0, y=0.0, z=0.0) -> np.ndarray:
@@ -26,29 +28,6 @@ def pose(R=None, t=(0.0, 0.0, 0.0)) -> np.ndarray:
     T[:3, :3] = np.eye(3) if R is None else R
     T[:3, 3] = t
     return T
-
-
-def texture(rng, side=256, scale=1.6) -> np.ndarray:
-    """Grey levels (side, side) without edges finer than ``scale`` pixels, and with coarser things among them."""
-    image = sum(
-        weight * normal(gaussian_filter(rng.normal(size=(side, side)), scale * factor))
-        for weight, factor in ((30.0, 1.0), (22.0, 2.5), (14.0, 7.0))
-    )
-    return 125.0 + image
-
-
-def normal(field) -> np.ndarray:
-    return field / field.std()
-
-
-@dataclass
-class Face:
-    """A rectangle with ``grey`` (s, s) on it, spanned in a body's frame by ``origin``, ``across``, ``down`` (3,)."""
-
-    grey: np.ndarray
-    origin: np.ndarray
-    across: np.ndarray
-    down: np.ndarray
 
 
 def box(rng, size, *, side=256, scale=1.6) -> list[Face]:

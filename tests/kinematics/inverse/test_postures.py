@@ -1,11 +1,20 @@
 """Postures that show given images: all of them, by the arm's forward kinematics, and none where there is none."""
 
+import re
+
 import numpy as np
 import pytest
 
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.inverse.postures import postures
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
-from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
+from stereoservo.kinematics.joint_angles import measured_joints, refined_joints
+from stereoservo.kinematics.joint_reprojection import (
+    JointAnglesError,
+    joint_problem,
+    predicted_pixels,
+    seen_chain,
+)
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 
@@ -47,3 +56,33 @@ def test_images_that_do_not_tell_a_posture_are_refused_with_the_number():
     pixels[1, 2:] = np.nan
     with pytest.raises(InverseKinematicsError, match=r"2 markers are shown to two cameras; 3 are needed"):
         postures(model, pixels, SIGMA)
+
+
+def test_a_learnt_arm_of_four_joints_has_both_its_elbows():
+    """Noise of its operators generates all rigid motions: a goal of such an arm is not refused for being none."""
+    cell, rng = synthetic.scara(), np.random.default_rng(0)
+    model = fit_model(cell.trials(0.1, rng, 10), epoch=1).model
+    room = np.where(np.array(cell.kinds) == "revolute", np.pi, 1.0)
+    limits = np.column_stack([cell.home - room, cell.home + room])
+    for q in cell.held_out(rng, 3, 0.7):
+        pixels = cell.pixels(q[None])[:, 0]
+        answers = postures(model, pixels + rng.normal(0, 0.1, pixels.shape), 0.1, limits=limits)
+        assert len(answers.images.solutions) == 2
+        assert min(np.abs(answer.q - q).max() for answer in answers.images.solutions) < 0.02
+
+
+def test_starts_that_are_refined_together_end_as_each_by_itself():
+    cell, rng = synthetic.rx90(), np.random.default_rng(1)
+    seen = seen_chain(exact_model(cell))
+    q = cell.held_out(rng, 1, 0.5)[0]
+    pixels = cell.pixels(q[None])[:, 0] + rng.normal(0, SIGMA, (2, len(cell.body), 2))
+    problem = joint_problem(seen, exact_model(cell).marker_points, pixels, SIGMA)
+    starts = np.array([q + 0.05, q + 2.0, q - 0.1])
+    for start, found in zip(starts, refined_joints(problem, starts), strict=True):
+        if isinstance(found, JointAnglesError):
+            with pytest.raises(JointAnglesError, match=re.escape(str(found))):
+                measured_joints(problem, start=start, largest_deviation=np.inf)
+            continue
+        alone = measured_joints(problem, start=start, largest_deviation=np.inf)[0]
+        np.testing.assert_allclose(found.q, alone.q, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(found.covariance, alone.covariance, rtol=1e-5, atol=1e-12)

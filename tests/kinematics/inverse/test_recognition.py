@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.kinematics.inverse.recognition import chain_of, examined, recognise
+from stereoservo.kinematics.inverse.recognition import chain_of, examined, recognise, structure
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
 from stereoservo_sim.experiments.arms import arm_families
 from stereoservo_sim.experiments.arms.inverse_kinematics import hide
@@ -96,6 +96,17 @@ def test_calibrated_arm_is_recognised_within_its_covariance(calibrated):
     for evidence in held:
         assert evidence.deviation > 1e-6
         assert evidence.chi2 <= evidence.threshold
+
+
+def test_the_structure_of_a_learnt_arm_is_told_and_nothing_else(calibrated):
+    """Of an elbow arm with a spherical wrist: the first axis meets the second, the upper arm turns in one plane."""
+    for arm in (calibrated("rx90", 0), chain_of(exact_model(synthetic.rx90()))):
+        told = structure(arm)
+        assert {(e.condition, e.joints) for e in told} >= {("parallel", (1, 2)), ("common_point", (3, 4, 5))}
+        assert all(e.holds for e in told)
+        assert ("common_point", (3, 4)) not in {(e.condition, e.joints) for e in told}
+    offset = structure(calibrated("rx90", 0, (4, ("shift", 0.003))))
+    assert ("common_point", (3, 4, 5)) not in {(e.condition, e.joints) for e in offset}
 
 
 def test_chi_square_of_conditions_that_hold_is_chi_square(calibrated):

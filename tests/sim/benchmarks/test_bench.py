@@ -12,6 +12,8 @@ from stereoservo_sim.benchmarks.calibration import run_calibration, thesis_sized
 from stereoservo_sim.benchmarks.cycle import run_cycle
 from stereoservo_sim.benchmarks.features import run_features
 from stereoservo_sim.benchmarks.timing import machine, stolen_share, summary, timed
+from stereoservo_sim.experiments.arms.learnt_postures import family
+from stereoservo_sim.world import synthetic
 
 
 def quiet(stage, done, total):
@@ -132,3 +134,10 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "wire",
     ]
     assert "wheels" in error["message"]
+
+
+def test_postures_of_a_learnt_arm_are_counted_beside_those_of_the_true_one():
+    row = family("gantry", synthetic.gantry(), 3, np.random.default_rng(0))
+    assert (row["refused"], row["poses_found"], row["postures_found"], row["postures"]) == (0, 3, 3, 3)
+    assert row["wall_ms"]["repetitions"] == 3
+    assert row["cpu_ms"]["median"] > 0.0

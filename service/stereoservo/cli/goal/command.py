@@ -147,6 +147,13 @@ GainOption = Annotated[float | None, typer.Option(help="Gain [1/s].")]
 AdaptiveGainOption = Annotated[
     str | None, typer.Option(metavar="NEAR:FAR[:SLOPE]", help="Gain that falls with the error [1/s].")
 ]
+DampingOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="K",
+        help="Share [0, 1) of the measured velocity that is taken back, for drives that lag; gain / (1 + K).",
+    ),
+]
 ToleranceOption = Annotated[float | None, typer.Option(help="Largest pixel distance at the goal [px].")]
 HoldFramesOption = Annotated[int | None, typer.Option(help="Frames for which the tolerance must hold.")]
 SpeedScaleOption = Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")]
@@ -196,6 +203,7 @@ def goal(
     posture: PostureOption = None,
     gain: GainOption = None,
     adaptive_gain: AdaptiveGainOption = None,
+    damping: DampingOption = None,
     tolerance: ToleranceOption = None,
     hold_frames: HoldFramesOption = None,
     speed_scale: SpeedScaleOption = 1.0,
@@ -237,7 +245,7 @@ def goal(
             target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
             cameras=camera or None, profile=profile, posture=ends_in,
-            gain=_one_gain(gain, adaptive_gain),
+            gain=_one_gain(gain, adaptive_gain), damping=damping,
             tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
             time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
             follow_markers=None if follow_markers is None else marker_ids(follow_markers, "--follow-markers"),

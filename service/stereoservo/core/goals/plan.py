@@ -250,13 +250,14 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
 
 
 def _exponential_s(job: PlanJob, context: StepContext) -> float:
-    """Time in which the error decays to its tolerance at the goal's gain."""
+    """Time in which the error decays to its tolerance at the goal's gain and damping."""
     source, arrays = job.source, context.arrays
     assert source is not None
     assert arrays is not None
     asked = source.wanted * source.used[:, None]
     error = float(_largest_error(arrays.matrices, job.points, source.set_points, asked))
-    return math.log(max(error / source.tolerance_px, 1.0)) / min(source.gain_near, source.gain_far)
+    gain = min(source.gain_near, source.gain_far) / (1.0 + source.damping)
+    return math.log(max(error / source.tolerance_px, 1.0)) / gain
 
 
 @kernel

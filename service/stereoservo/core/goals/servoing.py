@@ -9,6 +9,8 @@ import numpy as np
 from stereoservo.control.face_choice import NOT_CHOSEN
 from stereoservo.control.law import JacobianChoice, Law
 from stereoservo.control.law_registry import LAWS
+from stereoservo.control.pd import GAIN_MARGIN, largest_gain
+from stereoservo.core.block import VELOCITY_FILTER_S
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import markers_needed
 from stereoservo.core.goals.resolve import camera_index, marker_indices, normalize_scale, of_this_model
@@ -80,6 +82,7 @@ def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, 
         "gain_near": near,
         "gain_far": far,
         "gain_slope": slope,
+        "damping": _stable_damping(goal, near, context),
         "tolerance_px": goal.tolerance_px or settings.tolerance_px,
         "hold_frames": goal.hold_frames or settings.hold_frames,
         "time_limit_s": goal.time_limit_s or settings.time_limit_s,
@@ -88,6 +91,26 @@ def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, 
         "lease_until_ns": context.now_ns + int((goal.lease_s or 0.0) * 1e9),
         "used": used,
     }
+
+
+def _stable_damping(goal: Goal, gain: float, context: StepContext) -> float:
+    """The damping that a goal asks for. Raises RefusalError where the drives are too late for it at its ``gain``."""
+    damping = goal.damping or 0.0
+    if damping == 0.0:
+        return damping
+    delays, settings = context.state.block.delay_s, context.settings
+    slowest = int(delays.argmax())
+    late_s = float(delays[slowest]) + VELOCITY_FILTER_S + 1.0 / settings.rate_hz
+    most = largest_gain(damping, late_s) / GAIN_MARGIN
+    if gain > most:
+        joint = settings.joint_names[slowest]
+        raise RefusalError(
+            "DAMPING_UNSTABLE",
+            f"damping {damping:g} at a gain of {gain:g}/s: the velocity of {joint} is known {late_s:.3f} s after its "
+            f"command, by which gains up to {most:.2g}/s are damped; lower the gain, or the damping",
+            subject=joint, value=gain, threshold=most, unit="1/s",
+        )  # fmt: skip
+    return damping
 
 
 def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatArray:

@@ -36,7 +36,7 @@ from stereoservo.core.goals.resolve import (
 from stereoservo.core.goals.servoing import no_plan, run_fields, used_cameras
 from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.core.prediction import points_now, scene_of
-from stereoservo.core.sources.law import options, run_ended
+from stereoservo.core.sources.law import damp, options, run_ended
 from stereoservo.core.sources.progress import error_of_run
 from stereoservo.core.state import IncidenceGoal
 from stereoservo.geometry.homogeneous import GeometryError
@@ -254,7 +254,7 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
         return ended
     still = bool((step.status == int(IncidenceStatus.NOT_FINITE)).any())
     return SourceOutput(
-        np.zeros_like(context.q) if still else step.velocity, True, source.goal.speed_scale,
+        np.zeros_like(context.q) if still else damp(source, context, step.velocity), True, source.goal.speed_scale,
         error_px=error_px if isfinite(error_px) else None, task_error=step.error_px,
         reasons=incidence_reasons(step, task, source.names),
     )  # fmt: skip

@@ -15,6 +15,7 @@ from stereoservo.control.face_choice import FaceChoice, choose_face, law_scene
 from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene, Task
 from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
+from stereoservo.control.pd import damped_velocity
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
@@ -88,8 +89,11 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
         velocity = velocity_of(step, len(context.q))
     except Exception as error:  # whatever a third party's law raises ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
+    expected: FloatArray | float = task.joint_rates if task.joint_rates.size else 0.0
     if streamed or source.followed is not None:
-        velocity = velocity + feed_forward(source, context, found.usable * source.wanted)
+        expected = feed_forward(source, context, found.usable * source.wanted)
+        velocity = velocity + expected
+    velocity = damp(source, context, velocity, expected)
     if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has kept off the limits itself
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
@@ -124,13 +128,25 @@ def output_of(source: ServoGoal, context: StepContext, law: Law, error_px: float
     room = context.derived.room
     step = _found_step(room, len(law.components))
     velocity = step.velocity
+    expected: FloatArray | float = 0.0
     if source.followed is not None:
-        velocity = velocity + feed_forward(source, context, room.arrays["usable"] * source.wanted)
+        expected = feed_forward(source, context, room.arrays["usable"] * source.wanted)
+        velocity = velocity + expected
+    velocity = damp(source, context, velocity, expected)
     if len(velocity) > RIGID_FREEDOMS:
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
         velocity, True, source.goal.speed_scale, False, False, error_px, step.error, law.reasons(step)
     )
+
+
+def damp(
+    source: LawRun, context: StepContext, velocity: FloatArray, expected: FloatArray | float = 0.0
+) -> FloatArray:
+    """``velocity`` (n,) with the damping that the goal asks for, where ``expected`` (n,) is no error's doing."""
+    if source.damping == 0.0:
+        return velocity
+    return damped_velocity(velocity, expected, context.state.block.velocities, source.damping)
 
 
 def aim_at(room: Workspace, goal: ServoGoal) -> None:
@@ -502,7 +518,10 @@ def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
 def run_progress(source: LawRun, context: StepContext) -> Progress:
     """The same of any law, by the exponential decay of its error."""
     record = context.state.block.record
-    known, done, left_s = decay_of_error(record, source.tolerance_px, source.gain_near, source.gain_far)
+    slow = 1.0 + source.damping
+    known, done, left_s = decay_of_error(
+        record, source.tolerance_px, source.gain_near / slow, source.gain_far / slow
+    )
     return (done, left_s) if known else (None, None)
 
 
@@ -521,7 +540,7 @@ def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
 
 
 def _plain_traits(source: LawRun, context: StepContext) -> Traits:
-    gain = gain_now(source, error_of_run(context.state.block))
+    gain = gain_now(source, error_of_run(context.state.block)) / (1.0 + source.damping)
     return Traits(gain, run_progress(source, context)[1] or 0.0)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -170,6 +171,23 @@ def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tup
         condition
     ](*joints)
     return judge.evidence[condition, joints]
+
+
+def structure(arm: ProjectiveChain | CellModel) -> tuple[Evidence, ...]:
+    """What holds of neighbouring revolute axes, from the base on: two that are parallel or meet, three that do so in
+    one point, which replace the pairs that they contain.
+    """
+    chain = chain_of(arm)
+    turning = [j for j in chain.order if chain.kinds[j] == "revolute"]
+    pairs = list(pairwise(turning))
+    parallel = [examined(arm, "parallel", pair) for pair in pairs]
+    alike = {told.joints for told in parallel if told.holds}
+    triples = [three for three in zip(turning, turning[1:], turning[2:], strict=False)
+               if not {three[:2], three[1:]} & alike]  # fmt: skip
+    through = [told for three in triples if (told := examined(arm, "common_point", three)).holds]
+    told_of = {pair for told in through for pair in pairwise(told.joints)}
+    met = [examined(arm, "common_point", pair) for pair in pairs if pair not in alike | told_of]
+    return tuple(told for told in (*parallel, *through, *met) if told.holds)
 
 
 def chain_of(arm: ProjectiveChain | CellModel) -> ProjectiveChain:

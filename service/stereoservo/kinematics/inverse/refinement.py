@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereoservo.kinematics.inverse.solutions import InverseSolutions, distinct, within_limits
-from stereoservo.kinematics.joint_angles import JointAngles, measured_joints
+from stereoservo.kinematics.joint_angles import JointAngles, refined_joints
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, joint_problem
 from stereoservo.numerics.arrays import FloatArray
 
@@ -46,14 +46,12 @@ def refined_on_images(
     problem = joint_problem(seen, points, pixels, sigma)
     refined: list[JointAngles] = []
     refused: list[tuple[FloatArray, str]] = []
-    for q in found.joints:
-        try:
-            best = measured_joints(problem, limits=limits, start=q, largest_deviation=np.inf)[0]
+    ends = refined_joints(problem, found.joints, limits=limits)
+    for q, best in zip(found.joints, ends, strict=True):
+        if isinstance(best, JointAnglesError):
+            refused.append((q, str(best)))
+        else:
             refined.append(replace(best, q=within_limits(seen.chain.kinds, best.q, q, limits)[0]))
-        except JointAnglesError as error:
-            if error.code not in ("no_agreement", "outside_limits"):
-                raise
-            refused.append((q, str(error)))
     refined.sort(key=lambda angles: angles.cost)
     if refined:
         kept = distinct(seen.chain.kinds, np.array([angles.q for angles in refined]), MERGED)

@@ -53,6 +53,9 @@ POLISH = 1e-9
 RIGID = 3
 """Number of points from which a goal shows whether it is a rigid motion."""
 ROUNDING = 1e-9
+FREEDOMS = 6
+EXACT_GOALS = 1e-6
+"""Tolerance up to which goals and chain count as exact."""
 
 Solver = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], Branches]
 SINGLE_POINT: dict[Case, Solver] = {"two_revolute": two_general, "two_parallel": two_parallel, "arm": arm}
@@ -151,7 +154,11 @@ def _displacement(problem: _Problem, known: Recognition) -> FloatArray | None:
     """
     if problem.displacement is not None:
         return problem.displacement
-    if len(problem.points) < RIGID and not known.inverted and known.case not in WHOLE_ROTATION:
+    needless = not known.inverted and known.case not in WHOLE_ROTATION
+    if needless and len(problem.points) < RIGID:
+        return None
+    # Of a learnt arm of few joints nobody knows the group of motions: noise of its operators generates all of them.
+    if needless and problem.chain.joints < FREEDOMS and problem.tolerance > EXACT_GOALS:
         return None
     misfit = max(problem.tolerance, ROUNDING)
     return goals.displacement_between(

@@ -84,11 +84,11 @@ def judged_drives(seed: int) -> DriveVerdict:
         shown, _ = driven.rest(1.0)
         ends[name] = end.kind if end.kind == "goal_reached" or not end.codes else end.codes[0]
         errors[name] = float(np.linalg.norm(shown - wanted, axis=-1).max())
-        overshoot[name] = _overshoot(case.cell.pixels(np.array(driven.path)), wanted)
+        overshoot[name] = overshoot_of(case.cell.pixels(np.array(driven.path)), wanted)
     return DriveVerdict(seed, delay_s, friction, ends, errors, overshoot)
 
 
-def _overshoot(pixels: FloatArray, wanted: FloatArray) -> float:
+def overshoot_of(pixels: FloatArray, wanted: FloatArray) -> float:
     """Of pixels (c, k, m, 2) on their way to ``wanted`` (c, m, 2), over the longest way."""
     way = wanted - pixels[:, 0]
     length = np.linalg.norm(way, axis=-1)
