@@ -84,7 +84,8 @@ def _better(
         mended = corrected_views(views, step.hypothesis, frames, step.x)
         again = None if mended is None else _learnt(mended)
         if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
-            return mended, again, step
+            offsets = reference.offsets + again.offsets
+            return again.put_right(mended), replace(again, offsets=offsets), step
     return None
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.calibration.examination.recorded_views import RecordedViews
-from stereoservo.calibration.rig_model import exponentials
+from stereoservo.kinematics.parameterization import exponentials
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 SOUGHT_S, GRID_S = 0.2, 0.02
