@@ -104,12 +104,14 @@ def _freed(views: RecordedViews, reference: ReferenceModel) -> tuple[CellModel, 
     return exact, replace(problem, root=root, uncertainty=bounded(root))
 
 
-def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis) -> _Step:
-    """The onset of a hypothesis of one parameter that explains most, at every frame (Rao's score test)."""
+def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset: int | None = None) -> _Step:
+    """The onset of a hypothesis of one parameter that explains most, of every frame or as given (Rao's score test)."""
     here = problem.residuals_at(start_state(problem))
     slope = change_jacobian(problem, (one.change,), np.zeros(1), here)[:, 0]
     concerned = frames_concerned(one, views)
     onsets = concerned[LASTING : len(concerned) - LASTING + 1]
+    if onset is not None:
+        onsets = np.array([onset], dtype=np.int64)
     if not len(onsets):
         return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
     B = problem.uncertainty
@@ -139,8 +141,13 @@ def _later(rows: FloatArray, begin: IntArray) -> FloatArray:
 
 
 def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> ChangePoint:
-    """What was taken back as a change point of the recording as it now is."""
+    """What was taken back as a change point of the recording as it now is; what is then still left of it, to first
+    order, is part of its deviation.
+    """
     problem = examined_frames(reference.model, views, reference.noise_factor)
-    names = {(one.kind, one.subject): one for one in hypotheses(reference.model, views, problem)}
-    one = names[step.hypothesis.kind, step.hypothesis.subject]
-    return change_of(problem, views, one, step.onset, step.span, step.x, step.deviation)
+    model, free = _freed(views, reference)
+    named = {(one.kind, one.subject): one for one in hypotheses(model, views, free)}
+    one = named[step.hypothesis.kind, step.hypothesis.subject]
+    left = _step(free, views, one, step.onset)
+    deviation = float(np.hypot(left.deviation, left.x)) if np.isfinite(left.deviation) else step.deviation
+    return change_of(problem, views, one, step.onset, step.span, step.x, deviation)

@@ -26,7 +26,7 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import CellModel
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 AS_GOOD = 1.1
 """The whole is taken where it scatters no more than so many times the best half."""
@@ -34,7 +34,7 @@ GOOD = 1.5
 """A model that scatters more than so many times the noise is asked whether something happened while it was learnt."""
 ORDERS = 2, 4, 6
 """Differences that the noise of the pixels is told from: of a high order little of a smooth motion is left."""
-NOISE_BLOCK, LEAST_VALUES, LOW = 40, 100, 0.1
+NOISE_BLOCK, LEAST_VALUES, LOW = 80, 100, 0.25
 """Frames of a block, differences that tell a noise, and the quantile of the blocks that is taken."""
 
 
@@ -129,29 +129,21 @@ def frame_noise(views: RecordedViews) -> float:
     what is left of the motion there.
     """
     still = views.speeds(views.times) <= AT_REST
-    found = [
-        noise
-        for c in range(len(views.cameras))
-        for noise in _noise_of(views, np.flatnonzero(views.camera == c), still)
-    ]
-    return max(1.0, min(found, default=1.0))
-
-
-def _noise_of(views: RecordedViews, mine: IntArray, still: BoolArray) -> list[float]:
-    """Noises of the frames ``mine`` of a camera, by rests and blocks."""
-    pixels = views.pixels[mine] / views.sigmas[mine][..., None]
-    there, resting = views.at(views.times[mine]), still[mine]
-    same = resting[1:] & resting[:-1] & (np.abs(np.diff(there, axis=0)).max(axis=1) <= ALONE)
-    found = [_noise(np.diff(pixels, axis=0)[same], 1)]
-    for order in ORDERS:
-        apart = np.diff(pixels, n=order, axis=0)
-        blocks = [
-            _noise(apart[begin : begin + NOISE_BLOCK], order) for begin in range(0, len(apart), NOISE_BLOCK)
-        ]
-        known = [one for one in blocks if math.isfinite(one)]
-        if known:
-            found.append(float(np.quantile(known, LOW)))
-    return [one for one in found if math.isfinite(one)]
+    by_order: dict[int, list[float]] = {order: [] for order in (1, *ORDERS)}
+    for c in range(len(views.cameras)):
+        mine = np.flatnonzero(views.camera == c)
+        pixels = views.pixels[mine] / views.sigmas[mine][..., None]
+        there, resting = views.at(views.times[mine]), still[mine]
+        same = resting[1:] & resting[:-1] & (np.abs(np.diff(there, axis=0)).max(axis=1) <= ALONE)
+        by_order[1].append(_noise(np.diff(pixels, axis=0)[same], 1))
+        for order in ORDERS:
+            apart = np.diff(pixels, n=order, axis=0)
+            by_order[order] += [
+                _noise(apart[begin : begin + NOISE_BLOCK], order)
+                for begin in range(0, len(apart), NOISE_BLOCK)
+            ]
+    known = [[one for one in found if math.isfinite(one)] for found in by_order.values()]
+    return max(1.0, min((float(np.quantile(found, LOW)) for found in known if found), default=1.0))
 
 
 def _noise(apart: FloatArray, order: int) -> float:
