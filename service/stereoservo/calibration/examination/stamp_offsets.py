@@ -46,13 +46,14 @@ def course(views: RecordedViews, frames: IntArray) -> Course:
         costs = np.array([_misfit(views, mine, float(late)) for late in grid])
         if not np.isfinite(costs).all():
             continue
-        least = float(costs.min())
         k = int(np.argmin(costs))
+        late, least = float(grid[k]), float(costs[k])
         if 0 < k < len(grid) - 1:
             bend = costs[k - 1] - 2.0 * costs[k] + costs[k + 1]
-            late = float(grid[k] + 0.5 * GRID_S * (costs[k - 1] - costs[k + 1]) / max(bend, 1e-300))
-            if abs(late) >= TOLD_S and (there := _misfit(views, mine, late)) <= least:
-                offsets[c], least = late, there
+            finer = late + 0.5 * GRID_S * float(costs[k - 1] - costs[k + 1]) / max(float(bend), 1e-300)
+            if (there := _misfit(views, mine, finer)) <= least:
+                late, least = finer, there
+            offsets[c] = late if abs(late) >= TOLD_S else 0.0
         left = max(left, least)
     return Course(offsets, left)
 
