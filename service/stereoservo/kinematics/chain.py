@@ -96,6 +96,14 @@ class ProjectiveChain:
         """``H(q)`` (4, 4): points at the zero to points at ``q`` (n,) (5.18)."""
         return np.array(self.partial_displacements(q)[-1])
 
+    def displacements(self, configurations: FloatArray) -> FloatArray:
+        """``H(q)`` (s, 4, 4) at each of ``configurations`` (s, n) (5.18)."""
+        steps = np.array([self._steps(q) for q in configurations]).reshape(-1, self.joints)
+        product: FloatArray = np.tile(np.eye(4), (len(steps), 1, 1))
+        for j in self.order:
+            product = product @ exp_generator(self.kinds[j], self.generators[j], steps[:, j])
+        return product
+
     def operators_at(self, q: FloatArray) -> FloatArray:
         """Generators at the present configuration, ``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4) (5.21)."""
         order = list(self.order)

@@ -104,7 +104,7 @@ def standard_deviations(model: CellModel, function: Callable[[CellModel], FloatA
 def predicted_pixels(model: CellModel, positions: FloatArray) -> FloatArray:
     """Raw pixels (c, s, m, 2) of the markers at joint ``positions`` (s, n), inside the image or not."""
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, tip_first=model.tip_first)
-    points = np.array([model.marker_points @ chain.displacement(q).T for q in positions])
+    points = model.marker_points @ chain.displacements(positions).transpose(0, 2, 1)
     pixels = []
     for camera in model.cameras:
         images = points @ camera.matrix.T

@@ -14,6 +14,7 @@ from stereoservo.calibration.examination.examined_frames import examined_frames
 from stereoservo.calibration.examination.frame_times import gaps, step_between
 from stereoservo.calibration.examination.recorded_views import single_joint_motions
 from stereoservo.calibration.examination.reference_model import frame_noise, learn_reference
+from stereoservo.calibration.examination.stamp_offsets import course
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo_sim.experiments.cameras.examined_recordings import (
@@ -23,6 +24,7 @@ from stereoservo_sim.experiments.cameras.examined_recordings import (
 )
 
 BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, STOP_MISTAKEN, DRIFTED_IN_TRIALS, POSES = 5, 11, 8, 2, 22, 7, 12
+LATE_POSES, DRIFTED_AND_RIPPLED = 5004, 5012
 """Seeds of cases; of one the fit's refusal names a stop that is wrong by five."""
 
 
@@ -34,6 +36,8 @@ BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, STOP_MISTAKEN, DRIFTED_IN_TRIALS, POSES =
         (QUIET, []),
         (BUMPED_IN_TRIALS, ["camera_moved"]),
         (STOP_MISTAKEN, ["camera_moved"]),
+        (LATE_POSES, ["late_stamps"]),
+        pytest.param(DRIFTED_AND_RIPPLED, ["joint_zero"], marks=pytest.mark.slow),
         pytest.param(POSES, ["camera_moved"], marks=pytest.mark.slow),
         pytest.param(DRIFTED_IN_TRIALS, ["joint_zero", "dropped_frames"], marks=pytest.mark.slow),
     ],
@@ -131,6 +135,19 @@ def test_a_jump_beside_the_course_of_the_joints_is_found_to_the_frame() -> None:
     assert span[0] <= jump <= span[1]
     still = step_between(views, 1, (int(mine[8]), int(mine[32])), (int(mine[15]), int(mine[26])))
     assert still.gain < 0.05 * gain
+
+
+def test_stamps_are_told_against_poses_before_any_camera_is_known() -> None:
+    """Offsets against those of the generated recording, of either half, and of a recording without any."""
+    late, plain = examined_case(LATE_POSES), examined_case(POSES).views
+    size = late.faults[0].size
+    f = len(late.views.camera)
+    for frames in (np.arange(f), np.arange(f // 2), np.arange(f // 2, f)):
+        assert course(late.views, frames).offsets == pytest.approx([0.0, size], abs=2e-3)
+    half = np.arange(len(plain.camera) // 2)
+    moved = plain.shifted(np.where(plain.camera == 0, -0.04, 0.0))
+    assert moved.stamped[moved.camera == 0] == pytest.approx(plain.times[plain.camera == 0])
+    assert course(moved, half).offsets[0] - course(plain, half).offsets[0] == pytest.approx(0.04, abs=2e-3)
 
 
 def test_the_noise_of_frames_is_that_of_the_pixels_where_the_motion_is_even() -> None:

@@ -23,7 +23,7 @@ from stereoservo.calibration.change.hypothesis_test import (
     two_best,
 )
 from stereoservo.calibration.change.model_changes import (
-    ChangeEstimate,
+    ModelChange,
     change_jacobian,
     changed_state,
     estimate_changes,
@@ -96,7 +96,7 @@ def best_change(
 ) -> ChangePoint | None:
     """The most probable significant change, None where there is none; ``middle``: a frame that the model is of."""
     here = problem.residuals_at(start_state(problem))
-    found = likely_changes(problem, views, tested, middle)
+    found = _likely_changes(problem, views, tested, middle)
     count = here.size
     limits = check_thresholds(FALSE_ALARM, len(tested) * len(views.camera), count)
     chi2 = float(here @ problem.whitened(here))
@@ -120,7 +120,21 @@ def best_change(
     return found[best]
 
 
-def likely_changes(
+def change_of(
+    problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset: int, span: tuple[int, int], x: float,
+    deviation: float,
+) -> ChangePoint:  # fmt: skip
+    """A change of one known parameter, from ``onset`` on: what it does to the pixels."""
+    frames = _frames_of(_Candidate(one, True, onset, 0.0), views, onset)
+    rows = frames[problem.data.stop]
+    part = problem.select(rows)
+    return ChangePoint(
+        one, frames, True, onset, span, np.array([x]), np.array([[deviation**2]]), rows,
+        _effect(part, (one.change,), np.array([x])), 0.0,
+    )  # fmt: skip
+
+
+def _likely_changes(
     problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], middle: int
 ) -> list[ChangePoint]:
     """The changes of the largest gain to first order, significant or not, estimated in full, the likeliest first."""
@@ -227,14 +241,14 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     covariance: FloatArray = np.linalg.pinv(estimate.information).astype(np.float64)
     return ChangePoint(
         one.hypothesis, frames, one.after, onset, span, estimate.x, covariance, rows,
-        _effect(part, estimate), ratio,
+        _effect(part, estimate.changes, estimate.x), ratio,
     )  # fmt: skip
 
 
-def _effect(part: ExaminedFrames, estimate: ChangeEstimate) -> FloatArray:
-    """Change (r, 2) [px] of the pixels, observed less predicted, by an estimated change."""
+def _effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: FloatArray) -> FloatArray:
+    """Change (r, 2) [px] of the pixels, observed less predicted, by changes ``x`` (q,)."""
     plain = replace(part, joint_slopes=np.zeros((0, len(part.order))))
-    changed = plain.residuals_at(changed_state(plain, estimate.changes, estimate.x))
+    changed = plain.residuals_at(changed_state(plain, changes, x))
     apart = (changed - plain.residuals_at(start_state(plain))).reshape(-1, 2)
     return np.asarray(apart * part.data.sigmas[:, None])
 

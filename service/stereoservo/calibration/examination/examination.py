@@ -16,36 +16,33 @@ from stereoservo.calibration.change.model_changes import change_jacobian, estima
 from stereoservo.calibration.change.model_check import NOISE_MARGIN, SENTENCES, isolated_outliers
 from stereoservo.calibration.examination.change_points import (
     FALSE_ALARM,
+    LEAST_PX,
     ChangePoint,
     best_change,
-    likely_changes,
+    change_of,
 )
 from stereoservo.calibration.examination.examined_frames import (
     ExaminedFrames,
     Hypothesis,
-    corrected_views,
     examined_frames,
     hypotheses,
 )
 from stereoservo.calibration.examination.frame_times import Gap, gaps, step_near
+from stereoservo.calibration.examination.learning_changes import learnt_and_put_right
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
-    AS_GOOD,
-    MENDS,
     LearningError,
     ReferenceModel,
-    learn_reference,
 )
 from stereoservo.calibration.shutter_offset import LEAST_DEVIATION_S
-from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 MOST_CHANGES = 8
-TRIED = 2
-"""Changes that are taken back to see whether the model is better without."""
 SAME_ONSET = 4
 """Frames within which two onsets are one."""
+CANCEL, OPEN_S = 5.0, 1e-3
+"""Deviations, or [s], up to which the sum of two changes of stamps is none."""
 AWAY = 0.2
 """Share of its largest distance from its median from which a joint is away from it."""
 MOST_GAPS = 20
@@ -140,7 +137,7 @@ def examine_views(views: RecordedViews) -> RecordingReport:
     lost = _dropped(views)
     dropped = {camera.name: gaps(views, c) for c, camera in enumerate(views.cameras)}
     try:
-        views, reference, found = _mended(views, learn_reference(views))
+        views, reference, found = learnt_and_put_right(views)
     except LearningError as failed:
         return _not_learnt(views, failed, lost, dropped)
     model = reference.model
@@ -155,7 +152,7 @@ def examine_views(views: RecordedViews) -> RecordingReport:
             break
         found.append(change)
         problem = _without(problem, change)
-    found = _merged(found)
+    found = _merged([*found, *_offsets(problem, views, tested, reference.offsets)])
     causes = [_cause(model, views, change) for change in found] + lost
     causes += _joint_errors(reference) + _unexplained(model, views, problem)
     left = _residuals_px(problem)
@@ -172,58 +169,15 @@ def _learnt_from(reference: ReferenceModel) -> tuple[int, int, int] | None:
     return None if reference.stops is None else (reference.first, reference.last, len(reference.stops.frames))
 
 
-def _mended(
-    views: RecordedViews, reference: ReferenceModel
-) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
-    """Recording and model without what happened to joints and stamps while the model was learnt: a change that, taken
-    back, makes the model scatter less.
-    """
-    found: list[ChangePoint] = []
-    while len(found) < MENDS and not reference.fits:
-        exact = msgspec.structs.replace(reference.model, joint_accuracy=None)
-        problem = examined_frames(exact, views, reference.noise_factor)
-        tested = [one for one in hypotheses(exact, views, problem) if one.kind in ("joint", "stamps")]
-        for change in likely_changes(problem, views, tested, reference.middle)[:TRIED]:
-            better = _taken_back(views, reference, change)
-            if better is not None:
-                break
-        else:
-            break
-        views, reference, change = better
-        found.append(change)
-    return views, reference, found
-
-
-def _taken_back(
-    views: RecordedViews, reference: ReferenceModel, change: ChangePoint
-) -> tuple[RecordedViews, ReferenceModel, ChangePoint] | None:
-    """Recording and model with a change taken back, and the change as it then was; None where the model is no better.
-
-    The model was learnt with the change in it and hides a part of it: the square of its scatter is a parabola of what
-    is taken back.
-    """
-    x, squares = float(change.x[0]), [reference.scatter_px**2]
-    best: tuple[RecordedViews, ReferenceModel, float] | None = None
-    for share in (1.0, 2.0, 0.0):
-        if share == 0.0:
-            bend = squares[0] - 2.0 * squares[1] + squares[2]
-            if not bend > 0.0:
-                break
-            share = 1.0 + 0.5 * (squares[0] - squares[2]) / bend
-        mended = corrected_views(views, change.hypothesis, change.frames, share * x)
-        again = None if mended is None else _learnt(mended)
-        if mended is None or again is None:
-            break
-        squares.append(again.scatter_px**2)
-        if not again.scatter_px < reference.scatter_px:
-            break
-        if best is None or again.scatter_px < best[1].scatter_px:
-            best = mended, again, share
-    if best is None or not best[1].scatter_px * AS_GOOD < reference.scatter_px:
-        return None
-    views, again, share = best
-    whole = replace(change, x=share * change.x, effect=share * change.effect)
-    return views, again, whole
+def _offsets(
+    problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], offsets: FloatArray
+) -> list[ChangePoint]:
+    """Offsets (c,) [s] of stamps that were put right before the model was learnt, as changes."""
+    return [
+        change_of(problem, views, one, 0, (0, 0), float(offsets[c]), LEAST_DEVIATION_S)
+        for c, camera in enumerate(views.cameras) if offsets[c] != 0.0
+        for one in tested if one.kind == "stamps" and one.subject == camera.name
+    ]  # fmt: skip
 
 
 def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
@@ -243,14 +197,24 @@ def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
             kept[same[0]] = replace(other, x=x, effect=effect, covariance=one.covariance)
         else:
             kept.append(one)
+    # What was put right and was not wrong is found with the opposite sign.
+    kept = [one for one in kept if one.hypothesis.kind != "stamps" or one.effect_px >= LEAST_PX]
+    for early in [one for one in kept if one.hypothesis.kind == "stamps" and not one.after]:
+        for k, one in enumerate(kept):
+            if one.hypothesis == early.hypothesis and one.after and one.onset == 0 and _cancel(one, early):
+                kept[k] = replace(
+                    one, onset=early.onset, span=early.span, frames=one.frames & ~early.frames,
+                    rows=one.rows & ~early.rows, effect=one.effect[~early.rows[one.rows]],
+                )  # fmt: skip
+                kept = [other for other in kept if other is not early]
+                break
     return kept
 
 
-def _learnt(views: RecordedViews) -> ReferenceModel | None:
-    try:
-        return learn_reference(views)
-    except (LearningError, CalibrationError):
-        return None
+def _cancel(one: ChangePoint, other: ChangePoint) -> bool:
+    """Whether two changes of stamps add to nothing."""
+    spread = float(np.sqrt(one.covariance[0, 0] + other.covariance[0, 0]))
+    return abs(float(one.x[0] + other.x[0])) <= max(CANCEL * spread, OPEN_S)
 
 
 def _when(cause: RecordingCause) -> float:
@@ -288,9 +252,9 @@ def _onset(views: RecordedViews, frame: int, span: tuple[int, int], camera: int)
     """An onset at ``frame`` among all frames, told in those of a camera."""
     mine = np.flatnonzero(views.camera == camera)
     k, first, last = (min(int(np.searchsorted(mine, one)), len(mine) - 1) for one in (frame, *span))
-    before = float(views.times[mine[k - 1]]) if k > 0 else None
+    before = float(views.stamped[mine[k - 1]]) if k > 0 else None
     return Onset(
-        views.cameras[camera].name, k, float(views.times[mine[k]]), before, first, last, int(views.episodes[mine[k]])
+        views.cameras[camera].name, k, float(views.stamped[mine[k]]), before, first, last, int(views.episodes[mine[k]])
     )  # fmt: skip
 
 

@@ -147,9 +147,7 @@ def corrected_views(
     where it is a change of another kind.
     """
     if one.kind == "stamps":
-        times = np.where(frames, views.times + x, views.times)
-        order = np.argsort(times, kind="stable")
-        return replace(views, times=times).select(order)
+        return views.shifted(np.where(frames, x, 0.0))
     if one.kind != "joint" or not frames.any():
         return None
     shown = views.times[frames]

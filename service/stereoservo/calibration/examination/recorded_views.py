@@ -38,7 +38,8 @@ class RecordedViews:
     ``times`` (f,) [s], ``numbers`` (f,) as counted by the camera, -1 where nothing counts, ``episodes`` (f,),
     ``pixels`` (f, m, 2) raw [px], NaN where a marker was not seen, ``sigmas`` (f, m) [px]. ``generators`` (n, 4, 4):
     of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
-    ``model``: one that the recording holds, for where none can be learnt.
+    ``model``: one that the recording holds, for where none can be learnt. ``added`` (f,) [s]: to the stamps, where
+    these were found wrong.
     """
 
     joint_names: tuple[str, ...]
@@ -56,6 +57,12 @@ class RecordedViews:
     generators: FloatArray | None = None
     timed: bool = True
     model: CellModel | None = None
+    added: FloatArray | None = None
+
+    @property
+    def stamped(self) -> FloatArray:
+        """Stamps (f,) [s] as recorded."""
+        return self.times if self.added is None else self.times - self.added
 
     @property
     def seen(self) -> BoolArray:
@@ -83,7 +90,14 @@ class RecordedViews:
     def select(self, frames: BoolArray | IntArray) -> RecordedViews:
         """The recording with some of its frames."""
         fields = ("camera", "times", "numbers", "episodes", "pixels", "sigmas")
-        return replace(self, **{name: getattr(self, name)[frames] for name in fields})
+        added = None if self.added is None else self.added[frames]
+        return replace(self, added=added, **{name: getattr(self, name)[frames] for name in fields})
+
+    def shifted(self, late: FloatArray) -> RecordedViews:
+        """The recording with ``late`` (f,) [s] added to its stamps, frames in their order."""
+        added = late if self.added is None else self.added + late
+        times = self.times + late
+        return replace(self, times=times, added=added).select(np.argsort(times, kind="stable"))
 
 
 def frames_apart(views: RecordedViews) -> TrialData:

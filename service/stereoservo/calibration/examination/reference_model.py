@@ -4,12 +4,16 @@ happened in the rest.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from stereoservo.calibration.calibration_result import CalibrationReport
 from stereoservo.calibration.examination.recorded_views import (
+    ALONE,
+    AT_REST,
     LearningStops,
     RecordedViews,
     instants,
@@ -17,18 +21,21 @@ from stereoservo.calibration.examination.recorded_views import (
     single_joint_motions,
     stop_positions,
 )
+from stereoservo.calibration.examination.stamp_offsets import course
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import CellModel
-from stereoservo.numerics.arrays import IntArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 AS_GOOD = 1.1
 """The whole is taken where it scatters no more than so many times the best half."""
 GOOD = 1.5
 """A model that scatters more than so many times the noise is asked whether something happened while it was learnt."""
-MENDS = 2
-"""Times that something is taken back."""
+ORDERS = 2, 4, 6
+"""Differences that the noise of the pixels is told from: of a high order little of a smooth motion is left."""
+NOISE_BLOCK, LEAST_VALUES, LOW = 80, 100, 0.25
+"""Frames of a block, differences that tell a noise, and the quantile of the blocks that is taken."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,14 @@ class ReferenceModel:
     first: int
     last: int
     noise: float
+    offsets: FloatArray
+    """(c,) [s] by which pictures were found to be later than stamped, before the model was learnt."""
+    at_rest: bool = False
+    """Whether its stops are rests, at which stamps do not matter."""
+
+    def put_right(self, views: RecordedViews) -> RecordedViews:
+        """The recording that it was learnt from, with the stamps that it was learnt with."""
+        return views.shifted(self.offsets[views.camera]) if self.offsets.any() else views
 
     @property
     def middle(self) -> int:
@@ -61,7 +76,7 @@ class ReferenceModel:
             return True
         return self.scatter_px <= GOOD * self.noise * float(np.median(self.stops.trials.sigmas))
 
-    @property
+    @cached_property
     def scatter_px(self) -> float:
         """rms deviation [px] that the model expects of a pixel at its stops, errors of the joints included."""
         if self.stops is None or self.report is None:
@@ -85,48 +100,71 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
     """
     if not len(views.camera):
         raise CalibrationError("too_few_stops", "the recording has no frame that shows a marker", stops=0)
+    none = np.zeros(len(views.cameras))
     if views.generators is None:
         if views.model is not None and _never_alone(views):
-            return ReferenceModel(views.model, None, None, -1, -1, frame_noise(views))
-        return _attempt(views, *_single_joint_stretch(views))
+            return ReferenceModel(views.model, None, None, -1, -1, frame_noise(views), none)
+        return _attempt(views, *_single_joint_stretch(views), none)
     f = len(views.camera)
-    found: list[ReferenceModel] = []
+    stretches = (0, f - 1), (0, f // 2 - 1), (f // 2, f - 1)
+    courses = [course(views, np.arange(first, last + 1)) for first, last in stretches]
+    # A stretch in which something happened has no course of its own.
+    whole, *halves = range(3)
+    halves.sort(key=lambda k: courses[k].misfit)
+    clean = courses[whole].misfit <= AS_GOOD**2 * max(1.0, courses[halves[0]].misfit)
+    order = [whole, *halves] if clean else [*halves, whole]
     failed: LearningError | None = None
-    for first, last in ((0, f - 1), (0, f // 2 - 1), (f // 2, f - 1)):
+    for k in order:
         try:
-            found.append(_attempt(views, first, last))
+            return _attempt(views, *stretches[k], courses[k].offsets)
         except LearningError as error:
             failed = failed or error
-    if not found:
-        assert failed is not None
-        raise failed
-    best = min(found, key=lambda one: one.scatter_px)
-    whole = found[0]
-    return whole if whole.scatter_px <= AS_GOOD * best.scatter_px else best
+    assert failed is not None
+    raise failed
 
 
 def frame_noise(views: RecordedViews) -> float:
-    """Noise of the pixels over the stated one: median second difference of each marker from frame to frame of a camera,
-    1 at least. An upper bound: too large by what most frames accelerate.
+    """Noise of the pixels over the stated one, 1 at least: the least that differences of a marker's pixels from frame
+    to frame of a camera tell, of even order by blocks of frames, of first order at rest. An upper bound: too large by
+    what is left of the motion there.
     """
-    apart = []
+    still = views.speeds(views.times) <= AT_REST
+    by_order: dict[int, list[float]] = {order: [] for order in (1, *ORDERS)}
     for c in range(len(views.cameras)):
-        mine = views.camera == c
-        pixels, sigmas = views.pixels[mine], views.sigmas[mine]
-        apart.append(((pixels[2:] - 2.0 * pixels[1:-1] + pixels[:-2]) / sigmas[1:-1, :, None]).ravel())
-    found = np.abs(np.concatenate(apart))
-    found = found[np.isfinite(found)]
-    return max(1.0, 1.4826 * float(np.median(found)) / np.sqrt(6.0)) if len(found) else 1.0
+        mine = np.flatnonzero(views.camera == c)
+        pixels = views.pixels[mine] / views.sigmas[mine][..., None]
+        there, resting = views.at(views.times[mine]), still[mine]
+        same = resting[1:] & resting[:-1] & (np.abs(np.diff(there, axis=0)).max(axis=1) <= ALONE)
+        by_order[1].append(_noise(np.diff(pixels, axis=0)[same], 1))
+        for order in ORDERS:
+            apart = np.diff(pixels, n=order, axis=0)
+            by_order[order] += [
+                _noise(apart[begin : begin + NOISE_BLOCK], order)
+                for begin in range(0, len(apart), NOISE_BLOCK)
+            ]
+    known = [[one for one in found if math.isfinite(one)] for found in by_order.values()]
+    return max(1.0, min((float(np.quantile(found, LOW)) for found in known if found), default=1.0))
 
 
-def _attempt(views: RecordedViews, first: int, last: int) -> ReferenceModel:
-    stops = learning_stops(views.select(np.arange(first, last + 1)))
+def _noise(apart: FloatArray, order: int) -> float:
+    """Deviation of what has differences ``apart`` of an ``order``, by their median; infinite from too few."""
+    values = np.abs(apart[np.isfinite(apart)])
+    if len(values) < LEAST_VALUES:
+        return math.inf
+    return 1.4826 * float(np.median(values)) / math.sqrt(math.comb(2 * order, order))
+
+
+def _attempt(views: RecordedViews, first: int, last: int, offsets: FloatArray) -> ReferenceModel:
+    right = views.shifted(offsets[views.camera]) if offsets.any() else views
+    stretch = right.select(np.arange(first, last + 1))
+    stops = learning_stops(stretch)
     stops = LearningStops(stops.trials, stops.frames + first)
     try:
         fit = fit_model(stops.trials, epoch=1)
-        return ReferenceModel(fit.model, fit.report, stops, first, last, frame_noise(views))
     except CalibrationError as error:
         raise LearningError(error, stops) from error
+    rest = bool((instants(stretch) < 0).any())
+    return ReferenceModel(fit.model, fit.report, stops, first, last, frame_noise(views), offsets, rest)
 
 
 def _never_alone(views: RecordedViews) -> list[str]:

@@ -1,0 +1,153 @@
+"""What happened to joints and stamps while the model of a recording was learnt: found beside a model that is free to be
+another, taken back from the recording, and the model learnt again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.change.model_changes import bounded, change_jacobian, start_state
+from stereoservo.calibration.examination.change_points import LASTING, ChangePoint, change_of
+from stereoservo.calibration.examination.examined_frames import (
+    ExaminedFrames,
+    Hypothesis,
+    corrected_views,
+    examined_frames,
+    frames_concerned,
+    hypotheses,
+)
+from stereoservo.calibration.examination.frame_times import CREDIBLE
+from stereoservo.calibration.examination.recorded_views import RecordedViews
+from stereoservo.calibration.examination.reference_model import (
+    AS_GOOD,
+    LearningError,
+    ReferenceModel,
+    learn_reference,
+)
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray, IntArray
+
+MENDS, TRIED = 2, 2
+"""Times that something is taken back, and changes that are tried for each."""
+FREE = 30.0
+"""Deviations of the model that count as one: what a change of the model explains says nothing."""
+EXPLAINS = 0.05
+"""Share of chi-square that a change must explain beside the model to be tried."""
+
+
+class _Step(NamedTuple):
+    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; ``share`` of chi-square it explains."""
+
+    hypothesis: Hypothesis
+    onset: int
+    span: tuple[int, int]
+    x: float
+    deviation: float
+    share: float
+
+
+def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
+    """Recording, with stamps and joints put right, the model learnt from it, and what was taken back. Raises
+    LearningError, CalibrationError (``bad_data``, ``too_few_stops``).
+    """
+    reference = learn_reference(views)
+    views = reference.put_right(views)
+    found: list[_Step] = []
+    while len(found) < MENDS and not reference.fits:
+        better = _better(views, reference)
+        if better is None:
+            break
+        views, reference, step = better
+        found.append(step)
+    return views, reference, [_change(views, reference, step) for step in found]
+
+
+def _better(
+    views: RecordedViews, reference: ReferenceModel
+) -> tuple[RecordedViews, ReferenceModel, _Step] | None:
+    """Recording and model without the change that explains most, None where the model is no better without."""
+    model, problem = _freed(views, reference)
+    # What is learnt at rest does not depend on stamps.
+    kinds = ("joint",) if reference.at_rest else ("joint", "stamps")
+    steps = [_step(problem, views, one) for one in hypotheses(model, views, problem) if one.kind in kinds]
+    for step in sorted(steps, key=lambda one: -one.share)[:TRIED]:
+        if step.share < EXPLAINS:
+            break
+        frames = np.zeros(len(views.camera), dtype=np.bool_)
+        concerned = frames_concerned(step.hypothesis, views)
+        frames[concerned[concerned >= step.onset]] = True
+        mended = corrected_views(views, step.hypothesis, frames, step.x)
+        again = None if mended is None else _learnt(mended)
+        if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
+            offsets = reference.offsets + again.offsets
+            return again.put_right(mended), replace(again, offsets=offsets), step
+    return None
+
+
+def _learnt(views: RecordedViews) -> ReferenceModel | None:
+    try:
+        return learn_reference(views)
+    except (LearningError, CalibrationError):
+        return None
+
+
+def _freed(views: RecordedViews, reference: ReferenceModel) -> tuple[CellModel, ExaminedFrames]:
+    """The model without errors of its joints, and the problem of all frames with that model free to change."""
+    exact = msgspec.structs.replace(reference.model, joint_accuracy=None)
+    problem = examined_frames(exact, views, reference.noise_factor)
+    root = FREE * problem.root
+    return exact, replace(problem, root=root, uncertainty=bounded(root))
+
+
+def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset: int | None = None) -> _Step:
+    """The onset of a hypothesis of one parameter that explains most, of every frame or as given (Rao's score test)."""
+    here = problem.residuals_at(start_state(problem))
+    slope = change_jacobian(problem, (one.change,), np.zeros(1), here)[:, 0]
+    concerned = frames_concerned(one, views)
+    onsets = concerned[LASTING : len(concerned) - LASTING + 1]
+    if onset is not None:
+        onsets = np.array([onset], dtype=np.int64)
+    if not len(onsets):
+        return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
+    B = problem.uncertainty
+    begin = np.searchsorted(np.repeat(problem.data.stop, 2), onsets)
+    shared = _later(slope[:, None] * B, begin)
+    moment = _later((slope * here)[:, None], begin)[:, 0] - shared @ (B.T @ here)
+    whole = _later((slope * slope)[:, None], begin)[:, 0]
+    information = whole - (shared**2).sum(axis=1)
+    known = information > 1e-9 * np.maximum(whole, 1e-300)
+    gain = np.where(known, moment**2 / np.where(known, information, 1.0), 0.0)
+    best = int(np.argmax(gain))
+    chi2 = float(here @ problem.whitened(here))
+    level = max(1.0, (chi2 - float(gain[best])) / len(here))
+    near = onsets[gain >= gain[best] - CREDIBLE * level]
+    if not known[best]:
+        return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
+    return _Step(
+        one, int(onsets[best]), (int(near[0]), int(near[-1])), float(-moment[best] / information[best]),
+        float(np.sqrt(level / information[best])), float(gain[best]) / max(chi2, 1e-300),
+    )  # fmt: skip
+
+
+def _later(rows: FloatArray, begin: IntArray) -> FloatArray:
+    """Sums (b, q) of ``rows`` (2 k, q) from each of ``begin`` (b,) on."""
+    sums = np.vstack([np.cumsum(rows[::-1], axis=0)[::-1], np.zeros((1, rows.shape[1]))])
+    return np.asarray(sums[begin])
+
+
+def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> ChangePoint:
+    """What was taken back as a change point of the recording as it now is; what is then still left of it, to first
+    order, is part of its deviation.
+    """
+    problem = examined_frames(reference.model, views, reference.noise_factor)
+    model, free = _freed(views, reference)
+    named = {(one.kind, one.subject): one for one in hypotheses(model, views, free)}
+    one = named[step.hypothesis.kind, step.hypothesis.subject]
+    left = _step(free, views, one, step.onset)
+    deviation = float(np.hypot(left.deviation, left.x)) if np.isfinite(left.deviation) else step.deviation
+    return change_of(problem, views, one, step.onset, step.span, step.x, deviation)
