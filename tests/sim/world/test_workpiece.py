@@ -303,7 +303,7 @@ def test_a_goal_on_a_workpiece_that_has_moved_is_reached_there(tmp_path: Path, i
 def point_on_plane(bench: Bench, before: np.ndarray) -> None:
     """Marker 5 goes into the plane of three markers of the workpiece that stands where it was moved to."""
     spec = IncidenceSpec("point-on-plane", Feature(markers=(5,)), Feature(markers=(15, 21, 24)))
-    target = bench.teaching.resolve_incidence(IncidenceTarget((spec,)))
+    target, _ = bench.teaching.resolve_incidence(IncidenceTarget((spec,)))
     assert set(target.incidences[0].fixed.pixels) == {"left", "right"}
     there = bench.go(target)
     corners = PART.marker_positions(PART.pose(MOVED))[[1, 7, 10]]
