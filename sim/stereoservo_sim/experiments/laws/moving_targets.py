@@ -2,7 +2,7 @@
 
 The demo's arm in lockstep. With cameras on the arm the marker body slides or swings before them, and the goal is that
 they see it where they saw it at first; with cameras that stand the workpiece slides beside the body, and the goal is
-that the body stays beside it. Judged by the truth, which the core never sees.
+that the body stays beside it. Or both ride on a turntable. Judged by the truth, which the core never sees.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import tempfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,11 +33,25 @@ from stereoservo_sim.world.workpiece import Motion, Moved, MovedFile, moved_pose
 NOISE_PX, RATE_HZ = 0.1, 30.0
 GAIN = 2.0
 LAWS: tuple[LawName, ...] = ("stereo", "cartesian3")
-MOTIONS: dict[str, tuple[float, float, float]] = {
-    "5 mm/s": (0.005, 0.0, 0.0), "20 mm/s": (0.02, 0.0, 0.0), "50 mm/s": (0.05, 0.0, 0.0),
-    "±20 mm at 0.5 Hz": (0.0, 0.02, 0.5),
+
+
+class Way(NamedTuple):
+    """How a target moves: along a line at ``speed`` [m/s], swinging by ``amplitude`` [m] at ``hz`` [Hz], or on a
+    turntable at ``turn`` [rad/s].
+    """
+
+    speed: float = 0.0
+    amplitude: float = 0.0
+    hz: float = 0.0
+    turn: float = 0.0
+
+
+MOTIONS = {
+    "5 mm/s": Way(0.005), "20 mm/s": Way(0.02), "50 mm/s": Way(0.05), "±20 mm at 0.5 Hz": Way(0.0, 0.02, 0.5),
+    "turns at 0.1 rad/s": Way(turn=0.1), "turns at 0.3 rad/s": Way(turn=0.3), "turns at 0.5 rad/s": Way(turn=0.5),
 }  # fmt: skip
-"""By name: speed [m/s], amplitude [m], frequency [Hz]."""
+RADIUS_M, TILT = 0.1, 0.1
+"""Of a target on a turntable from its axis, and of the axis from the line of sight, at most [rad]."""
 REST_S, SETTLE_S, JUDGED_S = 1.0, 2.0, 2.0
 """The target stands; then it moves: until the error is judged, and for so long."""
 STEADY_PX = 1.0
@@ -88,6 +102,7 @@ def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict
             f"exact model, {NOISE_PX:g} px noise a marker, cameras at {RATE_HZ:g} Hz, loop at 250 Hz, gain {GAIN:g}/s",
             f"errors are judged from {SETTLE_S:g} s after the target sets out, for {JUDGED_S:g} s, over all markers in "
             "both cameras, by the truth",
+            f"turntables: {RADIUS_M:g} m from the axis, which leaves the line of sight by {TILT:g} rad at most",
             "followed: with follow_markers; else as a goal that stands",
         ],
     }
@@ -108,21 +123,56 @@ def cell_of(mount: Mount) -> CellFile:
     )
 
 
-def motion_of(name: str, direction: FloatArray, since_ns: int) -> Motion:
-    """One of `MOTIONS` along a unit vector (3,) in the world."""
-    speed, amplitude, hz = MOTIONS[name]
-    v, a = (speed * direction).tolist(), (amplitude * direction).tolist()
-    return Motion(velocity_m_s=(v[0], v[1], v[2]), swing_m=(a[0], a[1], a[2]), swing_hz=hz, since_ns=since_ns)
+def motion_of(cell: SimulatedCell, name: str, seed: int, since_ns: int) -> Motion:
+    """One of `MOTIONS` in a cell, along, or about, what the seed says."""
+    way = MOTIONS[name]
+    if way.turn:
+        return turntable_of(cell, way.turn, seed, since_ns)
+    direction = direction_of(cell, seed)
+    return Motion(
+        velocity_m_s=_three(way.speed * direction), swing_m=_three(way.amplitude * direction), swing_hz=way.hz,
+        since_ns=since_ns,
+    )  # fmt: skip
 
 
 def direction_of(cell: SimulatedCell, seed: int) -> FloatArray:
     """A direction (3,) in the world: to the right in the images, and less so up or down, nearer or farther."""
+    up, far = np.random.default_rng([seed, 19]).uniform(-0.4, 0.4, 2)
+    found: FloatArray = _camera_to_world(cell) @ np.array([1.0, up, far]) / np.sqrt(1.0 + up * up + far * far)
+    return found
+
+
+def turntable_of(cell: SimulatedCell, turn: float, seed: int, since_ns: int) -> Motion:
+    """A turntable that turns at ``turn`` [rad/s], either way, its axis `RADIUS_M` beside the target and nearly along
+    the line of sight: anywhere round a target before cameras on the arm; beside a workpiece on the body's side, so that
+    the arm reaches the body's place all the way.
+    """
+    rng = np.random.default_rng([seed, 29])
+    to_world = _camera_to_world(cell)
+    axis = to_world @ np.array([*rng.uniform(-TILT, TILT, 2), 1.0])
+    axis *= rng.choice((-1.0, 1.0)) / np.linalg.norm(axis)
+    beside = to_world @ np.array([*rng.standard_normal(2), 0.0])
+    part = cell.workpiece
+    if part is not None:
+        middle = part.marker_positions(part.stand).mean(axis=0)
+        beside = cell.marker_positions(cell.base).mean(axis=0) - middle
+    beside = beside - axis * float(axis @ beside)
+    return Motion(
+        turn_rate_deg_s=_three(np.rad2deg(turn) * axis), about_m=_three(RADIUS_M * beside / np.linalg.norm(beside)),
+        since_ns=since_ns,
+    )  # fmt: skip
+
+
+def _camera_to_world(cell: SimulatedCell) -> FloatArray:
     camera_to_world = np.linalg.inv(cell.rig.world_to_rig)[:3, :3]
     if cell.stand is not None:
         camera_to_world = cell.flange(cell.base)[:3, :3] @ camera_to_world
-    up, far = np.random.default_rng([seed, 19]).uniform(-0.4, 0.4, 2)
-    found: FloatArray = camera_to_world @ np.array([1.0, up, far]) / np.sqrt(1.0 + up * up + far * far)
-    return found
+    return np.asarray(camera_to_world)
+
+
+def _three(vector: FloatArray) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -> Followed:
@@ -153,7 +203,7 @@ def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -
         cell.submit(RunGoal(goal))
         cell.run_for(REST_S)
         since_ns = cell.clock.now_ns()
-        motion = motion_of(name, direction_of(world, seed), since_ns)
+        motion = motion_of(world, name, seed, since_ns)
         MovedFile(Path(scratch)).write(motion)
         cell.run_for(SETTLE_S + JUDGED_S)
         ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
@@ -204,12 +254,20 @@ def _errors(world: SimulatedCell, moved: Moved, q: FloatArray) -> FloatArray:
     found = []
     for camera in world.rig.cameras:
         wanted = world.marker_positions(world.base)
-        if world.stand is None:  # translations alone
-            wanted = wanted + moved.matrix[:3, 3]
+        if world.stand is None:
+            wanted = _carried(world, wanted, moved)
         goal = world.in_world(camera, world.base).image_of(wanted)[0]
         seen = here.in_world(camera, q).image_of(here.marker_positions(q))[0]
         found.append(np.linalg.norm(seen - goal, axis=-1))
     return np.array(found)
+
+
+def _carried(world: SimulatedCell, points: FloatArray, moved: Moved) -> FloatArray:
+    """Points (m, 3) that go with the workpiece."""
+    part = world.workpiece
+    assert part is not None
+    D = part.pose(moved) @ np.linalg.inv(part.stand)
+    return np.asarray(points @ D[:3, :3].T + D[:3, 3])
 
 
 def draw_moving_targets(answer: dict[str, Any], folder: Path) -> list[Path]:
