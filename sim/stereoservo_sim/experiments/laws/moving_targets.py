@@ -1,15 +1,17 @@
-"""Experiment: targets that move by themselves, followed by cameras on the arm and before cameras that stand.
+"""Experiment: targets that move by themselves, followed by cameras on the arm, on a pan-tilt head, and before cameras
+that stand.
 
-The demo's arm in lockstep. With cameras on the arm the marker body slides or swings before them, and the goal is that
-they see it where they saw it at first; with cameras that stand the workpiece slides beside the body, and the goal is
-that the body stays beside it. Or both ride on a turntable. Judged by the truth, which the core never sees.
+The demo's arm, or the head (thesis 4.5.4), in lockstep. With cameras on the arm the marker body slides or swings before
+them, and the goal is that they see it where they saw it at first; with cameras that stand the workpiece slides beside
+the body, and the goal is that the body stays beside it. Or both ride on a turntable. The two freedoms of a head keep
+one marker where it was in one camera. Judged by the truth, which the core never sees.
 """
 
 from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,21 +20,27 @@ import numpy as np
 
 from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
 from stereoservo.daemon.lockstep import LockstepCell
-from stereoservo.messages.cell_file import CellFile, Mount, load_cell_file
+from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.messages.goals import FeatureTarget, Goal, LawName, RunGoal
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
+from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.experiments.laws.driven_tasks import labelled, picture, saved
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.simulated_cell import SimulatedCell, hand_cell, workpiece_cell
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.workpiece import Motion, Moved, MovedFile, moved_pose
 
 NOISE_PX, RATE_HZ = 0.1, 30.0
 GAIN = 2.0
-LAWS: tuple[LawName, ...] = ("stereo", "cartesian3")
+ON_THE_ARM, STANDING, ON_A_HEAD = "on the arm", "standing", "on a pan-tilt head"
+CELLS = {ON_THE_ARM: "eye_in_hand", STANDING: "workpiece", ON_A_HEAD: "pan_tilt"}
+"""Where the cameras are, and the shipped cell with them there."""
+LAWS: dict[str, tuple[LawName, ...]] = {
+    ON_THE_ARM: ("stereo", "cartesian3"), STANDING: ("stereo", "cartesian3"), ON_A_HEAD: ("image",),
+}  # fmt: skip
 
 
 class Way(NamedTuple):
@@ -70,20 +78,19 @@ class Followed:
 
 
 def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Every mount, law and motion with ``seeds`` seeds from ``seed`` on; the JSON object of the command."""
+    """Every place, law and motion with ``seeds`` seeds from ``seed`` on; the JSON object of the command."""
     rows: list[dict[str, Any]] = []
-    mounts: tuple[Mount, ...] = ("eye_in_hand", "eye_to_hand")
-    conditions = [(mount, law, name, True) for mount in mounts for law in LAWS for name in MOTIONS]
-    conditions += [("eye_in_hand", "stereo", name, False) for name in MOTIONS]
-    for k, (mount, law, name, follows) in enumerate(conditions):
+    conditions = [(place, law, name, True) for place in CELLS for law in LAWS[place] for name in MOTIONS]
+    conditions += [(ON_THE_ARM, "stereo", name, False) for name in MOTIONS]
+    for k, (place, law, name, follows) in enumerate(conditions):
         flown = []
         for s in range(seeds):
             progress("conditions and seeds", k * seeds + s, len(conditions) * seeds)
-            flown.append(follow(mount, law, name, seed + s, follows=follows))
+            flown.append(follow(place, law, name, seed + s, follows=follows))
         steady = sum(one.largest_px <= STEADY_PX and not one.ended for one in flown)
         rows.append(
             {
-                "cameras": "on the arm" if mount == "eye_in_hand" else "standing",
+                "cameras": place,
                 "law": law,
                 "target": name,
                 "followed": follows,
@@ -103,24 +110,34 @@ def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict
             f"errors are judged from {SETTLE_S:g} s after the target sets out, for {JUDGED_S:g} s, over all markers in "
             "both cameras, by the truth",
             f"turntables: {RADIUS_M:g} m from the axis, which leaves the line of sight by {TILT:g} rad at most",
+            "on a pan-tilt head: one marker in the first camera, by its image alone",
             "followed: with follow_markers; else as a goal that stands",
         ],
     }
 
 
-def cell_of(mount: Mount) -> CellFile:
-    """A shipped cell with fakes for arm and cameras."""
-    cell = load_cell_file(shipped_cell_path("eye_in_hand" if mount == "eye_in_hand" else "workpiece"))
+@lru_cache(maxsize=len(CELLS))
+def world_of(place: str) -> SimulatedCell:
+    """The simulated world of the shipped cell with its cameras in a place of `CELLS`."""
+    path = shipped_cell_path(CELLS[place])
+    return true_cell(load_cell_file(path), path.parent)
+
+
+def cell_of(place: str) -> CellFile:
+    """That cell with fakes for arm and cameras."""
+    cell = load_cell_file(shipped_cell_path(CELLS[place]))
     options: dict[str, Any] = {"noise_px": NOISE_PX, "rate_hz": RATE_HZ}
-    if mount == "eye_to_hand":
+    if place == STANDING:
         options["workpiece"] = True
     cameras = tuple(
         msgspec.structs.replace(camera, driver="fake", detector=None, detector_options={}, options=options)
         for camera in cell.camera
     )
     return msgspec.structs.replace(
-        cell, camera=cameras, joints=msgspec.structs.replace(cell.joints, driver="fake", options={})
-    )
+        cell, camera=cameras, joints=msgspec.structs.replace(
+            cell.joints, driver="fake", options=cell.joints.options if place == ON_A_HEAD else {}
+        )
+    )  # fmt: skip
 
 
 def motion_of(cell: SimulatedCell, name: str, seed: int, since_ns: int) -> Motion:
@@ -175,9 +192,10 @@ def _three(vector: FloatArray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -> Followed:
+def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> Followed:
     """Follow a target that moves in one way; deterministic given the seed."""
-    world = hand_cell() if mount == "eye_in_hand" else workpiece_cell()
+    world = world_of(place)
+    judged_by = _judged_by(place, world)
     history = TrueJointHistory.in_memory(len(world.base), capacity=1 << 14)
     seen: list[tuple[int, FloatArray]] = []
     verdicts: set[str] = set()
@@ -191,7 +209,7 @@ def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -
     with (
         tempfile.TemporaryDirectory(prefix="stereoservo-moving-") as scratch,
         LockstepCell(
-            cell_of(mount), cell_dir=Path(scratch), runtime_dir=Path(scratch), seed=seed,
+            cell_of(place), cell_dir=Path(scratch), runtime_dir=Path(scratch), seed=seed,
             services={"world": history}, on_step=watch,
         ) as cell,
     ):  # fmt: skip
@@ -199,7 +217,7 @@ def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -
         LockstepOperator(cell, seed=seed).enable()
         cell.update_model(ModelUpdate(exact_simulated_model(world, seed)))
         cell.run_for(0.5)
-        goal = _goal(world, law, follows)
+        goal = _goal(world, law, follows, judged_by)
         cell.submit(RunGoal(goal))
         cell.run_for(REST_S)
         since_ns = cell.clock.now_ns()
@@ -208,18 +226,35 @@ def follow(mount: Mount, law: LawName, name: str, seed: int, *, follows: bool) -
         cell.run_for(SETTLE_S + JUDGED_S)
         ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
     judged = [(t, q) for t, q in seen if t >= since_ns + round(SETTLE_S * 1e9)]
-    errors = np.array([_errors(world, motion.at(t), q) for t, q in judged[::3]])
+    errors = np.array([_errors(world, motion.at(t), q)[judged_by] for t, q in judged[::3]])
     return Followed(
         float(errors.max()), float(np.sqrt((errors**2).mean())), tuple(sorted(verdicts)),
         "; ".join(reason.code for event in ends for reason in event.reasons),
     )  # fmt: skip
 
 
-def _goal(world: SimulatedCell, law: LawName, follows: bool) -> Goal:
-    """What is seen now, relative to the target where it is now."""
+def _judged_by(place: str, world: SimulatedCell) -> BoolArray:
+    """Markers of cameras (c, m) that the goal shows: all; of a head the one in the middle of the first camera."""
+    if place != ON_A_HEAD:
+        return np.ones((len(world.rig.cameras), len(world.body.ids)), dtype=bool)
+    first = world.rig.cameras[0]
+    pixels = world.truth_pixels(world.base)[first.name]
+    off = np.linalg.norm(pixels - pixels.mean(axis=0), axis=1)
+    off[~world.visible(world.base, first)] = np.inf
+    chosen = np.zeros((len(world.rig.cameras), len(pixels)), dtype=bool)
+    chosen[0, int(off.argmin())] = True
+    return chosen
+
+
+def _goal(world: SimulatedCell, law: LawName, follows: bool, shown: BoolArray) -> Goal:
+    """What is seen now of the markers ``shown`` (c, m), relative to the target where it is now."""
     named = partial(_named, decimals=6)
     target = FeatureTarget(
-        {camera: named(world.body.ids, pixels) for camera, pixels in world.truth_pixels(world.base).items()}
+        {
+            camera: named(world.body.ids[shown[c]], pixels[shown[c]])
+            for c, (camera, pixels) in enumerate(world.truth_pixels(world.base).items())
+            if shown[c].any()
+        }
     )
     goal = Goal(
         "0000abcd", target, law=law, gain=GAIN, tolerance_px=0.06 if follows else 0.001, time_limit_s=600.0
