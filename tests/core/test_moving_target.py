@@ -5,8 +5,10 @@ carried through drop-outs. The truth is Euclidean, conjugated into a random proj
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -26,6 +28,7 @@ from stereoservo.core.target.motion import (
     solve_into,
     turns_about,
 )
+from stereoservo.core.target.track import restart, tell_untrackable
 from stereoservo.kinematics.kernels import image_jacobian, project_points, transform_points
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 
@@ -181,6 +184,31 @@ def test_a_goal_that_cannot_follow_is_refused_with_its_cause(benches: Any) -> No
     target = FeatureTarget(standing.features(standing.q))
     reply = standing.reply(RunGoal(Goal("00000003", target, follow_markers=(1, 20, 21, 22, 23))))
     assert (reply.accepted, reply.reasons[0].subject) == (False, "1")
+
+
+@pytest.mark.parametrize(("joints", "warned"), [(6, []), (2, ["TARGET_NOT_TRACKABLE"])])
+def test_a_body_said_to_move_that_the_model_cannot_follow_is_told(
+    benches: Any, joints: int, warned: list[str]
+) -> None:
+    """Two joints and no metric model tell no displacements of the body; six joints do."""
+    bench, told = benches(0, mount="eye_in_hand"), list[str]()
+    settings = msgspec.structs.replace(bench.settings, body_moves=True)
+    model = msgspec.structs.replace(
+        bench.truth.model, stratum="affine", projective_to_euclidean=None,
+        generators=bench.truth.model.generators[:joints],
+    )  # fmt: skip
+    state = ServoCore(settings).state
+    state.model = model
+    arrays = SimpleNamespace(
+        metric_basis=None, generators=model.generators, ids=np.arange(8), marker_points=model.marker_points
+    )
+    restart(state, cast(Any, arrays), settings)
+
+    def emit(kind: str, message: str, reasons: Any) -> None:
+        told.append(reasons[0].code)
+
+    tell_untrackable(cast(Any, SimpleNamespace(state=state, settings=settings, emit=emit)))
+    assert told == warned
 
 
 # -- the filter's arithmetic -----------------------------------------------------------------------------------
