@@ -206,7 +206,8 @@ def test_a_body_that_moves_by_itself_is_no_fault() -> None:
         examined = examine_model(cell.model(0), data, made_from=cell.made_from)
         standing, moving = make_check_report(examined), make_check_report(examined, body_moves=True)
         assert "body" in [cause.kind for cause in standing.causes]
-        assert [cause.subject for cause in moving.causes] == ([cell.cell.joint_names[1]] if drift else [])
+        grave = [cause.subject for cause in moving.causes if cause.effect_px > moving.limit_px]
+        assert grave == ([cell.cell.joint_names[1]] if drift else [])
         assert (moving.status == "holds") == (drift == 0.0)
         assert "as [scene] moves says" in moving.message
         assert all(found.kind != "body" for found in moving.drifts)
