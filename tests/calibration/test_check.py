@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binom, chi2
 
 from stereoservo.calibration.bundle_adjustment import solve
-from stereoservo.calibration.change.model_check import check_model_holds
+from stereoservo.calibration.change.model_check import check_model_holds, examine_model, make_check_report
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
@@ -190,6 +190,27 @@ def test_an_injected_cause_is_named(cause: str, seeds: int) -> None:
     assert named >= seeds - 1, named
     if pulls:
         assert np.square(pulls).sum() < chi2.isf(1e-3, len(pulls))
+
+
+def test_a_body_that_moves_by_itself_is_no_fault() -> None:
+    """Of a part that a belt has carried elsewhere nothing is to be cured; a joint's drift beside it is still named."""
+    cell, stops = arm(), arm().stops()
+    elsewhere, _, _, _ = injected(cell.cell, "body", np.random.default_rng(0))
+    for drift in (0.0, 0.01):
+        offset = np.zeros(len(cell.cell.kinds))
+        offset[1] = drift
+        data = elsewhere.trials(
+            SIGMA, np.random.default_rng(1), positions=(stops + offset, np.full(len(stops), -1)), stated=SIGMA
+        )
+        data = msgspec.structs.replace(data, positions=stops)
+        examined = examine_model(cell.model(0), data, made_from=cell.made_from)
+        standing, moving = make_check_report(examined), make_check_report(examined, body_moves=True)
+        assert "body" in [cause.kind for cause in standing.causes]
+        grave = [cause.subject for cause in moving.causes if cause.effect_px > moving.limit_px]
+        assert grave == ([cell.cell.joint_names[1]] if drift else [])
+        assert (moving.status == "holds") == (drift == 0.0)
+        assert "as [scene] moves says" in moving.message
+        assert all(found.kind != "body" for found in moving.drifts)
 
 
 @pytest.mark.parametrize("seeds", [40, pytest.param(80, marks=pytest.mark.slow)])

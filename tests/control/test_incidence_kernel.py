@@ -48,7 +48,7 @@ def test_kernel_is_the_reference(virtual, composition):
         ]  # fmt: skip
         task = IncidenceTask(
             np.concatenate([t.kinds for t in tasks]), np.concatenate([t.markers for t in tasks]),
-            np.concatenate([t.fixed for t in tasks]), 0.1,
+            np.concatenate([t.fixed for t in tasks]), 0.1, float(rng.integers(2)) * 0.02 * rng.standard_normal((4, 4)),
         )  # fmt: skip
         set_points = world.pixels(virtual.PLATE @ T1.T)
         second = (

@@ -5,12 +5,15 @@ carried through drop-outs. The truth is Euclidean, conjugated into a random proj
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
-from core.conftest import BASE, flange_at
+from core.conftest import BASE, flange_at, twist
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.core.target.motion import (
@@ -25,6 +28,7 @@ from stereoservo.core.target.motion import (
     solve_into,
     turns_about,
 )
+from stereoservo.core.target.track import restart, tell_untrackable
 from stereoservo.kinematics.kernels import image_jacobian, project_points, transform_points
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 
@@ -34,11 +38,21 @@ MARKERS = tuple(range(8))
 
 def slide(bench: Any, way: Callable[[float], np.ndarray]) -> None:
     """The body before the cameras goes along ``way`` (3,) [m] in the world, by the seconds from now."""
+
+    def displacement(t: float) -> np.ndarray:
+        D = np.eye(4)
+        D[:3, 3] = way(t)
+        return D
+
+    ride(bench, displacement)
+
+
+def ride(bench: Any, way: Callable[[float], np.ndarray]) -> None:
+    """The body before the cameras is displaced by ``way`` (4, 4) in the world, by the seconds from now."""
     begin_ns, markers = bench.now_ns, bench.truth.markers
 
     def points(q: np.ndarray) -> np.ndarray:
-        D = np.eye(4)
-        D[:3, 3] = way((bench.now_ns - begin_ns) * 1e-9)
+        D = way((bench.now_ns - begin_ns) * 1e-9)
         return (np.linalg.inv(flange_at(q)) @ D @ flange_at(BASE) @ markers.T).T[:, :3]
 
     bench.truth.points = points
@@ -80,6 +94,23 @@ def test_a_target_that_slides_is_followed_and_no_other_cause_is_named(benches: A
     assert largest_px(bench, wanted, 1.0) < 1.5
     assert verdicts(bench) == set()
     assert bench.core.state.source.goal.id == "00000001"  # it goes on as long as the target does
+
+
+@pytest.mark.parametrize("turn", [-0.3, 0.5])
+def test_a_target_on_a_turntable_is_followed(benches: Any, turn: float) -> None:
+    """100 mm from an axis that is nearly the line of sight."""
+    bench, wanted = following(benches, 6)
+    bench.run(0.4)
+    hand = flange_at(BASE)
+    axis = hand[:3, :3] @ np.array([0.08, -0.05, 1.0])
+    middle = (hand @ bench.truth.markers.T).T[:, :3].mean(axis=0)
+    G = twist(axis / np.linalg.norm(axis), middle + 0.1 * hand[:3, 0])
+    ride(bench, lambda t: np.asarray(expm(t * turn * G)))
+    bench.run(2.0)
+    largest = largest_px(bench, wanted, 1.0)
+    print(f"{turn:+.1f} rad/s: {largest:.2f} px")
+    assert largest < 1.0
+    assert verdicts(bench) == set()
 
 
 def test_without_its_name_the_same_target_is_lost(benches: Any) -> None:
@@ -153,6 +184,31 @@ def test_a_goal_that_cannot_follow_is_refused_with_its_cause(benches: Any) -> No
     target = FeatureTarget(standing.features(standing.q))
     reply = standing.reply(RunGoal(Goal("00000003", target, follow_markers=(1, 20, 21, 22, 23))))
     assert (reply.accepted, reply.reasons[0].subject) == (False, "1")
+
+
+@pytest.mark.parametrize(("joints", "warned"), [(6, []), (2, ["TARGET_NOT_TRACKABLE"])])
+def test_a_body_said_to_move_that_the_model_cannot_follow_is_told(
+    benches: Any, joints: int, warned: list[str]
+) -> None:
+    """Two joints and no metric model tell no displacements of the body; six joints do."""
+    bench, told = benches(0, mount="eye_in_hand"), list[str]()
+    settings = msgspec.structs.replace(bench.settings, body_moves=True)
+    model = msgspec.structs.replace(
+        bench.truth.model, stratum="affine", projective_to_euclidean=None,
+        generators=bench.truth.model.generators[:joints],
+    )  # fmt: skip
+    state = ServoCore(settings).state
+    state.model = model
+    arrays = SimpleNamespace(
+        metric_basis=None, generators=model.generators, ids=np.arange(8), marker_points=model.marker_points
+    )
+    restart(state, cast(Any, arrays), settings)
+
+    def emit(kind: str, message: str, reasons: Any) -> None:
+        told.append(reasons[0].code)
+
+    tell_untrackable(cast(Any, SimpleNamespace(state=state, settings=settings, emit=emit)))
+    assert told == warned
 
 
 # -- the filter's arithmetic -----------------------------------------------------------------------------------

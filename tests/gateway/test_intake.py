@@ -85,8 +85,10 @@ class StubTeaching:
             raise TransferError("marker 12 is 8.3 px off")
         return TransferredGoal(FeatureTarget(POINTS, 7), "known to 0.1 px")
 
-    def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
-        return target
+    def resolve_incidence(
+        self, target: IncidenceTarget, follow: tuple[int, ...]
+    ) -> tuple[IncidenceTarget, dict[str, dict[int, tuple[float, float]]]]:
+        return target, {}
 
     def expect(self, request: int, tool: tuple[int, ...]) -> None:
         self.expected.append((request, tool))

@@ -116,7 +116,8 @@ def test_standing_markers_of_an_incidence_become_their_pixels_of_now(bench: Benc
     ):
         bench.teaching.resolve_incidence(target)
     bench.show(placed(WORK, TABLE))
-    found = bench.teaching.resolve_incidence(target)
+    found, seen = bench.teaching.resolve_incidence(target)
+    assert seen == {}
     pixels = Cameras().pixels(placed(WORK, TABLE))
     assert found.incidences[1] == pointed
     assert found.incidences[0].moving == pin
@@ -125,6 +126,10 @@ def test_standing_markers_of_an_incidence_become_their_pixels_of_now(bench: Benc
     bench.show(placed(WORK, some_pose(np.random.default_rng(4))))
     with pytest.raises(TransferError, match="markers 10, 11 of a fixed feature move now"):
         bench.teaching.resolve_incidence(target)
+    found, seen = bench.teaching.resolve_incidence(target, (10, 11, 12, 77))
+    for camera, pixel in found.incidences[0].fixed.pixels.items():
+        assert seen[camera][10] == pixel[0]
+        assert sorted(seen[camera]) == [10, 11, 12]
 
 
 def test_a_goal_that_cannot_be_written_is_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

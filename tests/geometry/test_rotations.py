@@ -17,7 +17,7 @@ from oracles.jordan_frames import (
 )
 from stereoservo.geometry.cameras import project_many, triangulate
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.rotation_fit import bundle_rotation, refine_rotation, rotation_motion
+from stereoservo.geometry.rotation_fit import bundle_rotation, rotation_motion
 from stereoservo.geometry.rotations import (
     RotationChart,
     rotation_chart,
@@ -260,38 +260,32 @@ def start(truth, seed, size=0.02):
 
 def test_exact_pixels_give_the_exact_generator(rig):
     truth, Ps, M, exact = scene(rig, 1)
-    for fit in (refine_rotation, bundle_rotation):
-        found = fit(Ps, exact, M, start(truth, 1), ANGLES, 0.3)
-        assert np.abs(found.generator - truth.generator).max() < 1e-6
-        assert found.cost < 1e-6
-        assert np.allclose(rotation_from_parameters(found.parameters, found.chart), found.generator)
+    found = bundle_rotation(Ps, exact, M, start(truth, 1), ANGLES, 0.3)
+    assert np.abs(found.generator - truth.generator).max() < 1e-6
+    assert found.cost < 1e-6
+    assert np.allclose(rotation_from_parameters(found.parameters, found.chart), found.generator)
 
 
 def test_fits_reach_the_cramer_rao_bound_and_say_so(rig):
     """Normalised squared errors of the generator, and costs, pooled over 60 seeds: chi-square at 1 %."""
     sigma, runs = 0.3, 60
-    pooled = {"known points": [0.0, 0.0, 0], "free points": [0.0, 0.0, 0]}
+    normalised, cost, freedom = 0.0, 0.0, 0
     for seed in range(runs):
-        truth, Ps, M, exact = scene(rig, seed)
+        truth, Ps, _, exact = scene(rig, seed)
         rng = np.random.default_rng(seed)
         pixels = exact + rng.normal(0, sigma, exact.shape)
         pixels[2, 1, 3] = np.nan
         middle = triangulate(Ps, pixels[3], sigma)
-        fits = {
-            "known points": refine_rotation(Ps, pixels, M, start(truth, seed), ANGLES, sigma),
-            "free points": bundle_rotation(Ps, pixels, middle, start(truth, seed), ANGLES, sigma),
-        }
-        for name, fit in fits.items():
-            error = fit.parameters - rotation_parameters(truth.generator, fit.chart)
-            pooled[name][0] += error @ np.linalg.solve(fit.covariance, error)
-            pooled[name][1] += fit.cost
-            pooled[name][2] += fit.freedom
-            assert np.linalg.matrix_rank(fit.generator_covariance, tol=1e-12) <= 10
-    for name, (normalised, cost, freedom) in pooled.items():
-        low, high = chi2.ppf([0.005, 0.995], 10 * runs)
-        assert low < normalised < high, (name, normalised / (10 * runs))
-        low, high = chi2.ppf([0.005, 0.995], freedom)
-        assert low < cost < high, (name, cost / freedom)
+        fit = bundle_rotation(Ps, pixels, middle, start(truth, seed), ANGLES, sigma)
+        error = fit.parameters - rotation_parameters(truth.generator, fit.chart)
+        normalised += error @ np.linalg.solve(fit.covariance, error)
+        cost += fit.cost
+        freedom += fit.freedom
+        assert np.linalg.matrix_rank(fit.generator_covariance, tol=1e-12) <= 10
+    low, high = chi2.ppf([0.005, 0.995], 10 * runs)
+    assert low < normalised < high, normalised / (10 * runs)
+    low, high = chi2.ppf([0.005, 0.995], freedom)
+    assert low < cost < high, cost / freedom
 
 
 def test_a_flat_scene_will_do(rig):
@@ -321,4 +315,4 @@ def test_what_cannot_be_fitted_is_refused(rig):
     still = np.tile(on_axis, (len(M), 1)) + 1e-9 * M
     images = np.stack([project_many(Ps, still @ truth.turn(a).T) for a in ANGLES])
     with pytest.raises((GeometryError), match=r"undetermined|coplanar"):
-        refine_rotation(Ps, images, still, G, ANGLES, 0.3)
+        bundle_rotation(Ps, images, still, G, ANGLES, 0.3)

@@ -110,7 +110,12 @@ def incidence_reference(
         if predicted <= 1e-12 * float(e @ e) or float(e @ e) - left >= kernels.SUFFICIENT * predicted:
             break
         damp = max(kernels.GROWTH * damp, 1e-3 * sigma[0] ** 2)
-    velocity = options.gain * step
+    rates = np.concatenate([r.normal @ r.gradient @ task.drift @ scene.points[r.marker] for r in residuals])
+    fed = np.zeros(n)
+    fed[: len(values)] = values * (U[:, : len(values)].T @ rates)
+    fed[rank:] = 0.0
+    forward = Vt.T @ (fed / (sigma**2 + options.damping * sigma[0] ** 2)) / metric
+    velocity = options.gain * step + forward
     if rank < n and len(second.rates):
         S = (second.rows / metric) @ (Vt[rank:].T @ Vt[rank:])
         left_over = second.rates - second.rows @ velocity

@@ -1,27 +1,256 @@
-"""Command ``stereoservo home``: moves every joint to the cell's home position."""
+"""Command ``stereoservo home``: moves every joint to the cell's home position; by the pictures, where the joints' zeros
+are unknown or wrong (thesis 4.5.4, 4.5.5).
+"""
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from stereoservo.cli import interruption
 from stereoservo.cli.goal.command import follow
-from stereoservo.cli.output import CellArgument, EndpointOption, JsonOption, OperatorOption
+from stereoservo.cli.ik import OWN_SIGMA_PX, LearntArm, learnt_arm
+from stereoservo.cli.output import (
+    CellArgument,
+    CommandError,
+    EndpointOption,
+    JsonOption,
+    OperatorOption,
+    emit,
+    note,
+    note_hold,
+)
 from stereoservo.client import Client
+from stereoservo.messages.goals import JointTarget
+from stereoservo.messages.wire import FeaturesMessage
+
+if TYPE_CHECKING:
+    from stereoservo.kinematics.joint_angles import JointZeros
+    from stereoservo.numerics.arrays import FloatArray
+
+SPEED = 0.5
+"""Share of the joints' velocities, as without pictures."""
+FRAMES, LOOK_S, SETTLE_S = 15, 5.0, 0.4
+"""Frames of each camera that a look averages, the longest that it takes, and how long the arm rests before it."""
+LOOKS = 6
+PROBE = 0.15
+"""Longest way of a joint [rad or m] before the looks agree on one answer."""
+AGREES = 5.0
+"""Deviations within which zeros count as right."""
+
+
+class Look(NamedTuple):
+    """Readings of the joints (n,), raw pixels (c, m, 2) of the markers, NaN where unseen, deviations (c, m) [px]."""
+
+    readings: FloatArray
+    pixels: FloatArray
+    sigmas: FloatArray
 
 
 def home(
     cell: CellArgument,
+    by_vision: Annotated[
+        bool,
+        typer.Option(
+            "--by-vision", help="By the pictures of the home posture; tells by what each zero is off."
+        ),
+    ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="With --by-vision: only tell the zeros; nothing moves.")
+    ] = False,
     speed_scale: Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")] = 1.0,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Move every joint to the cell's home position. Ctrl-C cancels."""
-    with (
-        Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client,
-        client.home(speed_scale) as handle,
-    ):
-        follow(handle, json, client.cell)
+    """Move every joint to the cell's home position. Ctrl-C cancels.
+
+    With --by-vision, on the cell's host, to where the cameras see what the model says they see there, whatever the
+    encoders read.
+    """
+    if check and not by_vision:
+        raise CommandError(
+            "usage", "--check goes with --by-vision; without pictures `home` has nothing to tell"
+        )
+    if by_vision and endpoint is not None:
+        raise CommandError(
+            "usage", "--by-vision reads the cell's model: run it on the cell's host, without --endpoint"
+        )
+    arm = learnt_arm(cell, operator) if by_vision else None
+    with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
+        if arm is not None:
+            _by_vision(client, arm, check, speed_scale, json)
+            return
+        with client.home(speed_scale) as handle:
+            follow(handle, json, client.cell)
+
+
+def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, as_json: bool) -> None:
+    if arm.cell.scene.moves:
+        raise CommandError("moves", "[scene] moves: the markers move by themselves, and tell no joint's zero")
+    target, looks = _home_of(arm), list[Look]()
+    for _ in range(LOOKS):
+        looks.append(_look(client, arm))
+        found, error_px = _zeros(arm, looks), _from_home_px(arm, looks[-1], target)
+        sure = not found.alternatives and (len(looks) > 1 or _right(found))
+        if check or (sure and error_px <= _tolerance_px(arm)):
+            _report(arm, looks, found, error_px, check, as_json)
+            return
+        way = target - found.offset - looks[-1].readings
+        if not sure:
+            way = way * min(1.0, PROBE / max(float(abs(way).max()), 1e-12))
+        _move(client, arm, looks[-1].readings + way, SPEED * speed_scale)
+    raise CommandError(
+        "not_reached",
+        f"after {LOOKS} looks the pictures are still {error_px:.2f} px from those of the home posture, and "
+        f"{1 + len(found.alternatives)} answers are possible: `stereoservo calibrate {client.cell} --check`",
+        error_px=error_px,
+    )
+
+
+def _home_of(arm: LearntArm) -> FloatArray:
+    """The home position (n,): the cell file's, or the base from which the model was learnt."""
+    import numpy as np
+
+    base = {} if arm.cell.calibration is None else arm.cell.calibration.base
+    learnt = dict(zip(arm.model.joint_names, arm.model.zero.tolist(), strict=True))
+    stated = {**learnt, **base, **arm.cell.joints.home}
+    return np.array([stated[name] for name in arm.model.joint_names], dtype=np.float64)
+
+
+def _look(client: Client, arm: LearntArm) -> Look:
+    """The markers' mean pixels, from an arm at rest. Raises CommandError where the body is not seen."""
+    import numpy as np
+
+    model = arm.model
+    cameras = [camera.name for camera in model.cameras]
+    row = {marker: m for m, marker in enumerate(model.marker_ids)}
+    shape = len(cameras), len(row)
+    total, variance, count = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape)
+    frames = dict.fromkeys(cameras, 0)
+    time.sleep(SETTLE_S)
+    before = dict(client.status().joints)
+    until = time.monotonic() + LOOK_S
+    for message in client.watch(features=True):
+        interruption.check()
+        if isinstance(message, FeaturesMessage) and message.camera in frames:
+            frames[message.camera] += 1
+            c = cameras.index(message.camera)
+            for marker, pixel, sigma in zip(message.ids, message.pixels, message.sigmas, strict=True):
+                if marker in row:
+                    total[c, row[marker]] += pixel
+                    variance[c, row[marker]] += sigma**2
+                    count[c, row[marker]] += 1.0
+        if min(frames.values()) >= FRAMES or time.monotonic() > until:
+            break
+    seen = count >= max(1, FRAMES // 2)
+    if not seen.any():
+        told = ", ".join(f"{name}: {n} frames" for name, n in frames.items())
+        raise CommandError(
+            "not_seen",
+            f"no camera sees a marker of the body ({told}): bring it into view by `stereoservo jog {client.cell}`, or "
+            "look at the light",
+        )
+    readings = client.status().joints
+    moved = max(abs(readings[name] - before[name]) for name in model.joint_names)
+    if moved > 1e-2:
+        raise CommandError("moving", f"the arm moved by {moved:.3f} rad or m during the look: it must rest")
+    own = OWN_SIGMA_PX if model.statistics is None else max(OWN_SIGMA_PX, model.statistics.rms_px)
+    often = np.maximum(count, 1.0)
+    sigmas = np.hypot(np.sqrt(variance) / often, own)
+    pixels = np.where(seen[..., None], total / often[..., None], np.nan)
+    return Look(np.array([readings[name] for name in model.joint_names]), pixels, sigmas)
+
+
+def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
+    """What to add to the readings, by all looks. Raises CommandError where the pictures do not tell."""
+    import numpy as np
+
+    from stereoservo.kinematics.joint_angles import joint_zeros
+    from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
+
+    pixels, sigmas = np.array([look.pixels for look in looks]), np.array([look.sigmas for look in looks])
+    readings = np.array([look.readings for look in looks])
+    try:
+        return joint_zeros(seen_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
+    except JointAnglesError as error:
+        check = f"`stereoservo calibrate {arm.cell.cell.name} --check`"
+        other = f"; zeros alone do not explain them: {check} looks for other causes"
+        told = f"the pictures do not tell the joints' zeros: {error}"
+        raise CommandError(error.code, told + (other if error.code == "no_agreement" else "")) from error
+
+
+def _right(found: JointZeros) -> bool:
+    return bool((abs(found.offset) <= AGREES * found.deviations).all())
+
+
+def _tolerance_px(arm: LearntArm) -> float:
+    """Distance from the home pictures that is there: the cell's tolerance, or what model and images differ by."""
+    statistics = arm.model.statistics
+    own = OWN_SIGMA_PX if statistics is None else max(OWN_SIGMA_PX, statistics.rms_px)
+    return max(arm.cell.servo.tolerance_px, 3.0 * own)
+
+
+def _from_home_px(arm: LearntArm, look: Look, target: FloatArray) -> float:
+    """Largest distance [px] of a marker from where the model has it in the home posture's pictures."""
+    import numpy as np
+
+    from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
+
+    wanted = predicted_pixels(seen_chain(arm.model), target[None], arm.model.marker_points)[0]
+    return float(np.nanmax(np.linalg.norm(look.pixels - wanted, axis=-1)))
+
+
+def _move(client: Client, arm: LearntArm, readings: FloatArray, speed_scale: float) -> None:
+    positions = dict(zip(arm.model.joint_names, readings.tolist(), strict=True))
+    with client.goal(JointTarget(positions), speed_scale=speed_scale) as handle:
+        result = handle.wait(progress=lambda event: note_hold(event.kind, event.message, client.cell))
+    if result.outcome != "reached":
+        raise CommandError(f"goal_{result.outcome}", f"the way home ended: {result.outcome}: {result.why}")
+
+
+def _report(
+    arm: LearntArm, looks: list[Look], found: JointZeros, error_px: float, check: bool, as_json: bool
+) -> None:
+    rows: list[dict[str, Any]] = []
+    for j, name in enumerate(arm.model.joint_names):
+        reading, off = float(looks[-1].readings[j]), float(found.offset[j])
+        rows.append(
+            {
+                "joint": name,
+                "reads": reading,
+                "is_at": reading + off,
+                "zero_off_by": -off,
+                "deviation": float(found.deviations[j]),
+            }
+        )
+    lines = [
+        f"{row['joint']:>8}  reads {row['reads']:+.4f}, is at {row['is_at']:+.4f}: off by {row['zero_off_by']:+.4f} "
+        f"± {row['deviation']:.4f} {'m' if kind == 'prismatic' else 'rad'}"
+        for row, kind in zip(rows, arm.model.joint_kinds, strict=True)
+    ]
+    state = "not moved" if check else "home"
+    lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(looks)} looks")
+    if found.alternatives:
+        lines.append(
+            f"{len(found.alternatives)} other postures show the same from here; a look from elsewhere decides"
+        )
+    if not _right(found):
+        note(
+            f"set the encoders' zeros, or move those of the model: `stereoservo calibrate {arm.cell.cell.name} --check "
+            "--reset-zeros`"
+        )
+    emit(
+        {
+            "home": not check,
+            "error_px": error_px,
+            "joints": rows,
+            "looks": len(looks),
+            "alternatives": len(found.alternatives),
+            "model_epoch": arm.model.epoch,
+        },
+        "\n".join(lines),
+        as_json,
+    )

@@ -77,13 +77,15 @@ class IncidenceTask(NamedTuple):
 
     ``kinds`` (k,) codes of `KINDS`. ``markers`` (k, 3): indices into ``Scene.points`` of the points that span the
     moving feature, -1 where there are fewer. ``fixed`` (k, 3, 4): a point of height 1, then one direction of height
-    0 for a line, two for a plane, zero rows where there are fewer. ``tolerance_px`` [px].
+    0 for a line, two for a plane, zero rows where there are fewer. ``tolerance_px`` [px]. ``drift`` (4, 4) [1/s]: twist
+    of the fixed features relative to the moving points, where either move by themselves; fed forward.
     """
 
     kinds: IntArray
     markers: IntArray
     fixed: FloatArray
     tolerance_px: float
+    drift: FloatArray = np.zeros((4, 4))
 
 
 class IncidenceStep(NamedTuple):
@@ -226,7 +228,7 @@ def incidence_step(
     second: SecondTask | None = None,
     metric: FloatArray | None = None,
 ) -> IncidenceStep:
-    """``q̇ = -gain J⁺ e`` by damped least squares, with the least motion, and the second task in its null space.
+    """``q̇ = J⁺ (drift - gain e)`` by damped least squares and the least motion; the second task in the null space.
 
     Of the scene: ``operators``, ``composition``, ``matrices`` (two or more), ``points``. ``metric`` (n,) > 0: what a
     unit of each joint's motion costs; None: the pixels by which it moves the points (`joint_metric`).
@@ -239,7 +241,7 @@ def incidence_step(
     rest = no_second_task(n) if second is None else second
     velocity, error, status, rank, conditioning, share = incidence_kernel(
         scene.operators, int(scene.composition), scene.matrices, scene.points,
-        Constraints(task.kinds, task.markers, task.fixed), task.tolerance_px, options.gain, options.dt_s,
+        Constraints(task.kinds, task.markers, task.fixed, task.drift), task.tolerance_px, options.gain, options.dt_s,
         options.damping, metric, rest,
     )  # fmt: skip
     return IncidenceStep(velocity, error, status, rank, conditioning, share)

@@ -100,11 +100,14 @@ def _reducible(J: FloatArray, e: FloatArray) -> float:
 
 
 class Constraints(NamedTuple):
-    """``kinds`` (k,), ``markers`` (k, 3) indices into points, ``fixed`` (k, 3, 4), as `incidence.IncidenceTask`."""
+    """``kinds`` (k,), ``markers`` (k, 3) indices into points, ``fixed`` (k, 3, 4), ``drift`` (4, 4) [1/s], as
+    `incidence.IncidenceTask`.
+    """
 
     kinds: IntArray
     markers: IntArray
     fixed: FloatArray
+    drift: FloatArray
 
 
 class SecondTask(NamedTuple):
@@ -121,11 +124,13 @@ class SecondTask(NamedTuple):
 
 class Linearization(NamedTuple):
     """The incidences to first order: ``J`` (b·2c, n) and ``e`` (b·2c,) [px] by the ``metric``, rows of a constraint's
-    moving points, ``owner`` (b,) of the blocks, the constraints' ``error`` (k,) [px], and whether all is ``finite``.
+    moving points, ``rates`` (b·2c,) [px/s] at which the features leave these points by themselves, ``owner`` (b,) of
+    the blocks, the constraints' ``error`` (k,) [px], and whether all is ``finite``.
     """
 
     J: FloatArray
     e: FloatArray
+    rates: FloatArray
     owner: IntArray
     error: FloatArray
     finite: bool
@@ -151,7 +156,7 @@ def _linearized(
     operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, constraints: Constraints,
     metric: FloatArray,
 ) -> tuple[Seen, Linearization]:  # fmt: skip
-    kinds, markers, fixed = constraints
+    kinds, markers, fixed, drift = constraints
     n, count, rows = operators.shape[0], kinds.shape[0], 2 * matrices.shape[0]
     error = np.zeros(count)
     blocks = 0
@@ -164,6 +169,7 @@ def _linearized(
     bases = np.empty((blocks, 4))
     J = np.empty((blocks * rows, n))
     e = np.empty(blocks * rows)
+    rates = np.empty(blocks * rows)
     column = np.empty(rows)
     moved = np.empty(4)
     b = 0
@@ -181,21 +187,25 @@ def _linearized(
             for r in range(rows):
                 e[b * rows + r] = column[r]
                 finite = finite and math.isfinite(column[r])
-            for j in range(n):
+            for j in range(-1, n):
+                operator = drift if j < 0 else operators[j]
                 for r in range(4):
-                    moved[r] = product(operators[j], X, r)
+                    moved[r] = product(operator, X, r)
                 for r in range(rows):
                     column[r] = product(A, moved, r)
                 project_out(T, column)
                 for r in range(rows):
-                    J[b * rows + r, j] = column[r] / metric[j]
-                    finite = finite and math.isfinite(J[b * rows + r, j])
+                    if j < 0:
+                        rates[b * rows + r] = column[r]
+                    else:
+                        J[b * rows + r, j] = column[r] / metric[j]
+                    finite = finite and math.isfinite(column[r])
             distance = image_distance(matrices, A, T, D, X, bases[b])
             if not distance <= error[k]:
                 error[k] = distance
             b += 1
     seen = Seen(operators, composition, points, at, gradients, tangents, bases)
-    return seen, Linearization(J, e, owner, error, finite)
+    return seen, Linearization(J, e, rates, owner, error, finite)
 
 
 @kernel
@@ -263,8 +273,28 @@ def incidence_kernel(
         _damped_step(seen, found, metric, damping, ahead, step)
     for j in range(n):
         velocity[j] = gain * step[j]
+    _feed_forward(velocity, linear, found, metric, damping)
     _second_task(velocity, found.V, rank, metric, second.rows, second.rates, second.weights, damping)
     return velocity, error, status, rank, found.conditioning, share
+
+
+@kernel
+def _feed_forward(
+    velocity: FloatArray, linear: Linearization, found: Decomposition, metric: FloatArray, damping: float
+) -> None:
+    """Add to ``velocity`` (n,) the least motion that keeps the moving points on features which move by themselves."""
+    n = velocity.shape[0]
+    V, values = found.V, found.values
+    for i in range(found.rank):
+        along = 0.0
+        for r in range(linear.rates.shape[0]):
+            image = 0.0
+            for j in range(n):
+                image += linear.J[r, j] * V[j, i]
+            along += image * linear.rates[r]
+        along /= values[i] * values[i] + damping * values[0] * values[0]
+        for j in range(n):
+            velocity[j] += V[j, i] * along / metric[j]
 
 
 @kernel

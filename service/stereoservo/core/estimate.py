@@ -115,9 +115,9 @@ def _take_model(context: StepContext) -> None:
     assert model is not None
     moving_camera.start(state, context.settings, arrays, state.pending_reanchored, context.emit)
     state.pending_model, state.pending_reanchored = None, ()
-    context.emit(
-        "model", message=f"model epoch {model.epoch} is {state.readiness}", name=str(state.readiness)
-    )
+    readiness = str(state.readiness)
+    context.emit("model", message=f"model epoch {model.epoch} is {readiness}", name=readiness)
+    track.tell_untrackable(context)
 
 
 def _await_model(update: ModelUpdate, context: StepContext) -> None:

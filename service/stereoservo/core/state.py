@@ -137,16 +137,30 @@ class LawRun(Leased, eq=False, kw_only=True):
     reasons: list[Reason] = []
 
 
-class Followed(msgspec.Struct, eq=False, kw_only=True):
-    """Of a goal that follows a target: the displacement ``reference`` (4, 4) of the target at which its ``set_points``
-    (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,) hold. ``told``: the last event of the target.
+class FollowedTarget(msgspec.Struct, eq=False, kw_only=True):
+    """Of a goal that follows a target: the displacement ``reference`` (4, 4) of the target at which it holds. ``told``:
+    the last event of the target.
     """
 
     reference: FloatArray
+    told: Literal["", "target_seen", "target_unseen", "target_met"] = ""
+
+
+class Followed(FollowedTarget, eq=False, kw_only=True):
+    """Of set-points: ``set_points`` (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,) at the reference."""
+
     set_points: FloatArray
     target_points: FloatArray
     centre_target: FloatArray
-    told: Literal["", "target_seen", "target_unseen", "target_met"] = ""
+
+
+class FollowedFeatures(FollowedTarget, eq=False, kw_only=True):
+    """Of incidences: their ``fixed`` features (k, 3, 4) at the reference; ``drift`` (4, 4) [1/s], their twist now
+    relative to what shall lie on them.
+    """
+
+    fixed: FloatArray
+    drift: FloatArray
 
 
 class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
@@ -198,6 +212,7 @@ class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):
     joints_wanted: FloatArray
     set_points: FloatArray
     wanted: FloatArray
+    followed: FollowedFeatures | None = None
 
 
 class PoseMeasurement(Leased, eq=False, kw_only=True):

@@ -43,6 +43,7 @@ from stereoservo.core.prediction import camera_chi2, joint_step, joints_at, rows
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.core.sources.law import adaptive_gain
+from stereoservo.core.state import IncidenceGoal
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.kernels import distort_pixel
@@ -53,8 +54,11 @@ from stereoservo.messages.files import write_atomically
 from stereoservo.messages.goals import (
     DEFAULT_LAW,
     Command,
+    Feature,
     FeatureTarget,
     Goal,
+    IncidenceSpec,
+    IncidenceTarget,
     Jog,
     JointTarget,
     PointSource,
@@ -177,7 +181,7 @@ OTHERS = tuple(range(20, 26))
 
 def _warm_up_following(mount: Mount) -> None:
     """A core follows a target, the body before cameras on the arm or another one before cameras that stand: it is
-    found, moves on, jumps, and is brought in from where a goal was shown.
+    found, moves on, jumps, and is brought in from where a goal was shown; then incidences go with it.
     """
     model, settings = msgspec.structs.replace(example_model(), mount=mount), example_settings()
     cameras = tuple(msgspec.structs.replace(c, mount=mount, mobile=False) for c in settings.cameras)
@@ -188,6 +192,10 @@ def _warm_up_following(mount: Mount) -> None:
     wanted = {
         name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, _example_pixels(model), strict=True)
     }
+    at = tuple(float(height) for height in model.marker_points[0])
+    corner = IncidenceSpec(
+        "point-on-point", Feature(markers=(MARKERS[0],)), Feature(points=((at[0], at[1], at[2], at[3]),))
+    )
     for follow_seen in ({}, shown)[: 1 if ids is MARKERS else 2]:
         core = ServoCore(settings)
         for step in range(1, STEPS):
@@ -202,9 +210,12 @@ def _warm_up_following(mount: Mount) -> None:
                 follow_markers=ids,
                 follow_seen=follow_seen,
             )
-            requests = (Request(1, "warmup", RunGoal(goal)),) if step == 5 else ()
+            if step == STEPS - 6:
+                target = IncidenceTarget((corner,), model_epoch=model.epoch)
+                goal = Goal("00000000-0001", target, follow_markers=ids, follow_seen=follow_seen)
+            requests = (Request(1, "warmup", RunGoal(goal)),) if step in (5, STEPS - 6) else ()
             core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
-        if core.state.target is None:
+        if core.state.target is None or not isinstance(core.state.source, IncidenceGoal):
             raise AssertionError("the example cell was to follow a target, and does not")
 
 

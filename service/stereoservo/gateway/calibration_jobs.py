@@ -124,7 +124,7 @@ class CalibrationJobs:
             epoch = self._models.next_epoch()
             self._check = CheckJob(
                 self._job.trials(), path, self._history, self._settings.tolerance_px,
-                reset_to=self._models.path(epoch) if reset else None, epoch=epoch,
+                body_moves=self._settings.body_moves, reset_to=self._models.path(epoch) if reset else None, epoch=epoch,
             )  # fmt: skip
         except (CalibrationError, OSError) as error:
             self._failed(self._check_id, str(error), getattr(error, "code", ""))

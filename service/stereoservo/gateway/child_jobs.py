@@ -146,13 +146,14 @@ class CheckJob(ChildJob):
     """A running check of a model. ``reset_to``: file for a model, of ``epoch``, with drifted joint zeros reset."""
 
     def __init__(
-        self, check: TrialData, model_path: Path, history: Path, limit_px: float, *,
+        self, check: TrialData, model_path: Path, history: Path, limit_px: float, *, body_moves: bool = False,
         reset_to: Path | None = None, epoch: int = 0,
     ) -> None:  # fmt: skip
         path = model_path.with_name("check.npz")
         save_trials(check, path)
         self.reset_to = reset_to
         wanted = [] if reset_to is None else ["--reset-to", str(reset_to), "--epoch", str(epoch)]
+        wanted += ["--body-moves"] if body_moves else []
         super().__init__(
             "stereoservo.daemon.jobs.check_job", str(path), str(model_path), str(history), "--limit-px",
             repr(limit_px), *wanted,

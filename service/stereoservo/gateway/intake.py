@@ -164,12 +164,13 @@ class Intake:
     def _resolved(self, goal: Goal) -> Goal:
         """The goal in the core's form: taught goals as set-points, static markers as their pixels."""
         try:
+            ids = goal.follow_markers
             if isinstance(goal.target, IncidenceTarget):
-                return msgspec.structs.replace(goal, target=self._teaching.resolve_incidence(goal.target))
+                target, seen = self._teaching.resolve_incidence(goal.target, ids)
+                return msgspec.structs.replace(goal, target=target, follow_seen=goal.follow_seen or seen)
             if not isinstance(goal.target, TaughtTarget):
                 return goal
             resolved = self._teaching.resolve(goal.target)
-            ids = goal.follow_markers
             seen = self._teaching.seen_when_taught(goal.target, ids) if ids else {}
         except TransferError as error:
             raise _Answered(

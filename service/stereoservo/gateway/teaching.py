@@ -97,16 +97,26 @@ class TaughtGoalRegistry:
         }
         return {camera: pixels for camera, pixels in seen.items() if pixels}
 
-    def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
-        """Incidences with static markers replaced by their current pixels. Raises TransferError."""
+    def resolve_incidence(
+        self, target: IncidenceTarget, follow: tuple[MarkerId, ...] = ()
+    ) -> tuple[IncidenceTarget, dict[str, dict[int, Pixel]]]:
+        """Incidences with markers of the scene replaced by their current pixels; and, where some were, where the
+        markers to ``follow`` are in these pictures (raw pixels by camera). Raises TransferError.
+        """
         observations = self._seen()
         incidences = tuple(
-            msgspec.structs.replace(spec, fixed=_static_feature(spec.fixed, observations))
+            msgspec.structs.replace(spec, fixed=_scene_feature(spec.fixed, observations, bool(follow)))
             if spec.fixed.markers
             else spec
             for spec in target.incidences
         )
-        return msgspec.structs.replace(target, incidences=incidences)
+        seen: dict[str, dict[int, Pixel]] = {}
+        if any(spec.fixed.markers for spec in target.incidences):
+            for camera, shown in observations.items():
+                pixels = {marker: shown[marker].pixel for marker in follow if marker in shown}
+                if pixels:
+                    seen[camera] = pixels
+        return msgspec.structs.replace(target, incidences=incidences), seen
 
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())
@@ -126,7 +136,7 @@ class TaughtGoalRegistry:
         return False
 
 
-def _static_feature(feature: Feature, observations: MarkerObservations) -> Feature:
+def _scene_feature(feature: Feature, observations: MarkerObservations, may_move: bool) -> Feature:
     """Feature spanned by markers that are not on the body, by their current observations in two or more cameras."""
     pixels = {
         camera: tuple(seen[marker].pixel for marker in feature.markers)
@@ -139,11 +149,12 @@ def _static_feature(feature: Feature, observations: MarkerObservations) -> Featu
         raise TransferError(
             f"markers {text} of a fixed feature are all seen by {cameras} now; two cameras are needed"
         )
-    if any(
+    if not may_move and any(
         seen[marker].moves for seen in observations.values() for marker in feature.markers if marker in seen
     ):
         raise TransferError(
-            f"markers {text} of a fixed feature move now; send the goal when they stand still"
+            f"markers {text} of a fixed feature move now; send the goal when they stand still, or go with them: name "
+            "the markers of their body in follow_markers"
         )
     return Feature(pixels=pixels)
 

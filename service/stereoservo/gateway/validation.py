@@ -90,10 +90,6 @@ def _check_following(goal: Goal, settings: CoreSettings) -> list[str]:
         problems.append("follow_seen: says where markers of a target are; name them in follow_markers, too")
     if not ids:
         return problems
-    if isinstance(goal.target, IncidenceTarget):
-        problems.append(
-            "follow_markers: go with targets that fix a pose; an incidence holds where it was sent"
-        )
     if isinstance(goal.target, TaughtTarget) and goal.target.relative_to is not None:
         problems.append(
             f"follow_markers: carry the goal over by themselves; leave out relative_to {goal.target.relative_to!r}"

@@ -1,6 +1,6 @@
 """Maximum likelihood of one projective rotation from pixels and known angles (thesis 4.4, (4.42), (4.43)).
 
-Ten parameters; points given, or free and eliminated by the Schur complement. Pixels are ideal ones [px], NaN
+Ten parameters, and points, eliminated by the Schur complement. Pixels are ideal ones [px], NaN
 where missing. Everything runs in coordinates whitened over the points at all stops.
 """
 
@@ -59,24 +59,6 @@ def rotation_motion(chart: RotationChart, angles: FloatArray) -> Motion:
     return motion
 
 
-def refine_rotation(
-    Ps: FloatArray,
-    pixels: FloatArray,
-    points: FloatArray,
-    generator: FloatArray,
-    angles: npt.ArrayLike,
-    sigma: FloatArray | float,
-) -> RotationFit:
-    """The rotation of least reprojection error with points given a priori, taken for exact (4.42).
-
-    Cameras ``Ps`` (c, 3, 4); ``pixels`` (s, c, m, 2) [px] at ``angles`` (s,) [rad]; ``points`` (m, 4) at angle
-    0, NaN where one is to be left out; start ``generator`` (4, 4); noise ``sigma``, a number or (s, c, m) [px].
-    Raises GeometryError for shapes that do not fit, a start that is no rotation, a generator that the data do
-    not determine, no convergence.
-    """
-    return _fit(Ps, pixels, points, generator, angles, sigma, free_points=False)
-
-
 def bundle_rotation(
     Ps: FloatArray,
     pixels: FloatArray,
@@ -87,21 +69,11 @@ def bundle_rotation(
 ) -> RotationFit:
     """The rotation and the points of least reprojection error (4.42 with free points, three parameters each).
 
-    Arguments as for `refine_rotation`; ``points`` are the start. Points seen fewer than twice are left out.
+    Cameras ``Ps`` (c, 3, 4); ``pixels`` (s, c, m, 2) [px] at ``angles`` (s,) [rad]; start ``points`` (m, 4) at angle
+    0, NaN where one is to be left out, and ``generator`` (4, 4); noise ``sigma``, a number or (s, c, m) [px]. Points
+    seen fewer than twice are left out. Raises GeometryError for shapes that do not fit, a start that is no rotation, a
+    generator that the data do not determine, no convergence.
     """
-    return _fit(Ps, pixels, points, generator, angles, sigma, free_points=True)
-
-
-def _fit(
-    Ps: FloatArray,
-    pixels: FloatArray,
-    points: FloatArray,
-    generator: FloatArray,
-    angles: npt.ArrayLike,
-    sigma: FloatArray | float,
-    *,
-    free_points: bool,
-) -> RotationFit:
     images = read_images(Ps, pixels, sigma)
     theta = np.asarray(angles, dtype=np.float64)
     if (
@@ -118,9 +90,9 @@ def _fit(
         )
     G = check_rotation_generator(generator)
     views = (images.weights > 0).sum(axis=(0, 1))
-    known: BoolArray = np.asarray(np.isfinite(points).all(axis=1) & (views >= (2 if free_points else 1)))
+    known: BoolArray = np.asarray(np.isfinite(points).all(axis=1) & (views >= 2))
     used = Images(images.cameras, images.pixels[:, :, known], images.weights[:, :, known])
-    size = 10 + (3 * int(known.sum()) if free_points else 0)
+    size = 10 + 3 * int(known.sum())
     if used.measurements < size:
         raise GeometryError(
             "too_few",
@@ -135,7 +107,7 @@ def _fit(
     white = conjugate(W, G)
     chart = rotation_chart(white)
     seen = Images(used.cameras @ np.linalg.inv(W), used.pixels, used.weights)
-    best = minimise(seen, rotation_motion(chart, theta), rotation_parameters(white, chart), M, free_points)
+    best = minimise(seen, rotation_motion(chart, theta), rotation_parameters(white, chart), M, True)
     covariance = covariance_of(best.information, "the generator")
     back: FloatArray = np.asarray(np.linalg.inv(W), dtype=np.float64)
     found = conjugate(back, rotation_from_parameters(best.x, chart))
@@ -145,7 +117,7 @@ def _fit(
     parameters = rotation_parameters(found, own)
     inverse = np.linalg.pinv(rotation_parameter_derivatives(parameters, own).reshape(10, 16).T)
     estimated = np.full(points.shape, np.nan)
-    estimated[known] = best.points @ back.T if free_points else points[known]
+    estimated[known] = best.points @ back.T
     estimated = estimated / (estimated @ images.cameras[0, 2])[:, None]
     return RotationFit(
         found,

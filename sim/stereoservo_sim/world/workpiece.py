@@ -55,13 +55,15 @@ class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Motion(Moved, frozen=True, forbid_unknown_fields=True):
-    """A displacement that goes on: at ``velocity_m_s``, turning at ``turn_rate_deg_s``, and swinging along ``swing_m``
-    at ``swing_hz``, from the monotonic time ``since_ns`` on (None: from when its file was written), for ``for_s``, and
-    every ``every_s`` anew from where it began.
+    """A displacement that goes on: at ``velocity_m_s``, turning at ``turn_rate_deg_s`` about an axis through
+    ``about_m`` [m] off its origin (a turntable's), and swinging along ``swing_m`` at ``swing_hz``, from the monotonic
+    time ``since_ns`` on (None: from when its file was written), for ``for_s``, and every ``every_s`` anew from where it
+    began.
     """
 
     velocity_m_s: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     turn_rate_deg_s: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
+    about_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     swing_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     swing_hz: Annotated[float, Meta(ge=0, le=10)] = 0.0
     since_ns: int | None = None
@@ -77,7 +79,9 @@ class Motion(Moved, frozen=True, forbid_unknown_fields=True):
         shift = (
             np.array(self.shift_m) + elapsed_s * np.array(self.velocity_m_s) + swing * np.array(self.swing_m)
         )
-        turn = np.array(self.turn_deg) + elapsed_s * np.array(self.turn_rate_deg_s)
+        turned = elapsed_s * np.array(self.turn_rate_deg_s)
+        axis, turn = np.array(self.about_m), np.array(self.turn_deg) + turned
+        shift = shift + axis - Moved(turn_deg=tuple(turned.tolist())).matrix[:3, :3] @ axis
         return Moved(tuple(shift.tolist()), tuple(turn.tolist()))
 
 

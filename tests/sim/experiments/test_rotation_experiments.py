@@ -9,13 +9,13 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from oracles.thesis_verdicts import changed
-from stereoservo.calibration.pan_tilt_head import feed_forward
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
 from stereoservo_sim.experiments.rotations.homing import draw_homing, run_homing
 from stereoservo_sim.experiments.rotations.pan_tilt import (
     CONDITIONS,
     MEASURES,
     draw_pan_tilt,
+    feed_forward,
     measures,
     run_pan_tilt,
     step_pairs,

@@ -31,7 +31,7 @@ from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
 from stereoservo_sim.world.simulated_cell import DEMO_GOALS, workpiece_cell
-from stereoservo_sim.world.workpiece import FILE_NAME, Moved, MovedFile, MovedFileError
+from stereoservo_sim.world.workpiece import FILE_NAME, Motion, Moved, MovedFile, MovedFileError
 
 CELL = workpiece_cell()
 PART = CELL.workpiece
@@ -82,6 +82,17 @@ def test_it_moves_about_its_own_middle_by_the_worlds_axes() -> None:
     assert np.allclose(pose[:3, 3] - PART.stand[:3, 3], [0.01, 0.02, 0.03])
     assert np.allclose(pose[:3, 0], [-PART.stand[1, 0], PART.stand[0, 0], PART.stand[2, 0]])
     assert np.array_equal(PART.pose(Moved()), PART.stand)
+
+
+def test_a_turntable_turns_it_about_an_axis_beside_it() -> None:
+    table = Motion(turn_rate_deg_s=(0.0, 0.0, 30.0), about_m=(0.1, 0.0, 0.0), since_ns=0)
+    for t_s in (0.0, 1.0, 3.0):
+        pose = PART.pose(table.at(round(t_s * 1e9)))
+        angle = np.deg2rad(30.0 * t_s)
+        R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        np.testing.assert_allclose(pose[:3, :3], R @ PART.stand[:3, :3], atol=1e-12)
+        centre = PART.stand[:3, 3] + (0.1, 0.0, 0.0)
+        np.testing.assert_allclose(pose[:3, 3], centre + R @ (-0.1, 0.0, 0.0), atol=1e-12)
 
 
 def test_the_file_moves_it_and_nonsense_is_refused_with_what_would_be_valid(tmp_path: Path) -> None:
@@ -303,7 +314,7 @@ def test_a_goal_on_a_workpiece_that_has_moved_is_reached_there(tmp_path: Path, i
 def point_on_plane(bench: Bench, before: np.ndarray) -> None:
     """Marker 5 goes into the plane of three markers of the workpiece that stands where it was moved to."""
     spec = IncidenceSpec("point-on-plane", Feature(markers=(5,)), Feature(markers=(15, 21, 24)))
-    target = bench.teaching.resolve_incidence(IncidenceTarget((spec,)))
+    target, _ = bench.teaching.resolve_incidence(IncidenceTarget((spec,)))
     assert set(target.incidences[0].fixed.pixels) == {"left", "right"}
     there = bench.go(target)
     corners = PART.marker_positions(PART.pose(MOVED))[[1, 7, 10]]

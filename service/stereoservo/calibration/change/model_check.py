@@ -257,10 +257,15 @@ def isolated_outliers(problem: LinearisedProblem) -> npt.NDArray[np.bool_]:
     return gross
 
 
+ELSEWHERE = "; the marker body stands elsewhere than at calibration, as [scene] moves says it may"
+
+
 def make_check_report(
-    examined: ModelExamination, *, limit_px: float = 0.25, created: str = ""
+    examined: ModelExamination, *, limit_px: float = 0.25, created: str = "", body_moves: bool = False
 ) -> CheckReport:
-    """Report of an examination; ``limit_px``: tolerable change of the pixels [px]."""
+    """Report of an examination; ``limit_px``: tolerable change of the pixels [px]. ``body_moves``: the marker body is a
+    target that moves by itself (``[scene] moves``), and may stand elsewhere than when the model was learnt.
+    """
     model, check, problem, found = examined.model, examined.check, examined.problem, examined.explanation
     here = problem.residuals_at(start_state(problem))
     chi2 = float(here @ problem.whitened(here))
@@ -268,7 +273,12 @@ def make_check_report(
     squares = (here.reshape(-1, 2) ** 2).sum(axis=1) / 2.0
     # The model's own uncertainty widens what is expected of a pixel.
     expected = 1.0 + _model_variance(problem)
-    named = [_found_cause(model, problem, found, i) for i in range(len(found.changes))]
+    elsewhere = body_moves and any(change.kind == "body" for change in found.changes)
+    named = [
+        _found_cause(model, problem, found, i)
+        for i, change in enumerate(found.changes)
+        if not (body_moves and change.kind == "body")
+    ]
     freedom = max(1, count - found.x.size)
     left = float(np.sqrt(found.chi2 / freedom))
     if is_unexplained(found.chi2, freedom, math.log(ALPHA), NOISE_MARGIN**2 * freedom):
@@ -286,7 +296,8 @@ def make_check_report(
     away = np.abs(offsets) > 0.2 * np.abs(offsets).max(axis=0)
     return CheckReport(
         status=status,
-        message=_message(status, named, sigmas, chi2, count, problem, limit_px),
+        message=_message(status, named, sigmas, chi2, count, problem, limit_px)
+        + (ELSEWHERE if elsewhere else ""),
         model_epoch=model.epoch,
         stops=len(np.unique(problem.data.stop)),
         measurements=count,
@@ -299,7 +310,11 @@ def make_check_report(
         per_camera={camera.name: rms(problem.data.camera == c) for c, camera in enumerate(model.cameras)},
         per_marker={str(marker): rms(problem.data.marker == k) for k, marker in enumerate(model.marker_ids)},
         causes=tuple(named),
-        drifts=tuple(_drift(problem, cause) for cause in examined.hypotheses if cause.kind != "marker"),
+        drifts=tuple(
+            _drift(problem, cause)
+            for cause in examined.hypotheses
+            if cause.kind != "marker" and not (body_moves and cause.kind == "body")
+        ),
         left_out=examined.left_out,
         created=created,
     )

@@ -36,9 +36,10 @@ from stereoservo.core.goals.resolve import (
 from stereoservo.core.goals.servoing import no_plan, run_fields, used_cameras
 from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.core.prediction import points_now, scene_of
-from stereoservo.core.sources.law import damp, options, run_ended
+from stereoservo.core.sources.law import damp, may_end, options, run_ended, wait_for_target
 from stereoservo.core.sources.progress import error_of_run
 from stereoservo.core.state import IncidenceGoal
+from stereoservo.core.target.follow import require_followable
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.kernels import project_points, triangulate
 from stereoservo.messages.goals import Feature, Goal, IncidenceTarget, JointTarget, PlanReport
@@ -65,6 +66,8 @@ def start_incidence(
             value=1.0, threshold=2.0, unit="cameras",
         )  # fmt: skip
     of_this_model(target.model_epoch, model.epoch)
+    if goal.follow_markers:
+        require_followable(goal, True, "incidence", True, context)
     k, n = len(target.incidences), len(context.q)
     kinds, markers = np.zeros(k, np.int64), np.full((k, 3), -1, np.int64)
     fixed = np.zeros((k, 3, 4))
@@ -238,6 +241,9 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     arrays, prediction, weights, pixels = context.arrays, context.prediction, context.weights, context.pixels
     if arrays is None or prediction is None or weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")
+    waits = wait_for_target(source, context)
+    if waits is not None:
+        return waits
     usable = weights * source.used[:, None]
     points = points_now(arrays, context.q, pixels, usable, context.state.block.correction, source.points)
     scene = scene_of(prediction, pixels, arrays, points, usable)
@@ -248,20 +254,26 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     resting = bool((np.abs(step.velocity) < SECOND_AT_REST).all())
     ended = run_ended(
         source, context, error_px if isfinite(error_px) else None, int((usable.max(axis=0) > 0.0).sum()),
-        may_end=len(second.rates) == 0 or resting,
+        may_end=may_end(source, context) and (len(second.rates) == 0 or resting),
     )  # fmt: skip
     if ended is not None:
         return ended
     still = bool((step.status == int(IncidenceStatus.NOT_FINITE)).any())
+    expected: FloatArray | float = 0.0
+    if source.damping and source.followed is not None:
+        standing = incidence_step(scene, task._replace(drift=np.zeros((4, 4))), how, second)
+        expected = step.velocity - standing.velocity
+    velocity = np.zeros_like(context.q) if still else damp(source, context, step.velocity, expected)
     return SourceOutput(
-        np.zeros_like(context.q) if still else damp(source, context, step.velocity), True, source.goal.speed_scale,
+        velocity, True, source.goal.speed_scale,
         error_px=error_px if isfinite(error_px) else None, task_error=step.error_px,
         reasons=incidence_reasons(step, task, source.names),
     )  # fmt: skip
 
 
 def _task(source: IncidenceGoal) -> IncidenceTask:
-    return IncidenceTask(source.kinds, source.markers, source.fixed, source.tolerance_px)
+    task = IncidenceTask(source.kinds, source.markers, source.fixed, source.tolerance_px)
+    return task if source.followed is None else task._replace(drift=source.followed.drift)
 
 
 def _second(source: IncidenceGoal, context: StepContext, scene: Scene, gain: float) -> SecondTask:

@@ -32,8 +32,8 @@ from stereoservo.core.sources.progress import (
     follow_error,
 )
 from stereoservo.core.sources.streaming import feed_forward, follow
-from stereoservo.core.state import LawRun, ServoGoal
-from stereoservo.core.target.follow import follow_target, stands, start_following
+from stereoservo.core.state import IncidenceGoal, LawRun, ServoGoal
+from stereoservo.core.target.follow import Follower, follow_target, stands, start_following
 from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
@@ -52,10 +52,9 @@ SELF_MOTION_RATE = 0.5
 def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     """One step of a law: error, joint velocity, and whether the goal is reached or out of time."""
     law = context.derived.laws[source.law]
-    if source.followed is not None:
-        waits = follow_target(source, context)
-        if waits is not None:
-            return SourceOutput(np.zeros_like(context.q), needs_features=True, reasons=(waits,))
+    waiting = wait_for_target(source, context)
+    if waiting is not None:
+        return waiting
     if (
         law.kernel is not None
         and source.stream is None
@@ -70,8 +69,8 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     streamed = follow(source, context, arrays) if source.stream is not None else False
     found = goal_error(source, context, arrays, context.weights, pixels)
     error_px = found.error_px
-    may_end = not streamed and (source.followed is None or stands(context.state.target))
-    ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=may_end)
+    ends = not streamed and may_end(source, context)
+    ended = run_ended(source, context, error_px, found.seen, source.wanted, may_end=ends)
     if ended is not None:
         return ended
     scene, task = choose(source, context, *scene_and_task(source, context, arrays, found))
@@ -102,6 +101,19 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
     )  # fmt: skip
 
 
+def wait_for_target(source: Follower, context: StepContext) -> SourceOutput | None:
+    """Bring a goal that follows a target to where that is now; no motion where it is not seen."""
+    waits = None if source.followed is None else follow_target(source, context)
+    if waits is None:
+        return None
+    return SourceOutput(np.zeros_like(context.q), needs_features=True, reasons=(waits,))
+
+
+def may_end(source: Follower, context: StepContext) -> bool:
+    """Whether a goal may be reached for good: its target stands, where it follows one."""
+    return source.followed is None or stands(context.state.target)
+
+
 def _compiled_step(
     source: ServoGoal, context: StepContext, law: Law, kernel: Callable[[Record, float, float, int], None]
 ) -> SourceOutput:
@@ -110,8 +122,7 @@ def _compiled_step(
     aim_at(room, source)
     seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
     error_px = numbers.error_px if numbers.measured else None
-    may_end = source.followed is None or stands(context.state.target)
-    ended = run_ended(source, context, error_px, seen, source.wanted, may_end=may_end)
+    ended = run_ended(source, context, error_px, seen, source.wanted, may_end=may_end(source, context))
     if ended is not None:
         return ended
     if law.components:
@@ -272,7 +283,7 @@ def activate_run(source: LawRun, context: StepContext) -> None:
     source.started_ns = context.now_ns
     begin_run(context.state.block.record)
     source.renew_lease(context.now_ns)
-    if isinstance(source, ServoGoal) and source.goal.follow_markers:
+    if isinstance(source, ServoGoal | IncidenceGoal) and source.goal.follow_markers:
         start_following(source, context)
 
 
@@ -541,7 +552,7 @@ def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
 
 def _plain_traits(source: LawRun, context: StepContext) -> Traits:
     gain = gain_now(source, error_of_run(context.state.block)) / (1.0 + source.damping)
-    return Traits(gain, run_progress(source, context)[1] or 0.0)
+    return Traits(gain, run_progress(source, context)[1] or 0.0, moves=bool(source.goal.follow_markers))
 
 
 def progress_reasons(

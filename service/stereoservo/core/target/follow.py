@@ -1,7 +1,7 @@
 """Goals that hold relative to a target that moves: their set-points now, and the velocities that are fed forward.
 
 With cameras on the arm the set-points stand in the images and the body moves; with cameras that stand the set-points
-go with the target.
+go with the target. The features of incidences do likewise.
 """
 
 from __future__ import annotations
@@ -15,15 +15,24 @@ from stereoservo.core.goals.resolve import camera_index, ideal_pixels, marker_in
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
 from stereoservo.core.sources.progress import error_of_run
-from stereoservo.core.state import Followed, ServoGoal
-from stereoservo.core.target.motion import TargetBody, find_pose, find_shape, pixel_rates, target_body
+from stereoservo.core.state import Followed, FollowedFeatures, FollowedTarget, IncidenceGoal, ServoGoal
+from stereoservo.core.target.motion import (
+    TargetBody,
+    find_pose,
+    find_shape,
+    generator_of,
+    pixel_rates,
+    seen_through,
+    target_body,
+)
 from stereoservo.core.target.track import FEWEST, FEWEST_TO_FIND, IDENTITY, displacements_of, pose_at
 from stereoservo.kinematics.kernels import invert4, multiply4_into, project_points, transform_points
 from stereoservo.messages.goals import Goal
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 
-LEAST_STATED = 3
+Follower = ServoGoal | IncidenceGoal
+"""Goals that may follow a target."""
 
 
 def require_followable(
@@ -107,7 +116,7 @@ def _stated(
     return ids[there], np.ascontiguousarray(points[there]), sights[:, there].copy(), seen[:, there].copy()
 
 
-def start_following(source: ServoGoal, context: StepContext) -> None:
+def start_following(source: Follower, context: StepContext) -> None:
     """A goal that follows a target begins: the target is looked for, where it is not followed already."""
     arrays, state, goal = context.arrays, context.state, source.goal
     assert arrays is not None
@@ -128,13 +137,18 @@ def start_following(source: ServoGoal, context: StepContext) -> None:
             reference = pose_at(body, context.now_ns)[0]
         else:
             state.target = target_body(ids, None, cameras, carried=False)
+    if isinstance(source, IncidenceGoal):
+        source.followed = FollowedFeatures(
+            reference=reference, fixed=source.fixed.copy(), drift=np.zeros((4, 4))
+        )
+        return
     source.followed = Followed(
         reference=reference, set_points=source.set_points.copy(), target_points=source.target_points.copy(),
         centre_target=source.centre_target.copy(),
     )  # fmt: skip
 
 
-def follow_target(source: ServoGoal, context: StepContext) -> Reason | None:
+def follow_target(source: Follower, context: StepContext) -> Reason | None:
     """Bring a goal to where its target is now, with the velocities of its set-points; the reason where it cannot.
 
     By events it tells when the target is seen, is lost, and is met while it moves.
@@ -155,7 +169,7 @@ def follow_target(source: ServoGoal, context: StepContext) -> Reason | None:
 
 
 def _tell(
-    kind: Literal["target_seen", "target_unseen", "target_met"], message: str, source: ServoGoal, context: StepContext
+    kind: Literal["target_seen", "target_unseen", "target_met"], message: str, source: Follower, context: StepContext
 ) -> None:  # fmt: skip
     assert source.followed is not None
     source.followed.told = kind
@@ -165,11 +179,10 @@ def _tell(
     )
 
 
-def _brought(source: ServoGoal, context: StepContext) -> Reason | None:
-    body, arrays, followed = context.state.target, context.arrays, source.followed
-    assert arrays is not None
-    assert followed is not None
-    source.rates = np.zeros_like(source.set_points)
+def _brought(source: Follower, context: StepContext) -> Reason | None:
+    body = context.state.target
+    if isinstance(source, ServoGoal):
+        source.rates = np.zeros_like(source.set_points)
     if body is None or body.t_ns == 0:
         return _unseen(source, "the target is looked for: bring its markers into the view of two cameras")
     unseen_s = (context.now_ns - int(body.seen_ns.max())) * 1e-9
@@ -177,25 +190,55 @@ def _brought(source: ServoGoal, context: StepContext) -> Reason | None:
         return _unseen(
             source, f"the target was not seen for {unseen_s:.2f} s", unseen_s, context.settings.limits.coast_s
         )
+    if isinstance(source, IncidenceGoal):
+        _bring_features(source, body, context)
+    else:
+        _bring_set_points(source, body, context)
+    return None
+
+
+def _bring_features(source: IncidenceGoal, body: TargetBody, context: StepContext) -> None:
+    arrays, followed = context.arrays, source.followed
+    assert arrays is not None
+    assert followed is not None
+    _, twist = pose_at(body, context.now_ns + context.inputs.period_ns // 2)
+    if body.carried:
+        carried = seen_through(body.basis, chain_at(arrays, context.q)[0])
+        followed.drift = -generator_of(carried, twist)
+        return
+    moved = _moved(followed, body, context)
+    for k in range(len(source.fixed)):
+        source.fixed[k] = transform_points(moved, followed.fixed[k])
+    followed.drift = generator_of(body.basis, twist)
+
+
+def _moved(followed: FollowedTarget, body: TargetBody, context: StepContext) -> FloatArray:
+    """What the target was displaced by (4, 4) since its reference."""
+    moved = np.empty((4, 4))
+    multiply4_into(pose_at(body, context.now_ns)[0], invert4(followed.reference), moved)
+    return moved
+
+
+def _bring_set_points(source: ServoGoal, body: TargetBody, context: StepContext) -> None:
+    arrays, followed = context.arrays, source.followed
+    assert arrays is not None
+    assert followed is not None
     pose, twist = pose_at(body, context.now_ns + context.inputs.period_ns // 2)
     if body.carried:
         carrier = chain_at(arrays, context.q)[0]
         points = transform_points(pose, body.points)
         source.rates = -pixel_rates(body.basis, twist, arrays.matrices, carrier, points)
-        return None
-    pose = pose_at(body, context.now_ns)[0]
-    moved = np.empty((4, 4))
-    multiply4_into(pose, invert4(followed.reference), moved)
+        return
+    moved = _moved(followed, body, context)
     source.target_points = transform_points(moved, followed.target_points)
     source.centre_target = transform_points(moved, followed.centre_target[None])[0]
     here, _ = project_points(arrays.matrices, source.target_points)
     there, _ = project_points(arrays.matrices, followed.target_points)
     source.set_points = here + np.where(source.wanted[..., None] > 0.0, followed.set_points - there, 0.0)
     source.rates = pixel_rates(body.basis, twist, arrays.matrices, IDENTITY, source.target_points)
-    return None
 
 
-def _unseen(source: ServoGoal, hint: str, value: float | None = None, limit: float | None = None) -> Reason:
+def _unseen(source: Follower, hint: str, value: float | None = None, limit: float | None = None) -> Reason:
     ids = ", ".join(str(marker) for marker in source.goal.follow_markers)
     return Reason("TARGET_UNSEEN", "hold", ids, value, limit, "s" if value is not None else "", hint)
 

@@ -31,7 +31,7 @@ from stereoservo.numerics.linear import damped_least_squares
 FREEDOMS = 6
 ACCELERATION_PX = 15.0
 """[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
-TURNS = 0.1
+TURNS = 0.025
 """Share of it by which turns of a target about its own middle move its markers."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0
@@ -190,7 +190,7 @@ def scaled_basis(
     independently of the others; the covariance (6, 6) in it of what is spread alike over the former, at 1 px rms; and
     whether it could be.
     """
-    J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points)).reshape(
+    J = image_jacobian(seen_through(basis, carrier), matrices, transform_points(carrier, points)).reshape(
         (-1, FREEDOMS)
     )
     N = np.zeros((FREEDOMS, FREEDOMS))
@@ -237,8 +237,8 @@ def scaled_basis(
 
 
 @kernel
-def _carried(basis: FloatArray, carrier: FloatArray) -> FloatArray:
-    """``C Ĝ C⁻¹`` of every twist (6, 4, 4)."""
+def seen_through(basis: FloatArray, carrier: FloatArray) -> FloatArray:
+    """Twists (6, 4, 4) as they are seen through a ``carrier`` C (4, 4): ``C Ĝ C⁻¹``."""
     inverse, half, out = invert4(carrier), np.empty((4, 4)), np.empty(basis.shape)
     for k in range(basis.shape[0]):
         multiply4_into(carrier, basis[k], half)
@@ -318,7 +318,7 @@ def compare(
     """
     there = transform_points(carrier, transform_points(D, points))
     pixels, _ = project_points(matrix, there)
-    J = image_jacobian(_carried(basis, carrier), matrix, there)[0]
+    J = image_jacobian(seen_through(basis, carrier), matrix, there)[0]
     left = np.zeros(sights.shape)
     for i in range(seen.size):
         for a in range(2):
@@ -446,7 +446,9 @@ def jumped(
     """
     before = transform_points(carrier, transform_points(D, points))
     shown = seen.reshape((1, -1))
-    moved, rest_px = find_pose(_carried(basis, carrier), matrix, before, sights.reshape((1, -1, 2)), shown)
+    moved, rest_px = find_pose(
+        seen_through(basis, carrier), matrix, before, sights.reshape((1, -1, 2)), shown
+    )
     here, _ = project_points(matrix, transform_points(moved, before))
     there, _ = project_points(matrix, before)
     total = count = 0.0
@@ -467,7 +469,7 @@ def pixel_rates(
     basis: FloatArray, twist: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
 ) -> FloatArray:
     """Pixel velocities (c, k, 2) [px/s] of ``points`` (k, 4), where they are now, that move with a ``twist`` (6,)."""
-    J = image_jacobian(_carried(basis, carrier), matrices, transform_points(carrier, points))
+    J = image_jacobian(seen_through(basis, carrier), matrices, transform_points(carrier, points))
     rates = np.zeros(J.shape[:3])
     for c in range(J.shape[0]):
         for i in range(J.shape[1]):

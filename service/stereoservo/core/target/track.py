@@ -40,6 +40,7 @@ from stereoservo.core.target.motion import (
     widen,
 )
 from stereoservo.kinematics.kernels import project_points, transform_points
+from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation
@@ -213,6 +214,23 @@ def restart(state: CoreState, arrays: ModelArrays, settings: CoreSettings) -> No
     body.t_ns, body.seen_ns[:], body.first_seen[:] = 0, 0, 0.0
     if body.carried and body.points.shape == arrays.marker_points.shape:
         body.points[:] = arrays.marker_points
+
+
+def tell_untrackable(context: StepContext) -> None:
+    """Warn where the body is said to move, and the model that was taken tells no displacements."""
+    model = context.state.model
+    if model is None or context.state.target is not None or not context.settings.body_moves:
+        return
+    reason = Reason(
+        "TARGET_NOT_TRACKABLE", "slow",
+        hint="calibrate with a body by which the model becomes metric, or with an arm of six joints",
+    )  # fmt: skip
+    context.emit(
+        "warning",
+        message=f"[scene] moves, but the model is {model.stratum}, and the {len(model.joint_names)} joints do not make "
+        "all displacements: the body is not followed, and where it moves a camera or a joint will be blamed",
+        reasons=(reason,),
+    )
 
 
 # -- following it ----------------------------------------------------------------------------------------------

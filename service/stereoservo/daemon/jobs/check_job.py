@@ -28,9 +28,10 @@ from stereoservo.messages.files import read_bounded, set_aside, write_atomically
 
 
 def check_and_remember(
-    check: TrialData, model_path: Path, history_path: Path, limit_px: float
+    check: TrialData, model_path: Path, history_path: Path, limit_px: float, body_moves: bool = False
 ) -> tuple[ModelExamination, CheckReport]:
-    """Examine a model, find trends over earlier checks, append the report to the history.
+    """Examine a model, find trends over earlier checks, append the report to the history. ``body_moves``: as of
+    `make_check_report`.
 
     A damaged history is set aside, one that cannot be written is left as it is: the report says so. Raises
     ModelFileError, CalibrationError.
@@ -44,7 +45,7 @@ def check_and_remember(
     except CalibrationError as error:
         notes.append(f"checked without the model's own trial data: {error}")
     examined = examine_model(model, check, made_from=trials)
-    report = make_check_report(examined, limit_px=limit_px, created=created)
+    report = make_check_report(examined, limit_px=limit_px, created=created, body_moves=body_moves)
     history, lost = load_checks(history_path)
     grown = find_trend([*history, report])
     notes += [] if grown is None else [grown.message]
@@ -74,6 +75,7 @@ def main() -> int:
     parser.add_argument("model", type=Path)
     parser.add_argument("history", type=Path)
     parser.add_argument("--limit-px", type=float, required=True)
+    parser.add_argument("--body-moves", action="store_true", help="the marker body may stand elsewhere")
     parser.add_argument("--parent", type=int, default=0, help="end with this process")
     parser.add_argument("--reset-to", type=Path, help="model file for the joint zeros reset")
     parser.add_argument("--epoch", type=int, default=0)
@@ -81,8 +83,9 @@ def main() -> int:
     become_child(arguments.parent)
     try:
         examined, report = check_and_remember(
-            load_trials(arguments.check), arguments.model, arguments.history, arguments.limit_px
-        )
+            load_trials(arguments.check), arguments.model, arguments.history, arguments.limit_px,
+            arguments.body_moves,
+        )  # fmt: skip
         print_line({"check": msgspec.to_builtins(report)})
         if arguments.reset_to is not None:
             reset = reset_and_save(examined, report, arguments.reset_to, arguments.epoch)

@@ -16,10 +16,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from stereoservo.calibration.pan_tilt_head import feed_forward
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.joint_reprojection import SeenChain, seen_chain
+from stereoservo.kinematics.joint_reprojection import SeenChain, points_seen, predicted_pixels, seen_chain
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.comparison import Comparison, of_error, of_limit, of_statement
 from stereoservo_sim.experiments.experiment import whole_table
@@ -163,6 +162,17 @@ def _sequences(cell: SyntheticCell, tracks: Tracks, rng: np.random.Generator) ->
             list(combinations(range(POSITIONS), 2))[:PAIRS],
         ),
     }
+
+
+def feed_forward(
+    seen: SeenChain, q_from: FloatArray, pixels: FloatArray, q_to: FloatArray, sigma: FloatArray | float = 1.0
+) -> FloatArray:
+    """Predicted raw pixels (s, c, m, 2) at configurations ``q_to`` (s, n) of points seen at ``pixels`` (c, m, 2) in
+    ``q_from`` (n,): reconstructed, displaced by the joints (4.44), projected. NaN where two cameras do not see a
+    point.
+    """
+    points, _ = points_seen(seen, q_from, pixels, sigma)
+    return predicted_pixels(seen, np.atleast_2d(q_to), points)
 
 
 def run_pan_tilt(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:

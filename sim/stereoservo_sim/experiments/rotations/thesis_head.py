@@ -16,8 +16,8 @@ from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_statistics import covariance_root
 from stereoservo.calibration.generator_initialization import common_points, linear_generator
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
-from stereoservo.calibration.pan_tilt_head import calibrate_pan_tilt
 from stereoservo.calibration.rig_model import Measurements, RigModel, rig_at
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import TrialCamera, TrialData
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.rotation_fit import bundle_rotation
@@ -200,11 +200,11 @@ def _seen(rig: RigModel, zero: FloatArray) -> SeenChain:
 
 
 def calibrated(trials: TrialData) -> HeadCalibration:
-    """The fit of `calibrate_pan_tilt`, and the plain bundle of pinholes there, whose covariance is asked for.
+    """The ordinary fit, and the plain bundle of pinholes there, whose covariance is asked for.
 
-    Raises CalibrationError as `calibrate_pan_tilt` does.
+    Raises CalibrationError as `fit_model` does.
     """
-    model = calibrate_pan_tilt(trials, epoch=1)[1].model
+    model = fit_model(trials, epoch=1).model
     rig, stratum = _rig_of(model)
     camera, stop, marker = (index.ravel() for index in np.indices(trials.sigmas.shape))
     offsets = (trials.positions - model.zero)[:, ::-1]

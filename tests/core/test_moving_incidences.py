@@ -1,0 +1,247 @@
+"""Incidences on bodies that move: points, lines and planes that go with a target are followed, its twist fed forward,
+before cameras that stand and on the arm. The truth is Euclidean, conjugated into a random projective frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from core.conftest import BASE, flange_at, twist
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.state_encoding import decode_state, encode_state
+from stereoservo.messages.goals import Feature, Goal, IncidenceSpec, IncidenceTarget, RunGoal
+
+NOISE_PX = 0.1
+PART = tuple(range(8, 14))
+"""Markers of the target before cameras that stand."""
+SETTLE_S, JUDGED_S = 2.0, 1.0
+
+Way = Callable[[float], np.ndarray]
+
+
+def sliding(seed: int, speed: float = 0.05) -> Way:
+    direction = np.random.default_rng([seed, 23]).standard_normal(3)
+    direction *= speed / np.linalg.norm(direction)
+
+    def way(t: float) -> np.ndarray:
+        D = np.eye(4)
+        D[:3, 3] = t * direction
+        return D
+
+    return way
+
+
+def turning(centre: np.ndarray, axis: np.ndarray, speed: float) -> Way:
+    G = twist(axis / np.linalg.norm(axis), centre)
+    return lambda t: np.asarray(expm(t * speed * G))
+
+
+class Cell:
+    """A bench with a part that goes along a ``way`` (4, 4) by the seconds from `set_out` on."""
+
+    def __init__(self, bench: Any) -> None:
+        self.bench, self.begin_ns, self.way = bench, 0, sliding(0, 0.0)
+        rng = np.random.default_rng([5, 23])
+        middle = bench.truth.points(BASE).mean(axis=0)
+        spread = rng.uniform(-0.1, 0.1, (len(PART), 3)) + np.array([0.0, 0.06, 0.03])
+        self.part = np.column_stack([middle + spread, np.ones(len(PART))])
+        bench.truth.static = self.part
+
+    @property
+    def moved(self) -> np.ndarray:
+        """(4, 4): of the part, by now."""
+        return self.way((self.bench.now_ns - self.begin_ns) * 1e-9)
+
+    def set_out(self, way: Way) -> None:
+        self.way, self.begin_ns = way, self.bench.now_ns
+
+    def step(self) -> None:
+        self.bench.truth.static = self.part @ self.moved.T
+        self.bench.step()
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds * self.bench.settings.rate_hz)):
+            self.step()
+
+    def send(
+        self,
+        kind: str,
+        moving: tuple[int, ...],
+        fixed: np.ndarray,
+        follow: tuple[int, ...],
+        shown: Any = None,
+    ) -> Any:
+        points = tuple(map(tuple, self.bench.projective(fixed).tolist()))
+        spec = IncidenceSpec(kind, Feature(markers=moving), Feature(points=points))
+        goal = Goal(
+            "00000001", IncidenceTarget((spec,), model_epoch=7), gain=2.0, tolerance_px=0.4, time_limit_s=60.0,
+            follow_markers=follow, follow_seen=shown or {},
+        )  # fmt: skip
+        return self.bench.reply(RunGoal(goal))
+
+    def images(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(self.bench.truth.images_of(np.column_stack([points, np.ones(len(points))])))
+
+
+def off_feature(points: np.ndarray, feature: np.ndarray) -> np.ndarray:
+    """The nearest points (k, 3) to ``points`` (k, 3) of the span of 1 to 3 points (K, 3)."""
+    if len(feature) == 1:
+        return np.broadcast_to(feature[0], points.shape)
+    Q = np.linalg.qr((feature[1:] - feature[0]).T)[0]
+    return np.asarray(feature[0] + (points - feature[0]) @ Q @ Q.T)
+
+
+def largest_px(cell: Cell, moving: tuple[int, ...], feature: Callable[[], np.ndarray]) -> float:
+    """Largest distance over time between a marker's image and that of the feature's nearest point."""
+    errors = []
+    for _ in range(round(JUDGED_S * cell.bench.settings.rate_hz)):
+        cell.step()
+        points = cell.bench.truth.points(cell.bench.q)[list(moving)]
+        apart = cell.images(points) - cell.images(off_feature(points, feature()))
+        errors.append(np.linalg.norm(apart, axis=-1).max())
+    return float(max(errors))
+
+
+KINDS = {
+    "point-on-point": ((4,), (4,)),
+    "point-on-line": ((4,), (4, 5)),
+    "line-on-line": ((0, 2), (0, 2)),
+    "plane-on-plane": ((0, 1, 2), (0, 1, 2)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("turns", [False, True])
+def test_features_that_go_with_a_target_are_followed(benches: Any, kind: str, turns: bool) -> None:
+    cell = Cell(benches(1, noise_px=NOISE_PX).ready())
+    moving, own = KINDS[kind]
+    fixed = cell.bench.truth.points(BASE)[list(own)]
+    assert cell.send(kind, moving, fixed, PART).accepted
+    cell.run(0.3)
+    middle = cell.part[:, :3].mean(axis=0)
+    way = turning(middle, np.array([0.2, 0.1, 1.0]), 0.3) if turns else sliding(1)
+    cell.set_out(way)
+    cell.run(SETTLE_S)
+
+    def feature() -> np.ndarray:
+        return (np.column_stack([fixed, np.ones(len(fixed))]) @ cell.moved.T)[:, :3]
+
+    largest = largest_px(cell, moving, feature)
+    print(f"{kind}, turns {turns}: {largest:.2f} px")
+    assert largest < 1.0
+    assert [e.kind for e in cell.bench.events if e.kind.startswith("target_")] == [
+        "target_seen",
+        "target_met",
+    ]
+    assert {e.name for e in cell.bench.events if e.kind == "health"} <= {"ok"}
+
+
+def test_what_an_incidence_leaves_free_stays_though_the_target_moves(benches: Any) -> None:
+    """Onto a plane that slides along itself nothing has to move."""
+    cell = Cell(benches(2).ready())
+    fixed = cell.bench.truth.points(BASE)[:3]
+    assert cell.send("point-on-plane", (0,), fixed, PART).accepted
+    cell.run(0.3)
+    before = cell.bench.q.copy()
+    along = (fixed[1] - fixed[0]) / np.linalg.norm(fixed[1] - fixed[0])
+
+    def way(t: float) -> np.ndarray:
+        D = np.eye(4)
+        D[:3, 3] = 0.03 * t * along
+        return D
+
+    cell.set_out(way)
+    cell.run(2.0)
+    assert np.abs(cell.bench.q - before).max() < 2e-3
+
+
+def test_without_its_name_the_feature_stands(benches: Any) -> None:
+    cell = Cell(benches(1, noise_px=NOISE_PX).ready())
+    fixed = cell.bench.truth.points(BASE)[[4]]
+    assert cell.send("point-on-point", (4,), fixed, ()).accepted
+    cell.run(0.3)
+    cell.set_out(sliding(1))
+    cell.run(SETTLE_S)
+    way = largest_px(cell, (4,), lambda: (np.column_stack([fixed, [1.0]]) @ cell.moved.T)[:, :3])
+    assert way > 20.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_body_that_moves_before_cameras_on_the_arm_is_kept_on_features_of_the_cameras(
+    benches: Any, kind: str
+) -> None:
+    bench = benches(3, noise_px=NOISE_PX, mount="eye_in_hand").ready()
+    cell = Cell(bench)
+    bench.truth.static = np.zeros((0, 4))
+    cell.part = bench.truth.static
+    moving, own = KINDS[kind]
+    fixed = bench.truth.points(BASE)[list(own)]
+    markers = bench.truth.markers
+    bench.truth.points = lambda q: (np.linalg.inv(flange_at(q)) @ cell.moved @ flange_at(BASE) @ markers.T).T[
+        :, :3
+    ]
+    assert cell.send(kind, moving, fixed, tuple(range(8))).accepted
+    cell.run(0.3)
+    cell.set_out(sliding(3, 0.03))
+    cell.run(SETTLE_S)
+    largest = largest_px(cell, moving, lambda: fixed)
+    print(f"{kind}: {largest:.2f} px")
+    assert largest < 1.0
+    assert {e.name for e in bench.events if e.kind == "health"} <= {"ok"}
+
+
+def test_the_goal_ends_where_the_target_stands_and_waits_where_it_is_not_seen(benches: Any) -> None:
+    cell = Cell(benches(4, noise_px=NOISE_PX).ready())
+    fixed = cell.bench.truth.points(BASE)[[4]]
+    assert cell.send("point-on-point", (4,), fixed, PART).accepted
+    cell.run(0.3)
+    slide = sliding(4, 0.02)
+    cell.set_out(lambda t: slide(min(t, 2.0)))
+    cell.run(1.0)
+    part, cell.part = cell.part, cell.part + np.array([0.0, 0.0, 50.0, 0.0])
+    cell.run(0.8)
+    assert any(e.kind == "target_unseen" for e in cell.bench.events)
+    before = cell.bench.q.copy()
+    cell.run(0.3)
+    assert np.abs(cell.bench.q - before).max() < 1e-3
+    cell.part = part
+    cell.run(4.0)
+    kinds = [e.kind for e in cell.bench.events if e.kind.startswith("target_") or e.kind == "goal_reached"]
+    assert kinds[-2:] == ["target_seen", "goal_reached"]
+
+
+def test_where_the_target_was_when_its_features_were_shown_is_taken_as_said(benches: Any) -> None:
+    cell = Cell(benches(5).ready())
+    fixed = cell.bench.truth.points(BASE)[[4]]
+    names = cell.bench.names
+    shown = {
+        name: {i: (float(u), float(v)) for i, (u, v) in zip(PART, image, strict=True)}
+        for name, image in zip(names, cell.images(cell.part[:, :3]), strict=True)
+    }
+    slide = sliding(5, 0.05)
+    cell.set_out(lambda t: slide(1.0))
+    cell.run(0.5)
+    assert cell.send("point-on-point", (4,), fixed, PART, shown).accepted
+    cell.run(5.0)
+    assert cell.bench.events[-1].kind == "goal_reached"
+    there = fixed + slide(1.0)[:3, 3]
+    np.testing.assert_allclose(cell.bench.truth.points(cell.bench.q)[[4]], there, atol=2e-3)
+
+
+def test_its_state_survives_serialisation_bit_for_bit(benches: Any) -> None:
+    cell = Cell(benches(6, noise_px=NOISE_PX).ready())
+    assert cell.send("point-on-line", (4,), cell.bench.truth.points(BASE)[[4, 5]], PART).accepted
+    cell.run(0.3)
+    cell.set_out(sliding(6))
+    cell.run(0.8)
+    twin = ServoCore(cell.bench.settings, decode_state(encode_state(cell.bench.core.state)))
+    start = len(cell.bench.log)
+    cell.run(0.3)
+    for inputs, outputs in cell.bench.log[start:]:
+        assert twin.step(inputs).command.tobytes() == outputs.command.tobytes()
+    assert encode_state(twin.state) == encode_state(cell.bench.core.state)
