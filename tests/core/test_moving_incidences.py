@@ -75,12 +75,13 @@ class Cell:
         fixed: np.ndarray,
         follow: tuple[int, ...],
         shown: Any = None,
+        damping: float = 0.0,
     ) -> Any:
         points = tuple(map(tuple, self.bench.projective(fixed).tolist()))
         spec = IncidenceSpec(kind, Feature(markers=moving), Feature(points=points))
         goal = Goal(
             "00000001", IncidenceTarget((spec,), model_epoch=7), gain=2.0, tolerance_px=0.4, time_limit_s=60.0,
-            follow_markers=follow, follow_seen=shown or {},
+            follow_markers=follow, follow_seen=shown or {}, damping=damping,
         )  # fmt: skip
         return self.bench.reply(RunGoal(goal))
 
@@ -117,11 +118,15 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turns", [False, True])
-def test_features_that_go_with_a_target_are_followed(benches: Any, kind: str, turns: bool) -> None:
+@pytest.mark.parametrize("damping", [0.0, 0.4])
+def test_features_that_go_with_a_target_are_followed(
+    benches: Any, kind: str, turns: bool, damping: float
+) -> None:
+    """Damping holds back no motion that the target's asks for."""
     cell = Cell(benches(1, noise_px=NOISE_PX).ready())
     moving, own = KINDS[kind]
     fixed = cell.bench.truth.points(BASE)[list(own)]
-    assert cell.send(kind, moving, fixed, PART).accepted
+    assert cell.send(kind, moving, fixed, PART, damping=damping).accepted
     cell.run(0.3)
     middle = cell.part[:, :3].mean(axis=0)
     way = turning(middle, np.array([0.2, 0.1, 1.0]), 0.3) if turns else sliding(1)
