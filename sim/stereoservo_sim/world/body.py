@@ -37,6 +37,11 @@ class MarkerBody:
         )
 
     @property
+    def marker_radii(self) -> FloatArray:
+        """Radius of each marker, (m,) [m]."""
+        return np.concatenate([np.full(len(face.ids), face.radius) for face in self.faces])
+
+    @property
     def marker_normals(self) -> FloatArray:
         """Outward unit normal at each marker in the flange's frame, (m, 3)."""
         return np.concatenate(
