@@ -39,12 +39,14 @@ FINE_PX = 4.0
 """Half the width of the last search, and how near another edge may be."""
 NEAR_PX = 6.0
 """Least of a search beside an expected edge."""
+SETTLED_PX = 0.3
+"""By how much vertices may still move where the last search found the edges."""
 PRIOR_PX = 4.0
 """Rms by which a prior may be off the part's shape, beside its own deviations."""
-LEAST_EDGES = 5
-"""That must agree on a pose, whose seven numbers they give ten distances."""
-LEAST_SHARE = 0.5
-"""Of the edges in sight that are long enough."""
+LEAST_EDGES = 6
+"""That must agree on a pose, whose seven numbers they give twelve distances."""
+LEAST_SHARE = 0.6
+"""Of the edges in sight that are long and free enough to be looked for."""
 DISAGREE = 5.0
 """Standard deviations, per line, beyond which lines do not meet in one point."""
 
@@ -96,8 +98,8 @@ class EdgeDetector:
     """Detects the vertices of one part by its edges in one camera. One thread at a time.
 
     It remembers where the part was in the last frame, and forgets it where the sequence goes back or time has passed:
-    the same *series* of frames and priors gives the same observations. Nothing is reported unless half of the edges in
-    sight, and five, agree on a pose of the part. ``refused``: of the newest frame, why vertices are not reported.
+    the same *series* of frames and priors gives the same observations. Nothing is reported unless most of the edges in
+    sight, and six, agree on a pose of the part. ``refused``: of the newest frame, why vertices are not reported.
 
     Raises DriverError: ``option``, ``part`` at construction; ``image_format``, ``image_size`` by :meth:`detect`.
     Content never raises.
@@ -177,7 +179,7 @@ class EdgeDetector:
         sigma = float(np.sqrt(variances[good].mean()))
         if fitted is None or fitted[1] > PRIOR_PX + 2.0 * sigma:
             return None
-        return fitted[0], (min(self.options.search_px, NEAR_PX + 2.0 * sigma),)
+        return fitted[0], (min(self.options.search_px, max(FINE_PX, 3.0 + 3.0 * sigma)),)
 
     # -- the part in the image ---------------------------------------------------------------------------------
 
@@ -196,7 +198,10 @@ class EdgeDetector:
             better = pose_from_lines(self._part, pose, lines, 0.5) if len(lines) >= LEAST_EDGES else None
             if better is None:
                 return None
+            moved = float(np.abs(better.pixels(self._part.points) - pose.pixels(self._part.points)).max())
             pose = better
+            if moved < SETTLED_PX:
+                break
         off = np.abs(line_distances(self._part, pose, lines)[0]).max(axis=1)
         kept = {
             number: line for (number, line), px in zip(lines.items(), off.tolist(), strict=True)

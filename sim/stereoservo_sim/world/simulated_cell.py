@@ -14,7 +14,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo_sim.world.body import MarkerBody, roof_body
 from stereoservo_sim.world.camera_rig import PinholeCamera, StereoRig, inverse_pose, look_at, stereo_rig
 from stereoservo_sim.world.robots import RX90, Robot, flange_pose, shape_segments
-from stereoservo_sim.world.solid import wedge
+from stereoservo_sim.world.solid import LIGHT, wedge
 from stereoservo_sim.world.synthetic import rotation, translation
 from stereoservo_sim.world.workpiece import Moved, Workpiece, plate_body
 
@@ -162,10 +162,10 @@ def demo_cell() -> SimulatedCell:
     return SimulatedCell(robot=RX90, body=body, rig=rig, base=base)
 
 
-@lru_cache(maxsize=1)
-def solid_cell() -> SimulatedCell:
-    """The embedded cell with a solid without markers on its flange."""
-    return replace(demo_cell(), body=wedge())
+@lru_cache(maxsize=8)
+def solid_cell(light: tuple[float, float, float] = LIGHT) -> SimulatedCell:
+    """The embedded cell with a solid without markers on its flange, and the direction of its ``light``."""
+    return replace(demo_cell(), body=replace(wedge(), light=np.array(light)))
 
 
 @lru_cache(maxsize=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,8 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.world.body import MarkerBody
 
 FIRST_ID = 400
+LIGHT = (-0.6, -0.6, 0.8)
+"""Towards the lamp of the embedded cell, above and behind its cameras."""
 AMBIENT, DIFFUSE = 45.0, 165.0
 """Grey levels of a face in no light, and what light from straight in front adds."""
 
@@ -24,7 +27,7 @@ class SolidBody(MarkerBody):
 
     vertices: FloatArray
     outlines: tuple[tuple[int, ...], ...]
-    light: FloatArray = field(default_factory=lambda: np.array([-0.6, -0.6, 0.8]))
+    light: FloatArray = field(default_factory=lambda: np.array(LIGHT))
     first_id: int = FIRST_ID
 
     @property
@@ -89,3 +92,15 @@ def wedge(
     sides = tuple((k, (k + 1) % count, (k + 1) % count + count, k + count) for k in range(count))
     outlines = (tuple(range(count)), tuple(range(count, 2 * count)), *sides)
     return SolidBody((), np.zeros((0, 4, 4)), np.concatenate([base, upper]), outlines, first_id=first_id)
+
+
+def part_text(body: SolidBody, start: Mapping[str, Mapping[int, tuple[float, float]]]) -> str:
+    """The part file of a solid for the detector ``edges``; ``start``: by camera, pixels of its vertices by id."""
+    lines = ["schema = 1"]
+    for marker, point in zip(body.ids.tolist(), body.vertices.tolist(), strict=True):
+        lines.append(f"[[vertex]]\nid = {marker}\nat = [{', '.join(f'{x:.6f}' for x in point)}]")
+    lines += [f"[[face]]\nvertices = {[int(body.ids[row]) for row in outline]}" for outline in body.outlines]
+    for camera, pixels in start.items():
+        lines.append(f"[start.{camera}]")
+        lines += [f"{marker} = [{u:.1f}, {v:.1f}]" for marker, (u, v) in pixels.items()]
+    return "\n".join(lines) + "\n"
