@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoservo.daemon.taught_goals import TaughtGoal, TaughtModel
+from stereoservo.gateway.feature_alignment import align_features
 from stereoservo.gateway.marker_views import (
     MarkerViews,
     model_frame,
@@ -163,7 +164,10 @@ def _common_change(
     observations: MarkerObservations,
     same: bool,
 ) -> tuple[FrameChange, str]:
-    """Map of the common markers since the goal was taught, and a sentence on its evidence."""
+    """Map of the common features since the goal was taught, and a sentence on its evidence."""
+    if requested.lines or requested.planes:
+        family = family_between(old, new, same)
+        return align_features(requested, family, old, new, taught, observations, model)
     common = _common(requested, goal, model, observations)
     before, now = taught.subset(common), observed_views(observations, model, common)
     require_still(observations, common, "the common markers")
@@ -286,6 +290,8 @@ def _relative_to_cameras(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
             f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach anew"
         )
+    if requested.lines or requested.planes:
+        raise TransferError("the cameras ride on the arm: goals are carried over by markers alone, not by lines or planes")
     frame = model_frame(model)
     common = _common(requested, goal, model, observations)
     body = list(model.marker_ids)

@@ -75,12 +75,19 @@ class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", 
     ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
     relative to the ``common`` markers on the workpiece, which may have moved since. ``"cameras"``: the
     ``common`` markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen
-    when it was taught and now; empty: all that are both.
+    when it was taught and now; empty: all that are both. ``lines``: edges of the workpiece instead of markers, or
+    beside them (then only those in ``common`` that are named), each by two ids whose pixels lie on it in every image;
+    the two need not be the same places in two images, nor then and now. ``planes``: faces of it, each by ids whose
+    points lie on it, one or more seen when it was taught and three or more, perhaps others, now.
     """
 
     name: Name
     relative_to: Literal["workpiece", "cameras"] | None = None
     common: tuple[MarkerId, ...] = ()
+    lines: Annotated[tuple[tuple[MarkerId, MarkerId], ...], Meta(max_length=64)] = ()
+    planes: Annotated[
+        tuple[Annotated[tuple[MarkerId, ...], Meta(min_length=3, max_length=64)], ...], Meta(max_length=16)
+    ] = ()
 
 
 class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", forbid_unknown_fields=True):

@@ -1,8 +1,8 @@
 """Experiment: a part without markers is aligned by its edges, in rendered pictures; and a taught goal is carried over
 to a part that was moved, by its edges, beside the same by markers.
 
-Every cell differs in light, lens blur, noise, distance of the cameras and goal. The arm shows the goal, which is taught
-from the pictures, goes home, and is sent there. Errors are of noise-free projections of the part's vertices.
+Every cell differs in light, lens blur, noise, distance of the cameras and goal. The arm stands at the goal, which is taught
+from the pictures, goes away, and is sent back. Errors are of noise-free projections of the part's vertices.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ START_PX = 3.0
 LEAST_SEEN = 6
 """Vertices that each camera sees at the goal."""
 TOLERANCE_PX = 0.25
-HOLD_FRAMES = 8
-RATE_HZ, CAMERA_HZ = 100.0, 15.0
-TAUGHT_FRAMES = 12
+HOLD_FRAMES = 6
+RATE_HZ, CAMERA_HZ = 50.0, 10.0
+TAUGHT_FRAMES = 10
 LIMIT_S = 40.0
 REST_S = 1.0
 
@@ -118,9 +118,14 @@ def cell_of(setting: EdgeSetting) -> CellFile:
     return msgspec.structs.replace(
         cell,
         camera=tuple(msgspec.structs.replace(camera, options=options) for camera in cell.camera),
-        joints=msgspec.structs.replace(cell.joints, driver="fake", options={"rate_hz": RATE_HZ}),
+        joints=msgspec.structs.replace(cell.joints, driver="fake", options={"rate_hz": RATE_HZ, "start": named(setting.goal)}),
         servo=msgspec.structs.replace(cell.servo, rate_hz=RATE_HZ),
     )
+
+
+def named(q: FloatArray) -> dict[str, float]:
+    """Positions (n,) by joint name."""
+    return dict(zip(solid_cell().robot.joint_names, q.tolist(), strict=True))
 
 
 def align_part(setting: EdgeSetting) -> dict[str, Any]:
@@ -132,7 +137,7 @@ def align_part(setting: EdgeSetting) -> dict[str, Any]:
             marker: tuple((pixel + rng.uniform(-START_PX, START_PX, 2)).tolist())
             for marker, pixel in zip(world.body.ids.tolist(), pixels, strict=True)
         }
-        for name, pixels in world.truth_pixels(world.base).items()
+        for name, pixels in world.truth_pixels(setting.goal).items()
     }
     history = TrueJointHistory.in_memory(6, capacity=1 << 14)
     with tempfile.TemporaryDirectory(prefix="stereoservo-edges-") as scratch:
@@ -160,11 +165,9 @@ def _teach_and_reach(cell: LockstepCell, setting: EdgeSetting, model: CellModel)
     cell.update_model(ModelUpdate(model))
     cell.run_for(0.3)
     try:
-        operator.goal(JointTarget(dict(zip(cell.settings.joint_names, setting.goal.tolist(), strict=True))))
-        cell.run_for(0.4)
         operator.teach("goal", TAUGHT_FRAMES)
         taught = msgspec.structs.replace(operator.taught["goal"], model_epoch=None)
-        operator.home()
+        operator.goal(JointTarget(named(solid_cell(setting.light).base)))
         event = operator.goal(
             taught, law=setting.law, tolerance_px=TOLERANCE_PX, hold_frames=HOLD_FRAMES, time_limit_s=LIMIT_S, timeout_s=2 * LIMIT_S
         )
