@@ -189,7 +189,9 @@ class EdgeDetector:
         """The part's pose by its edges, and those that agree with it; None where too few do."""
         for half in widths:
             lines, _ = self._lines(image, pose, half, coarse=True)
-            better = pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
+            better = (
+                pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
+            )
             if better is None:
                 return None
             pose = better
@@ -238,8 +240,8 @@ class EdgeDetector:
             away = float(np.linalg.norm(point - expected[row]))
             if not sigma <= self.options.max_sigma_px:
                 found.refused[marker] = (
-                    f"its edges leave it uncertain by {sigma:.2f} px, {self.options.max_sigma_px:g} px is allowed: they "
-                    "are near-parallel, short or far from it"
+                    f"its edges leave it uncertain by {sigma:.2f} px, {self.options.max_sigma_px:g} px is allowed: "
+                    "they are near-parallel, short or far from it"
                 )
             elif squares > DISAGREE**2 * (len(there) - 1):
                 found.refused[marker] = f"its {len(there)} edges do not meet in one point"

@@ -66,7 +66,10 @@ class PartPose:
         """The pose after a step (7,) along `slopes`."""
         turn = np.asarray(cv2.Rodrigues(step[:3].reshape(3, 1))[0], dtype=np.float64)
         return replace(
-            self, R=turn @ self.R, t=self.t + step[3:6], focal=self.focal * float(np.exp(np.clip(step[6], -1, 1)))
+            self,
+            R=turn @ self.R,
+            t=self.t + step[3:6],
+            focal=self.focal * float(np.exp(np.clip(step[6], -1, 1))),
         )
 
 
@@ -119,7 +122,9 @@ def _solve(pose: PartPose, J: FloatArray, left: FloatArray, weights: FloatArray,
     return step
 
 
-def line_distances(part: Part, pose: PartPose, lines: dict[int, MeasuredLine]) -> tuple[FloatArray, FloatArray]:
+def line_distances(
+    part: Part, pose: PartPose, lines: dict[int, MeasuredLine]
+) -> tuple[FloatArray, FloatArray]:
     """Distances (n, 2) [px] of the ends of n measured lines from the part's edges in the pose, and their derivatives
     (n, 2, 7) by the pose, as `PartPose.slopes` has them.
     """
@@ -139,7 +144,9 @@ def line_distances(part: Part, pose: PartPose, lines: dict[int, MeasuredLine]) -
     return distances, by_pose
 
 
-def pose_from_lines(part: Part, pose: PartPose, lines: dict[int, MeasuredLine], scale_px: float) -> PartPose | None:
+def pose_from_lines(
+    part: Part, pose: PartPose, lines: dict[int, MeasuredLine], scale_px: float
+) -> PartPose | None:
     """Pose of least distance from measured lines, those far from it (beside ``scale_px``) counted little; None where
     the part would come behind the camera.
     """
@@ -151,7 +158,9 @@ def pose_from_lines(part: Part, pose: PartPose, lines: dict[int, MeasuredLine], 
         weights = np.sqrt(1.0 / (1.0 + (worst / scale_px) ** 2)) * np.ones((1, 2))
         step = _solve(pose, J.reshape(-1, 7), distances.ravel(), weights.ravel(), scale_px)
         # A step beyond a quarter turn, or the part's distance, is no refinement.
-        step = step / max(1.0, float(np.abs(step[:3]).max()) / 0.3, float(np.abs(step[3:6]).max()) / (0.3 * pose.t[2]))
+        step = step / max(
+            1.0, float(np.abs(step[:3]).max()) / 0.3, float(np.abs(step[3:6]).max()) / (0.3 * pose.t[2])
+        )
         pose = pose.stepped(step)
         if float(np.abs(step).max()) < CONVERGED:
             break

@@ -21,15 +21,19 @@ from stereoservo.gateway.point_alignment import (
 from stereoservo.geometry.alignment import AlignmentFrame, Family
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.incidence_alignment import MixedFeatures, align_incidences
+from stereoservo.geometry.lines import line_points, triangulate_lines
 from stereoservo.geometry.moved_cameras import FrameChange
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import TaughtTarget
+from stereoservo.messages.goals import Feature, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
+
+SEGMENT_PX = 0.5
+"""Of the ends of segments that a client states."""
 
 
 @dataclass(frozen=True)
 class CommonFeatures:
-    """What of a workpiece gives its motion: ids of ``points``, ``lines`` by two ids each, ``planes`` by their points."""
+    """What gives a workpiece's motion: ids of ``points``, ``lines`` by two ids each, ``planes`` by their points."""
 
     points: tuple[int, ...]
     lines: tuple[tuple[int, int], ...]
@@ -38,7 +42,9 @@ class CommonFeatures:
     @property
     def ids(self) -> list[int]:
         """All ids, sorted."""
-        return sorted({*self.points, *(m for line in self.lines for m in line), *(m for p in self.planes for m in p)})
+        return sorted(
+            {*self.points, *(m for line in self.lines for m in line), *(m for p in self.planes for m in p)}
+        )
 
     @property
     def names(self) -> list[str]:
@@ -98,8 +104,23 @@ def align_features(
         )
     note = f"{what} by {_counted(features)} as a {family} map, which agree within {worst:.2f} px"
     if left_out:
-        note += f"; left out, since they lie in a plane through two cameras' centres: edges {listed(left_out)}"
+        note += (
+            f"; left out, since they lie in a plane through two cameras' centres: edges {listed(left_out)}"
+        )
     return change, note
+
+
+def fixed_line(feature: Feature, model: CellModel) -> Feature:
+    """A line that is given by segments of its images, by two points in the model's frame. Raises TransferError."""
+    views = MarkerViews.empty(model, (0, 1))
+    for camera, ends in feature.segments.items():
+        views.add(camera, {k: (pixel, SEGMENT_PX) for k, pixel in enumerate(ends)})
+    try:
+        line = triangulate_lines(views.Ps, views.pixels[:, None], SEGMENT_PX)
+    except GeometryError as error:
+        raise TransferError(f"a fixed line by its segments: {error}") from error
+    points = line_points(line)[0]
+    return Feature(points=tuple((float(x), float(y), float(z), float(w)) for x, y, z, w in points))
 
 
 def _mixed(views: MarkerViews, features: CommonFeatures) -> MixedFeatures:
@@ -154,8 +175,8 @@ def _outlier(
     if best[1] < 0:
         return ""
     return (
-        f"; without {features.names[best[1]]} the others agree within {best[0]:.2f} px: it is another one, or was taken "
-        "for another"
+        f"; without {features.names[best[1]]} the others agree within {best[0]:.2f} px: it is another one, or was "
+        "taken for another"
     )
 
 

@@ -291,7 +291,9 @@ def _relative_to_cameras(
             f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach anew"
         )
     if requested.lines or requested.planes:
-        raise TransferError("the cameras ride on the arm: goals are carried over by markers alone, not by lines or planes")
+        raise TransferError(
+            "the cameras ride on the arm: goals are carried over by markers alone, not by lines or planes"
+        )
     frame = model_frame(model)
     common = _common(requested, goal, model, observations)
     body = list(model.marker_ids)

@@ -14,6 +14,7 @@ import msgspec
 from stereoservo.core.cycle import Event
 from stereoservo.daemon.taught_goals import TaughtGoal, taught_goal
 from stereoservo.gateway.cad_goals import synthesise
+from stereoservo.gateway.feature_alignment import fixed_line
 from stereoservo.gateway.goal_transfer import TransferredGoal, resolve
 from stereoservo.gateway.observation_cache import MarkerObservations, ObservationCache
 from stereoservo.gateway.persistence import TaughtStore
@@ -98,15 +99,26 @@ class TaughtGoalRegistry:
         return {camera: pixels for camera, pixels in seen.items() if pixels}
 
     def resolve_incidence(self, target: IncidenceTarget) -> IncidenceTarget:
-        """Incidences with static markers replaced by their current pixels. Raises TransferError."""
-        observations = self._seen()
-        incidences = tuple(
-            msgspec.structs.replace(spec, fixed=_static_feature(spec.fixed, observations))
-            if spec.fixed.markers
-            else spec
-            for spec in target.incidences
-        )
-        return msgspec.structs.replace(target, incidences=incidences)
+        """Incidences with static markers replaced by their current pixels, and lines by segments by points in the
+        model's frame. Raises TransferError.
+        """
+        observations, model = self._seen(), self._model()
+        epoch = target.model_epoch
+        incidences = []
+        for spec in target.incidences:
+            fixed = spec.fixed
+            if fixed.markers:
+                fixed = _static_feature(fixed, observations)
+            elif fixed.segments:
+                if model is None:
+                    raise TransferError("the cell has no model yet: calibrate first")
+                if epoch not in (None, model.epoch):
+                    raise TransferError(
+                        f"the goal is stated with model epoch {epoch}, the cell has {model.epoch}: state it anew"
+                    )
+                fixed, epoch = fixed_line(fixed, model), model.epoch
+            incidences.append(msgspec.structs.replace(spec, fixed=fixed))
+        return msgspec.structs.replace(target, incidences=tuple(incidences), model_epoch=epoch)
 
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())

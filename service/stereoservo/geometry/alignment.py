@@ -167,7 +167,9 @@ def align(
     up_old, up_new = upgrades(family, old, new)
     T = start_map(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
-    views = PointViews(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
+    views = PointViews(
+        new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used]
+    )
     # About the points' centroid, in units of their standard deviation: rotations and translations are then well
     # distinguished.
     local = local_frame(family, move_points(up_new, M_new[both])) @ up_new

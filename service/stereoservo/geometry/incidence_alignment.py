@@ -31,7 +31,7 @@ from stereoservo.geometry.cameras import (
     triangulate,
     triangulation_covariance,
 )
-from stereoservo.geometry.homogeneous import GeometryError, move_points, to_homogeneous
+from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.homography import unit_determinant
 from stereoservo.geometry.incidences import (
     Incidence,
@@ -196,9 +196,7 @@ class _Mixed:
     def residuals(self, T: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
         if not np.isfinite(T).all():
             raise np.linalg.LinAlgError("the map has diverged")
-        return np.concatenate(
-            [part.residuals(T, w) for part, w in zip(self.parts, whitening, strict=True)]
-        )
+        return np.concatenate([part.residuals(T, w) for part, w in zip(self.parts, whitening, strict=True)])
 
     def slopes(self, T: FloatArray, generators: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
         return np.concatenate(
@@ -206,7 +204,9 @@ class _Mixed:
         )
 
 
-def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
+def line_end_points(
+    Ps: FloatArray, segments: FloatArray, sigmas: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Two points (m, 2, 4), at depth 1, of each line of segments ``(c, m, 2, 2)`` [px], NaN where missing, and their
     covariance (m, 8, 8) for ends known to ``sigmas`` (c, m) [px].
 
@@ -219,9 +219,7 @@ def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) ->
     along = own[:, 1] - own[:, 0]
     planes = np.stack(
         [
-            np.einsum(
-                "mji,mj->mi", Ps[first], np.column_stack([along, -(along * own[:, end]).sum(axis=1)])
-            )
+            np.einsum("mji,mj->mi", Ps[first], np.column_stack([along, -(along * own[:, end]).sum(axis=1)]))
             for end in range(2)
         ],
         axis=1,
@@ -300,7 +298,9 @@ def align_incidences(
     found.sort(key=lambda pair: pair[0])
     squares, T = found[0]
     for other_squares, other in found[1:]:
-        if other_squares < squares + AMBIGUOUS and float(np.abs(other - T).max()) > APART * float(np.abs(T).max()):
+        if other_squares < squares + AMBIGUOUS and float(np.abs(other - T).max()) > APART * float(
+            np.abs(T).max()
+        ):
             raise GeometryError(
                 "degenerate",
                 "two maps bring the features onto their images alike; add a line or a point that tells them apart",
@@ -342,7 +342,9 @@ def _constraints(
     lost = np.flatnonzero(~(np.isfinite(M).all(axis=1) & np.isfinite(Y).all(axis=1)))
     if len(lost):
         raise GeometryError(
-            "too_few", f"point(s) {lost.tolist()} are not seen by two cameras, then and now", points=lost.tolist()
+            "too_few",
+            f"point(s) {lost.tolist()} are not seen by two cameras, then and now",
+            points=lost.tolist(),
         )
     pixels = np.nan_to_num(now.points)
     weights = np.where(np.isfinite(now.points).all(axis=2), 1.0 / now.sigmas, 0.0)
@@ -357,13 +359,9 @@ def _constraints(
         A, covariance = line_end_points(old.Ps, then.segments, then.line_sigmas)
         sigma = float(np.median(now.line_sigmas[np.isfinite(now.line_sigmas)]))
         B = line_points(triangulate_lines(new.Ps, now.segments, EPIPOLAR * sigma))
-        parts.append(
-            _Lines(new.Ps, A, covariance, image_lines(now.segments), now.segments, now.line_sigmas)
-        )
+        parts.append(_Lines(new.Ps, A, covariance, image_lines(now.segments), now.segments, now.line_sigmas))
         traces += (0.5 * np.trace(covariance, axis1=1, axis2=2)).tolist()
-        incidences += [
-            Incidence(a, b, now.segments[:, k]) for k, (a, b) in enumerate(zip(A, B, strict=True))
-        ]
+        incidences += [Incidence(a, b, now.segments[:, k]) for k, (a, b) in enumerate(zip(A, B, strict=True))]
     planes = [
         _on_plane(old, new, *views)
         for views in zip(then.on_planes, then.plane_sigmas, now.on_planes, now.plane_sigmas, strict=True)
@@ -487,9 +485,7 @@ def _metric_starts(
         if solved is not None:
             found.append(solved)
     found.sort(key=lambda pair: pair[0])
-    return [
-        unit_determinant(np.linalg.inv(up_new) @ T @ up_old, "the map") for _, T in found[:STARTS]
-    ]
+    return [unit_determinant(np.linalg.inv(up_new) @ T @ up_old, "the map") for _, T in found[:STARTS]]
 
 
 def _shift(

@@ -238,7 +238,9 @@ def _draw_solid(
         for outline, level, normal in zip(body.outlines, body.shades(pose), normals, strict=True)
         if normal @ (camera.centre - placed[outline[0]]) > 0.0
     ]
-    outlines = [pixels[rows] if camera.k1 == 0.0 else bend_outline(camera, pixels[rows]) for rows, _ in fronts]
+    outlines = [
+        pixels[rows] if camera.k1 == 0.0 else bend_outline(camera, pixels[rows]) for rows, _ in fronts
+    ]
     region = _region([(outline.min(axis=0), outline.max(axis=0)) for outline in outlines], camera)
     if region is None:
         return None

@@ -55,7 +55,9 @@ class SolidBody(MarkerBody):
     def marker_normals(self) -> FloatArray:
         """Mean unit normal of the faces that meet in each vertex, (n, 3)."""
         faces = self.face_normals
-        touching = np.array([[row in outline for outline in self.outlines] for row in range(len(self.vertices))])
+        touching = np.array(
+            [[row in outline for outline in self.outlines] for row in range(len(self.vertices))]
+        )
         normals = touching.astype(np.float64) @ faces
         mean: FloatArray = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         return mean
@@ -88,7 +90,9 @@ def wedge(
     ]  # sides stay plane: edges of the top are parallel to those of the base
     count = len(WEDGE_BASE)
     base = np.column_stack([scale * WEDGE_BASE, np.full(count, height[0])])
-    upper = np.column_stack([scale * np.array(top), np.full(count, height[0] + scale * (height[1] - height[0]))])
+    upper = np.column_stack(
+        [scale * np.array(top), np.full(count, height[0] + scale * (height[1] - height[0]))]
+    )
     sides = tuple((k, (k + 1) % count, (k + 1) % count + count, k + count) for k in range(count))
     outlines = (tuple(range(count)), tuple(range(count, 2 * count)), *sides)
     return SolidBody((), np.zeros((0, 4, 4)), np.concatenate([base, upper]), outlines, first_id=first_id)

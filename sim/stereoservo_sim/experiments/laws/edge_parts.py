@@ -118,7 +118,9 @@ def cell_of(setting: EdgeSetting) -> CellFile:
     return msgspec.structs.replace(
         cell,
         camera=tuple(msgspec.structs.replace(camera, options=options) for camera in cell.camera),
-        joints=msgspec.structs.replace(cell.joints, driver="fake", options={"rate_hz": RATE_HZ, "start": named(setting.goal)}),
+        joints=msgspec.structs.replace(
+            cell.joints, driver="fake", options={"rate_hz": RATE_HZ, "start": named(setting.goal)}
+        ),
         servo=msgspec.structs.replace(cell.servo, rate_hz=RATE_HZ),
     )
 
@@ -169,7 +171,12 @@ def _teach_and_reach(cell: LockstepCell, setting: EdgeSetting, model: CellModel)
         taught = msgspec.structs.replace(operator.taught["goal"], model_epoch=None)
         operator.goal(JointTarget(named(solid_cell(setting.light).base)))
         event = operator.goal(
-            taught, law=setting.law, tolerance_px=TOLERANCE_PX, hold_frames=HOLD_FRAMES, time_limit_s=LIMIT_S, timeout_s=2 * LIMIT_S
+            taught,
+            law=setting.law,
+            tolerance_px=TOLERANCE_PX,
+            hold_frames=HOLD_FRAMES,
+            time_limit_s=LIMIT_S,
+            timeout_s=2 * LIMIT_S,
         )
         cell.run_for(REST_S)
     except LockstepRefusalError as error:
