@@ -25,7 +25,7 @@ from stereoservo.geometry.lines import line_points, triangulate_lines
 from stereoservo.geometry.moved_cameras import FrameChange
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Feature, TaughtTarget
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 SEGMENT_PX = 0.5
 """Of the ends of segments that a client states."""
@@ -140,11 +140,11 @@ def _mixed(views: MarkerViews, features: CommonFeatures) -> MixedFeatures:
 
 def _require_seen(features: CommonFeatures, views: MarkerViews, when: str) -> None:
     """Raise TransferError for points and edges that fewer than two cameras see, and planes of too few points."""
-    seen = np.isfinite(views.pixels).all(axis=2)
+    seen: BoolArray = np.asarray(np.isfinite(views.pixels).all(axis=2))
 
     def cameras(ids: Iterable[int]) -> list[str]:
         rows = [views.ids.index(marker) for marker in ids]
-        return [name for name, there in zip(views.cameras, seen[:, rows].all(axis=1), strict=True) if there]
+        return [name for name, there in zip(views.cameras, seen[:, rows], strict=True) if bool(there.all())]
 
     named: list[tuple[str, Sequence[int]]] = [(f"point {marker}", (marker,)) for marker in features.points]
     named += [(f"edge {a}-{b}", (a, b)) for a, b in features.lines]

@@ -220,7 +220,7 @@ class PointViews:
 
 
 class ImageConstraints(Protocol):
-    """Whitened image errors of a map ``T`` (4, 4), as `PointViews` has them; ``whitening`` is of the class's own kind."""
+    """Whitened image errors of a map ``T`` (4, 4); what ``whitening`` gives is of the class's own kind."""
 
     def whitening(self, T: FloatArray) -> Any: ...
 

@@ -100,8 +100,8 @@ class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A point, line or plane: the span of one, two or three points, specified in exactly one way.
 
     ``markers``: of the moving body, as they move. ``points``: homogeneous, in the frame of the goal's ``model_epoch``.
-    ``pixels``: for each of two or more cameras the points' raw pixels, where they are. ``segments``: of a line, for each
-    of two or more cameras two raw pixels of its image, which need not be the same places in two images.
+    ``pixels``: for each of two or more cameras the points' raw pixels, where they are. ``segments``: of a line, for
+    each of two or more cameras two raw pixels of its image, which need not be the same places in two images.
     """
 
     markers: Annotated[tuple[MarkerId, ...], Meta(max_length=3)] = ()

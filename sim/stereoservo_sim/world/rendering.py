@@ -192,8 +192,8 @@ def draw_faces(
 ) -> Region | None:
     """Draw a body at ``body_pose`` (4, 4) into ``image`` (height, width), [grey levels], without blur and noise.
 
-    Of a solid the faces that look at the camera, shaded by its light. Faces turned away show their dull backs and are drawn first: the body is convex, so no face that looks
-    at the camera is hidden by another.
+    Of a solid the faces that look at the camera, shaded by its light. Else faces turned away show their dull backs and
+    are drawn first: the body is convex, so no face that looks at the camera is hidden by another.
 
     Returns:
         The region touched (left, top, right, bottom) [px], or None where nothing was drawn.

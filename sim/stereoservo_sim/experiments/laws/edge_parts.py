@@ -1,8 +1,7 @@
-"""Experiment: a part without markers is aligned by its edges, in rendered pictures; and a taught goal is carried over
-to a part that was moved, by its edges, beside the same by markers.
+"""Experiment: a part without markers is aligned by its edges, in rendered pictures.
 
-Every cell differs in light, lens blur, noise, distance of the cameras and goal. The arm stands at the goal, which is taught
-from the pictures, goes away, and is sent back. Errors are of noise-free projections of the part's vertices.
+Every cell differs in light, lens blur, noise, distance of the cameras and goal. The arm stands at the goal, which is
+taught from the pictures, goes away, and is sent back. Errors are of noise-free projections of the part's vertices.
 """
 
 from __future__ import annotations
