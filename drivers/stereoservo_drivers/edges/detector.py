@@ -45,8 +45,8 @@ PRIOR_PX = 4.0
 """Rms by which a prior may be off the part's shape, beside its own deviations."""
 LEAST_EDGES = 6
 """That must agree on a pose, whose seven numbers they give twelve distances."""
-LEAST_SHARE = 0.6
-"""Of the edges in sight that are long and free enough to be looked for."""
+LEAST_SHARE, LEAST_OF_ALL = 0.6, 0.4
+"""Of the edges in sight that are long and free enough to be looked for: of those where the image has steps, of all."""
 DISAGREE = 5.0
 """Standard deviations, per line, beyond which lines do not meet in one point."""
 
@@ -188,7 +188,7 @@ class EdgeDetector:
     ) -> tuple[PartPose, dict[int, MeasuredLine]] | None:
         """The part's pose by its edges, and those that agree with it; None where too few do."""
         for half in widths:
-            lines, _ = self._lines(image, pose, half, coarse=True)
+            lines, *_ = self._lines(image, pose, half, coarse=True)
             better = (
                 pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
             )
@@ -196,7 +196,7 @@ class EdgeDetector:
                 return None
             pose = better
         for _ in range(2):
-            lines, tried = self._lines(image, pose, FINE_PX, coarse=False)
+            lines, tried, steep = self._lines(image, pose, FINE_PX, coarse=False)
             better = pose_from_lines(self._part, pose, lines, 0.5) if len(lines) >= LEAST_EDGES else None
             if better is None:
                 return None
@@ -209,18 +209,23 @@ class EdgeDetector:
             number: line for (number, line), px in zip(lines.items(), off.tolist(), strict=True)
             if px <= self.options.max_residual_px
         }  # fmt: skip
-        return (pose, kept) if len(kept) >= max(LEAST_EDGES, LEAST_SHARE * tried) else None
+        needed = max(LEAST_EDGES, LEAST_SHARE * steep, LEAST_OF_ALL * tried)
+        return (pose, kept) if len(kept) >= needed else None
 
     def _lines(
         self, image: FloatArray, pose: PartPose, half: float, *, coarse: bool
-    ) -> tuple[dict[int, MeasuredLine], int]:
-        """Lines near the edges in sight by number, and how many edges were long and free enough to look for."""
+    ) -> tuple[dict[int, MeasuredLine], int, int]:
+        """Lines near the edges in sight by number, how many edges were long and free enough to look for, and at how
+        many of these the image has steps: where two faces look alike there is nothing to find.
+        """
         numbers, ends = segments_in_sight(self._part, pose)
         good = np.isfinite(ends).all(axis=(1, 2))
         numbers, ends = numbers[good], ends[good]
         profiles = take_profiles(image, ends, numbers, ends, half, FINE_PX)
         lines = measure_lines(profiles, ends, numbers, self.options.min_slope, coarse=coarse)
-        return lines, len(np.unique(profiles.edge))
+        steps = np.abs(profiles.slopes).max(axis=1, initial=0.0) >= self.options.min_slope
+        steep = sum(bool(steps[profiles.edge == number].mean() > 0.5) for number in np.unique(profiles.edge))
+        return lines, len(np.unique(profiles.edge)), steep
 
     def _vertices(self, pose: PartPose, lines: dict[int, MeasuredLine], size: tuple[int, int]) -> Vertices:
         found = Vertices([], [], [], {})

@@ -193,7 +193,7 @@ def fit_line(
     gets how many profiles have a place on it (0: there is no line), offset, tilt, their covariance (1 1, 1 2, 2 2)
     [px²] and the places' rms distance from it.
 
-    Places count by their slopes' squares, as noise moves them. The search begins at the line on which most places within
+    Places count by their slopes' squares. The search begins at the line on which most places within
     ``reach`` lie, or at 0 where reach is 0; ``half``: half the segment's length.
     """
     n, c = offsets.shape

@@ -13,8 +13,8 @@ from stereoservo_sim.world.body import MarkerBody
 FIRST_ID = 400
 LIGHT = (-0.6, -0.6, 0.8)
 """Towards the lamp of the embedded cell, above and behind its cameras."""
-AMBIENT, DIFFUSE = 45.0, 165.0
-"""Grey levels of a face in no light, and what light from straight in front adds."""
+AMBIENT, SKY, DIFFUSE = 25.0, 60.0, 130.0
+"""Grey levels of a face in no light, what the sky adds to one that looks up, and the lamp to one that looks at it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,10 @@ class SolidBody(MarkerBody):
     def shades(self, pose: FloatArray) -> FloatArray:
         """Grey levels (f,) of the faces with the body at ``pose`` (4, 4) in the world."""
         light = self.light / np.linalg.norm(self.light)
-        levels: FloatArray = AMBIENT + DIFFUSE * np.maximum(0.0, self.face_normals @ pose[:3, :3].T @ light)
+        normals = self.face_normals @ pose[:3, :3].T
+        levels: FloatArray = (
+            AMBIENT + 0.5 * SKY * (1.0 + normals[:, 2]) + DIFFUSE * np.maximum(0.0, normals @ light)
+        )
         return levels
 
 
