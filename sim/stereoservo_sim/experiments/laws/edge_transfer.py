@@ -34,6 +34,7 @@ from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
 from stereoservo_sim.world.simulated_cell import DEMO_GOALS, SimulatedCell, workpiece_cell
 from stereoservo_sim.world.solid import SolidBody, part_text, wedge
+from stereoservo_sim.world.synthetic import rotation
 from stereoservo_sim.world.workpiece import Moved, Workpiece
 
 ALLOWED = 1.5
@@ -43,6 +44,8 @@ BODY_PX = 0.05
 FRAMES = 4
 START_PX = 3.0
 FIRST_ID = 500
+FACING_DEG = (6.0, -25.0)
+"""Turns about the plates' x and then y [degrees] that let the solid's top look at the cameras."""
 HEIGHT = (0.0, 0.045)
 """Of the solid's base and top, before it is scaled [m]: no face is seen at a grazing angle."""
 WAYS = ("markers", "edges", "mixed")
@@ -104,6 +107,7 @@ def carry(seed: int) -> dict[str, Any]:
     )
     # The plates' front is their -z, the solid's its top at +z: half a turn about x.
     turned = solid.vertices * np.array([1.0, -1.0, -1.0]) + np.array([0.0, 0.0, solid.vertices[:, 2].max()])
+    turned = turned @ (rotation("y", FACING_DEG[1]) @ rotation("x", FACING_DEG[0]))[:3, :3].T
     light = rng.normal(size=3) * 0.3 + np.array([-0.6, -0.6, 0.8])
     solid = replace(solid, vertices=turned, light=light)
     edges = replace(plates, workpiece=Workpiece(solid, plates.workpiece.stand))
