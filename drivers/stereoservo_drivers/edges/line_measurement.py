@@ -33,7 +33,7 @@ LEAST_OFF_PX = 0.3
 MOST_SCATTER_PX = 0.5
 """Rms of places about their line at most."""
 CANDIDATES = 4
-INTERPOLATION = 1.5
+INTERPOLATION = 2.2
 """By how much the variance of a mean of places exceeds that of independent ones: neighbours share pixels."""
 
 

@@ -94,12 +94,10 @@ def test_a_moving_part_is_followed_without_a_prior(tmp_path):
     for k in range(12):
         q = CELL.base + 0.01 * k
         found = detector.detect(frame_of(picture(q, seed=k), k + 1), None)
-        truth = truth_of(CELL, q)
-        assert len(found.ids) >= 7
-        assert (
-            max(np.linalg.norm(p - truth[m]) for m, p in zip(found.ids.tolist(), found.pixels, strict=True))
-            < 0.6
-        )
+        truth, sigmas = truth_of(CELL, q), np.sqrt(found.covariances.trace(axis1=1, axis2=2))
+        assert len(found.ids) >= 5
+        for marker, pixel, sigma in zip(found.ids.tolist(), found.pixels, sigmas, strict=True):
+            assert np.linalg.norm(pixel - truth[marker]) < 5.0 * sigma + 0.3
 
 
 def test_hidden_edges_are_not_taken_for_others(tmp_path):
@@ -176,7 +174,7 @@ def test_a_line_is_measured_within_its_covariance_and_parallel_ones_have_no_cros
         (lambda t: t[: len(t) // 2].rstrip()[:-1] + "[", "TOML"),
         (lambda t: t.replace(f"id = {FIRST}\n", f"id = {FIRST + 1}\n"), "twice"),
         (lambda t: re.sub(r"vertices = \[\d+", "vertices = [7", t, count=1), "no vertex 7"),
-        (lambda t: t.replace("at = [", "at = [9", 1), "plane"),
+        (lambda t: t.replace("at = [", "at = [9.0, 0.0, 0.0]  # ", 1), "plane"),
         (lambda t: t.replace("[start.left]", "[start.right]"), "start.left is missing"),
         (lambda t: t[: t.index("[start.left]") + 12] + f"\n{FIRST} = [1.0, 2.0]\n", "names 1 vertices"),
         (lambda t: t + "999 = [3.0, 4.0]\n", "no vertex 999"),
