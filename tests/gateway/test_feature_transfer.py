@@ -43,7 +43,7 @@ def scene(seed, stratum="metric", sigma=0.05, wrong=False):
     goal = teach(model, cameras, placed(BODY, hand) | placed(then, before), rng, sigma)
     now = WORK | slid(rng) | on_face((201, 203, 204))
     if wrong:
-        now[104] = tuple(np.array(now[104]) + [0.02, 0.01, 0.0])
+        now[104] = tuple(np.add(now[104], (0.0, 0.02, 0.01)))
     sights = cameras.sights(placed(BODY, some_pose(rng)) | placed(now, after), rng, sigma)
     return goal, model, sights, placed(BODY, after @ np.linalg.inv(before) @ hand)
 
@@ -61,7 +61,7 @@ def scene(seed, stratum="metric", sigma=0.05, wrong=False):
 def test_a_goal_goes_along_by_edges_whose_ends_do_not_correspond(stratum, common, lines, planes):
     """The largest error stays within 5 stated deviations, and where all edges count near that by six markers."""
     ratios, ours, markers = [], [], []
-    for seed in range(6):  # 7 has an edge in a plane through both centres: another test
+    for seed in range(6):
         goal, model, sights, truth = scene(seed, stratum)
         found = resolve(TaughtTarget("pick", "workpiece", common, lines, planes), goal, model, sights)
         away = errors(found.target, Cameras(), truth)
@@ -69,7 +69,7 @@ def test_a_goal_goes_along_by_edges_whose_ends_do_not_correspond(stratum, common
         ours.append(float((away**2).mean()))
         by = resolve(TaughtTarget("pick", "workpiece", tuple(WORK)), goal, model, sights)
         markers.append(float((errors(by.target, Cameras(), truth) ** 2).mean()))
-        assert f"{len(lines)} edges" in found.note
+        assert " edges (10" in found.note
     assert max(ratios) < 5.0
     if len(lines) == len(LINES) and stratum == "metric":
         assert np.sqrt(np.mean(ours)) < 1.5 * np.sqrt(np.mean(markers))

@@ -72,7 +72,7 @@ class EdgeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _FoundPart:
     """A frame in which the part was found."""
 
     seq: int
@@ -113,7 +113,7 @@ class EdgeDetector:
         )
         compile_kernels()
         self._place = {marker: k for k, marker in enumerate(self._part.ids.tolist())}
-        self._seen: _Seen | None = None
+        self._seen: _FoundPart | None = None
         self.refused: dict[int, str] = {}
 
     def describe(self) -> DetectorDescription:
@@ -131,7 +131,7 @@ class EdgeDetector:
                 continue
             pose, lines = registered
             found = self._vertices(pose, lines, size)
-            self._seen = _Seen(frame.seq, frame.t_shutter_ns, size, pose, pose.pixels(self._part.points))
+            self._seen = _FoundPart(frame.seq, frame.t_shutter_ns, size, pose, pose.pixels(self._part.points))
             break
         if found is None:
             found = Vertices([], [], [], {-1: "no pose of the part explains enough edges"})

@@ -55,7 +55,7 @@ Seen = dict[str, dict[int, tuple[FloatArray, FloatArray]]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _CarryScene:
     """A cell, the poses (4, 4) of its workpiece then and now, and where its arm is away from it."""
 
     cell: SimulatedCell
@@ -122,8 +122,8 @@ def carry(seed: int) -> dict[str, Any]:
     row: dict[str, Any] = {"seed": seed, "blur_px": settings.blur_px, "noise_grey": settings.noise_grey}
     body = _body_seen(plates, goal, rng)
     truth = _carried_truth(plates, goal, now @ np.linalg.inv(then))
-    by_dots = _seen_twice(_Scene(plates, then, now, settings), rng, None)
-    by_edges = _seen_twice(_Scene(edges, then, now, settings), rng, solid)
+    by_dots = _seen_twice(_CarryScene(plates, then, now, settings), rng, None)
+    by_edges = _seen_twice(_CarryScene(edges, then, now, settings), rng, solid)
     row["markers_px"], row["refused"] = _error(
         model, body, *by_dots, TaughtTarget("goal", "workpiece"), truth
     )
@@ -176,12 +176,12 @@ def _carried_truth(cell: SimulatedCell, q: FloatArray, moved: FloatArray) -> dic
     }
 
 
-def _seen_twice(scene: _Scene, rng: np.random.Generator, solid: SolidBody | None) -> tuple[Seen, Seen]:
+def _seen_twice(scene: _CarryScene, rng: np.random.Generator, solid: SolidBody | None) -> tuple[Seen, Seen]:
     """The workpiece's features when the goal is taught and when it is sent."""
     return _seen(scene, scene.then, rng, solid), _seen(scene, scene.now, rng, solid)
 
 
-def _seen(scene: _Scene, pose: FloatArray, rng: np.random.Generator, solid: SolidBody | None) -> Seen:
+def _seen(scene: _CarryScene, pose: FloatArray, rng: np.random.Generator, solid: SolidBody | None) -> Seen:
     seen: Seen = {}
     part = scene.cell.workpiece
     assert part is not None
