@@ -14,9 +14,9 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.simulated_arm import cell_of_context
+from stereoservo_sim.world.body import LIGHT
 from stereoservo_sim.world.history import FILE_NAME, HistoryError, TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell, solid_cell, workpiece_cell
-from stereoservo_sim.world.solid import LIGHT
 from stereoservo_sim.world.workpiece import Moved, MovedFile, MovedFileError, moved_pose
 
 NonNegative = Annotated[float, Meta(ge=0)]

@@ -6,9 +6,8 @@ import pytest
 
 from stereoservo.cli.goal.target_options import target_tree
 from stereoservo.cli.output import CommandError
-from stereoservo.gateway.feature_alignment import fixed_line
 from stereoservo.gateway.goal_transfer import resolve
-from stereoservo.gateway.point_alignment import TransferError
+from stereoservo.gateway.point_alignment import TransferError, fixed_line
 from stereoservo.messages.goals import Feature, TaughtTarget
 
 from .scene import BODY, WORK, Cameras, make_model, placed, some_pose, teach

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereoservo.daemon.taught_goals import TaughtGoal, TaughtModel
-from stereoservo.gateway.feature_alignment import align_features
 from stereoservo.gateway.marker_views import (
     MarkerViews,
     model_frame,
@@ -27,6 +26,7 @@ from stereoservo.gateway.point_alignment import (
     MIN_MARKERS,
     RESIDUAL_PX,
     TransferError,
+    align_features,
     align_points,
     listed,
     reproject_set_points,

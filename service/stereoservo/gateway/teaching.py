@@ -14,11 +14,10 @@ import msgspec
 from stereoservo.core.cycle import Event
 from stereoservo.daemon.taught_goals import TaughtGoal, taught_goal
 from stereoservo.gateway.cad_goals import synthesise
-from stereoservo.gateway.feature_alignment import fixed_line
 from stereoservo.gateway.goal_transfer import TransferredGoal, resolve
 from stereoservo.gateway.observation_cache import MarkerObservations, ObservationCache
 from stereoservo.gateway.persistence import TaughtStore
-from stereoservo.gateway.point_alignment import TransferError
+from stereoservo.gateway.point_alignment import TransferError, fixed_line
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Feature, IncidenceTarget, MarkerId, Pixel, TaughtTarget

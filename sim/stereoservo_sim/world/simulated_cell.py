@@ -11,10 +11,9 @@ import numpy as np
 
 from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import BoolArray, FloatArray
-from stereoservo_sim.world.body import MarkerBody, roof_body
+from stereoservo_sim.world.body import LIGHT, MarkerBody, roof_body, wedge
 from stereoservo_sim.world.camera_rig import PinholeCamera, StereoRig, inverse_pose, look_at, stereo_rig
 from stereoservo_sim.world.robots import RX90, Robot, flange_pose, shape_segments
-from stereoservo_sim.world.solid import LIGHT, wedge
 from stereoservo_sim.world.synthetic import rotation, translation
 from stereoservo_sim.world.workpiece import Moved, Workpiece, plate_body
 

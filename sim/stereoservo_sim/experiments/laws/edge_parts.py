@@ -25,10 +25,10 @@ from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator, Lo
 from stereoservo_sim.experiments.experiment import draw_sorted
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.summaries import wilson
+from stereoservo_sim.world.body import LIGHT, part_text
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell, solid_cell
-from stereoservo_sim.world.solid import LIGHT, part_text
 from stereoservo_sim.world.workpiece import Moved
 
 LIMIT_PX = 0.5

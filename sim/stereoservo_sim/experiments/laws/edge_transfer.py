@@ -29,11 +29,10 @@ from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_drivers.edges.detector import EdgeDetector
 from stereoservo_sim.experiments.experiment import draw_sorted
 from stereoservo_sim.progress import ProgressCall
-from stereoservo_sim.world.body import MarkerBody
+from stereoservo_sim.world.body import MarkerBody, SolidBody, part_text, wedge
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
 from stereoservo_sim.world.simulated_cell import DEMO_GOALS, SimulatedCell, workpiece_cell
-from stereoservo_sim.world.solid import SolidBody, part_text, wedge
 from stereoservo_sim.world.synthetic import rotation
 from stereoservo_sim.world.workpiece import Moved, Workpiece
 
@@ -71,15 +70,12 @@ def run_edge_transfer(*, seeds: int, seed: int, progress: ProgressCall) -> dict[
         progress("goals", k, seeds)
         rows.append(carry(seed + k))
     done = [row for row in rows if all(row[f"{way}_px"] is not None for way in WAYS)]
-    rms = {
-        way: float(np.sqrt(np.mean([row[f"{way}_px"] ** 2 for row in done]))) if done else None
-        for way in WAYS
-    }
-    ratios = {way: rms[way] / rms["markers"] for way in WAYS[1:]} if done else {}
+    rms = {way: float(np.sqrt(np.mean([row[f"{way}_px"] ** 2 for row in done]))) for way in WAYS if done}
+    ratios = {way: rms[way] / rms["markers"] for way in WAYS[1:] if done}
     return {
         "experiment": "edge-transfer",
         "title": f"edge-transfer: {len(done)} of {seeds} goals carried over every way; errors of set-points, rms "
-        + ", ".join(f"{way} {value:.3f} px" for way, value in rms.items() if value is not None)
+        + ", ".join(f"{way} {value:.3f} px" for way, value in rms.items())
         + "; over markers: "
         + ", ".join(f"{way} {value:.2f}" for way, value in ratios.items()),
         "rows": rows,
