@@ -14,8 +14,9 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverContext, DriverError, Frame
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.simulated_arm import cell_of_context
+from stereoservo_sim.world.body import LIGHT
 from stereoservo_sim.world.history import FILE_NAME, HistoryError, TrueJointHistory
-from stereoservo_sim.world.simulated_cell import SimulatedCell, workpiece_cell
+from stereoservo_sim.world.simulated_cell import SimulatedCell, solid_cell, workpiece_cell
 from stereoservo_sim.world.workpiece import Moved, MovedFile, MovedFileError, moved_pose
 
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -56,7 +57,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
     what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: there
     is one beside the body; the file ``simulated-workpiece.json`` there has its pose or motion for every frame
-    (`stereoservo_sim.world.workpiece`), and with cameras on the arm that of the body.
+    (`stereoservo_sim.world.workpiece`), and with cameras on the arm that of the body. ``solid``: the arm holds a solid
+    without markers in place of the marker body, and ``light`` is towards the lamp that shades it, in the world.
     Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
     ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
     after activation without frames; ``freeze_after_s``: from then on the picture stands still though frames keep
@@ -70,6 +72,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     moved: Moved = Moved()
     bumps: tuple[Bump, ...] = ()
     workpiece: bool = False
+    solid: bool = False
+    light: tuple[float, float, float] = LIGHT
     rate_hz: Annotated[float, Meta(ge=1, le=1000)] = 30.0
     latency_s: NonNegative = 0.012
     told_latency_s: NonNegative | None = None
@@ -329,6 +333,15 @@ class SimulatedCamera:
 
 
 def _cell_of(options: CameraOptions, context: DriverContext, driver: str) -> SimulatedCell:
+    if options.solid:
+        if context.mount != "eye_to_hand" or context.arm.get("urdf") or options.workpiece:
+            raise DriverError(
+                "option",
+                f"driver {driver!r}: solid: one is simulated on the embedded arm only, before standing cameras (mount "
+                "'eye_to_hand') and without a workpiece",
+                mount=context.mount,
+            )
+        return solid_cell(options.light)
     if not options.workpiece:
         return cell_of_context(context.arm, context, driver)
     if context.mount != "eye_to_hand" or context.arm.get("urdf"):

@@ -26,6 +26,7 @@ from stereoservo.gateway.point_alignment import (
     MIN_MARKERS,
     RESIDUAL_PX,
     TransferError,
+    align_features,
     align_points,
     listed,
     reproject_set_points,
@@ -163,7 +164,10 @@ def _common_change(
     observations: MarkerObservations,
     same: bool,
 ) -> tuple[FrameChange, str]:
-    """Map of the common markers since the goal was taught, and a sentence on its evidence."""
+    """Map of the common features since the goal was taught, and a sentence on its evidence."""
+    if requested.lines or requested.planes:
+        family = family_between(old, new, same)
+        return align_features(requested, family, old, new, taught, observations, model)
     common = _common(requested, goal, model, observations)
     before, now = taught.subset(common), observed_views(observations, model, common)
     require_still(observations, common, "the common markers")
@@ -285,6 +289,10 @@ def _relative_to_cameras(
         raise TransferError(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
             f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach anew"
+        )
+    if requested.lines or requested.planes:
+        raise TransferError(
+            "the cameras ride on the arm: goals are carried over by markers alone, not by lines or planes"
         )
     frame = model_frame(model)
     common = _common(requested, goal, model, observations)

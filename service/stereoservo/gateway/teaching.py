@@ -17,7 +17,7 @@ from stereoservo.gateway.cad_goals import synthesise
 from stereoservo.gateway.goal_transfer import TransferredGoal, resolve
 from stereoservo.gateway.observation_cache import MarkerObservations, ObservationCache
 from stereoservo.gateway.persistence import TaughtStore
-from stereoservo.gateway.point_alignment import TransferError
+from stereoservo.gateway.point_alignment import TransferError, fixed_line
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Feature, IncidenceTarget, MarkerId, Pixel, TaughtTarget
@@ -100,23 +100,28 @@ class TaughtGoalRegistry:
     def resolve_incidence(
         self, target: IncidenceTarget, follow: tuple[MarkerId, ...] = ()
     ) -> tuple[IncidenceTarget, dict[str, dict[int, Pixel]]]:
-        """Incidences with markers of the scene replaced by their current pixels; and, where some were, where the
-        markers to ``follow`` are in these pictures (raw pixels by camera). Raises TransferError.
+        """Incidences with markers of the scene replaced by their current pixels, and lines by segments by points in
+        the model's frame; and, where markers were, where those to ``follow`` are in these pictures (raw pixels by
+        camera). Raises TransferError.
         """
-        observations = self._seen()
-        incidences = tuple(
-            msgspec.structs.replace(spec, fixed=_scene_feature(spec.fixed, observations, bool(follow)))
-            if spec.fixed.markers
-            else spec
-            for spec in target.incidences
-        )
-        seen: dict[str, dict[int, Pixel]] = {}
-        if any(spec.fixed.markers for spec in target.incidences):
-            for camera, shown in observations.items():
-                pixels = {marker: shown[marker].pixel for marker in follow if marker in shown}
-                if pixels:
-                    seen[camera] = pixels
-        return msgspec.structs.replace(target, incidences=incidences), seen
+        observations, epoch = self._seen(), target.model_epoch
+        incidences, seen = [], {}
+        for spec in target.incidences:
+            fixed = spec.fixed
+            if fixed.markers:
+                fixed = _scene_feature(fixed, observations, bool(follow))
+                seen = _pixels_of(follow, observations)
+            elif fixed.segments:
+                model = self._model()
+                if model is None:
+                    raise TransferError("the cell has no model yet: calibrate first")
+                if epoch not in (None, model.epoch):
+                    raise TransferError(
+                        f"the goal is stated with model epoch {epoch}, the cell has {model.epoch}: state it anew"
+                    )
+                fixed, epoch = fixed_line(fixed, model), model.epoch
+            incidences.append(msgspec.structs.replace(spec, fixed=fixed))
+        return msgspec.structs.replace(target, incidences=tuple(incidences), model_epoch=epoch), seen
 
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())
@@ -134,6 +139,17 @@ class TaughtGoalRegistry:
             accepted=False, origin="gateway",
         )  # fmt: skip
         return False
+
+
+def _pixels_of(
+    markers: tuple[MarkerId, ...], observations: MarkerObservations
+) -> dict[str, dict[int, Pixel]]:
+    """Where ``markers`` are seen now, by camera and marker; cameras that see none are not in it."""
+    found = {
+        camera: {marker: shown[marker].pixel for marker in markers if marker in shown}
+        for camera, shown in observations.items()
+    }
+    return {camera: pixels for camera, pixels in found.items() if pixels}
 
 
 def _scene_feature(feature: Feature, observations: MarkerObservations, may_move: bool) -> Feature:

@@ -443,13 +443,18 @@ def check_taught(target: TaughtTarget, context: GoalContext) -> list[str]:
     problems = []
     if target.name not in context.taught:
         problems.append(f"target.name: no taught goal {target.name!r}; taught: {listed(context.taught)}")
+    features = {"lines": target.lines, "planes": target.planes}
+    for key, given in {"common": target.common, **features}.items():
+        if given and target.relative_to is None:
+            problems.append(
+                f"target.{key}: {listed(given)} belongs to relative_to; 'workpiece' and 'cameras' are valid there"
+            )
+    for key, given in features.items():
+        for k, ids in enumerate(given):
+            problems += check_markers(f"target.{key}[{k}]", ids, context, body=False)
     if not target.common:
         return problems
-    if target.relative_to is None:
-        problems.append(
-            f"target.common: {listed(target.common)} belongs to relative_to; 'workpiece' and 'cameras' are valid there"
-        )
-    if len(set(target.common)) < MIN_MARKERS:
+    if len(set(target.common)) < MIN_MARKERS and not (target.lines or target.planes):
         problems.append(
             f"target.common: {len(set(target.common))} marker(s) ({listed(target.common)}); 5 are needed, with a "
             f"metric model {MIN_MARKERS}"
@@ -496,12 +501,18 @@ def check_incidence(target: IncidenceTarget, context: GoalContext) -> list[str]:
 def _check_feature(
     where: str, feature: Feature, kind: str, has_epoch: bool, context: GoalContext
 ) -> list[str]:
-    given = [way for way in ("markers", "points", "pixels") if getattr(feature, way)]
+    given = [way for way in ("markers", "points", "pixels", "segments") if getattr(feature, way)]
     if where.endswith("moving") and given != ["markers"]:
         return [f"{where}: given by {listed(given)}; what moves is given by markers of the body"]
     if len(given) != 1:
-        return [f"{where}: given by {listed(given)}; exactly one of markers, points, pixels is valid"]
+        return [
+            f"{where}: given by {listed(given)}; exactly one of markers, points, pixels, segments is valid"
+        ]
     need = POINTS_OF[kind]
+    if feature.segments:
+        if kind != "line":
+            return [f"{where}.segments: are images of a line; a {kind} is given by points, pixels or markers"]
+        return _check_pixels(f"{where}.segments", feature.segments, kind, context)
     if feature.pixels:
         return _check_pixels(f"{where}.pixels", feature.pixels, kind, context)
     count = len(feature.markers or feature.points)

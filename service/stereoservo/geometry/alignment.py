@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from scipy.linalg import expm
@@ -64,7 +64,7 @@ def family_between(old: AlignmentFrame, new: AlignmentFrame, same_scale: bool) -
     return "affine" if old.to_affine is not None and new.to_affine is not None else "projective"
 
 
-def _algebra(family: Family) -> FloatArray:
+def algebra(family: Family) -> FloatArray:
     """Basis (k, 4, 4) of the group's Lie algebra, with trace 0, so that determinants are preserved."""
     units = np.eye(16).reshape(16, 4, 4)
     moves = [units[3], units[7], units[11]]
@@ -80,8 +80,8 @@ def _algebra(family: Family) -> FloatArray:
     return np.array([*off, *stretch])
 
 
-def _upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[FloatArray, FloatArray]:
-    """Maps from either frame to the one in which `_algebra` holds."""
+def upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[FloatArray, FloatArray]:
+    """Maps from either frame to the one in which `algebra` holds."""
     pairs = {"rigid": "to_euclidean", "similar": "to_euclidean", "affine": "to_affine"}
     if family == "projective":
         return np.eye(4), np.eye(4)
@@ -164,15 +164,17 @@ def align(
         new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both]
     )
     _refuse_flat(family, M_new[both], covariance_px, called[both].tolist())
-    up_old, up_new = _upgrades(family, old, new)
-    T = _start(family, M_old[both], M_new[both], up_old, up_new)
+    up_old, up_new = upgrades(family, old, new)
+    T = start_map(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
-    views = _Views(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
+    views = PointViews(
+        new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used]
+    )
     # About the points' centroid, in units of their standard deviation: rotations and translations are then well
     # distinguished.
-    local = _local(family, move_points(up_new, M_new[both])) @ up_new
-    generators = np.linalg.inv(local) @ _algebra(family) @ local
-    T = _descend(T, generators, views)
+    local = local_frame(family, move_points(up_new, M_new[both])) @ up_new
+    generators = np.linalg.inv(local) @ algebra(family) @ local
+    T = descend(T, generators, views)
     whitening = views.whitening(T)
     whitened, J = views.residuals(T, whitening), views.slopes(T, generators, whitening)
     _, singular, rows = np.linalg.svd(J, full_matrices=False)
@@ -186,7 +188,7 @@ def align(
 
 
 @dataclass(frozen=True)
-class _Views:
+class PointViews:
     """Points ``(n, 4)`` and their pixels ``(c, n, 2)`` with weights ``(c, n)``, 0 where missing."""
 
     Ps: FloatArray
@@ -217,7 +219,17 @@ class _Views:
         return slopes
 
 
-def _descend(T: FloatArray, generators: FloatArray, views: _Views) -> FloatArray:
+class ImageConstraints(Protocol):
+    """Whitened image errors of a map ``T`` (4, 4); what ``whitening`` gives is of the class's own kind."""
+
+    def whitening(self, T: FloatArray) -> Any: ...
+
+    def residuals(self, T: FloatArray, whitening: Any) -> FloatArray: ...
+
+    def slopes(self, T: FloatArray, generators: FloatArray, whitening: Any) -> FloatArray: ...
+
+
+def descend(T: FloatArray, generators: FloatArray, views: ImageConstraints) -> FloatArray:
     """Gauss-Newton on the group; the whitening follows the solution, and is fixed within a step."""
     for _ in range(ITERATIONS):
         whitening = views.whitening(T)
@@ -238,7 +250,7 @@ def _descend(T: FloatArray, generators: FloatArray, views: _Views) -> FloatArray
     return T
 
 
-def _start(
+def start_map(
     family: Family, M_old: FloatArray, M_new: FloatArray, up_old: FloatArray, up_new: FloatArray
 ) -> FloatArray:
     """A first map from both reconstructions, ``|det| = 1``, with the sign that keeps points in front."""
@@ -257,7 +269,7 @@ def _similarity(x: FloatArray, y: FloatArray, family: Family) -> FloatArray:
     return similarity_from_points(x, y, scaled=family == "similar")
 
 
-def _local(family: Family, X: FloatArray) -> FloatArray:
+def local_frame(family: Family, X: FloatArray) -> FloatArray:
     """Coordinates of the points ``(n, 4)`` of an upgraded frame relative to their centroid."""
     if family == "projective":
         return whitener(X)

@@ -76,12 +76,19 @@ class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", 
     ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
     relative to the ``common`` markers on the workpiece, which may have moved since. ``"cameras"``: the
     ``common`` markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen
-    when it was taught and now; empty: all that are both.
+    when it was taught and now; empty: all that are both. ``lines``: edges of the workpiece instead of markers, or
+    beside them (then only those in ``common`` that are named), each by two ids whose pixels lie on it in every image;
+    the two need not be the same places in two images, nor then and now. ``planes``: faces of it, each by ids whose
+    points lie on it, one or more seen when it was taught and three or more, perhaps others, now.
     """
 
     name: Name
     relative_to: Literal["workpiece", "cameras"] | None = None
     common: tuple[MarkerId, ...] = ()
+    lines: Annotated[tuple[tuple[MarkerId, MarkerId], ...], Meta(max_length=64)] = ()
+    planes: Annotated[
+        tuple[Annotated[tuple[MarkerId, ...], Meta(min_length=3, max_length=64)], ...], Meta(max_length=16)
+    ] = ()
 
 
 class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", forbid_unknown_fields=True):
@@ -94,12 +101,14 @@ class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A point, line or plane: the span of one, two or three points, specified in exactly one way.
 
     ``markers``: of the moving body, as they move. ``points``: homogeneous, in the frame of the goal's ``model_epoch``.
-    ``pixels``: for each of two or more cameras the points' raw pixels, where they are.
+    ``pixels``: for each of two or more cameras the points' raw pixels, where they are. ``segments``: of a line, for
+    each of two or more cameras two raw pixels of its image, which need not be the same places in two images.
     """
 
     markers: Annotated[tuple[MarkerId, ...], Meta(max_length=3)] = ()
     points: Annotated[tuple[Homogeneous, ...], Meta(max_length=3)] = ()
     pixels: dict[str, Annotated[tuple[Pixel, ...], Meta(max_length=3)]] = {}
+    segments: dict[str, tuple[Pixel, Pixel]] = {}
 
 
 IncidenceKind = Literal[

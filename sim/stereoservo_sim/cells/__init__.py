@@ -8,9 +8,10 @@ from pathlib import Path
 ARMS = ("panda", "iiwa", "xarm", "scara", "gantry", "pan_tilt", "rx90", "twist")
 """By name: cells of other arms, each of a URDF file and a search for its place; ``twist``: one that takes Cartesian
 velocities."""
-CELLS = ("demo", "wide", "eye_in_hand", "workpiece", "conveyor", "hil-can", "hil-video", *ARMS)
+CELLS = ("demo", "wide", "eye_in_hand", "workpiece", "conveyor", "edges", "hil-can", "hil-video", *ARMS)
 """By name: the embedded cell; with lenses that bend; with the cameras on the arm; with a workpiece beside the body;
-with the cameras on the arm before a conveyor; the embedded cell on a CAN bus; the same with cameras that are streams
+with the cameras on the arm before a conveyor; with a part without
+markers, by its edges; the embedded cell on a CAN bus; the same with cameras that are streams
 over HTTP; those of other arms."""
 
 

@@ -20,7 +20,7 @@ from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.world.arms.arm_cell import cell_of, place_of
 from stereoservo_sim.world.arms.arm_goals import goals_of
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
-from stereoservo_sim.world.simulated_cell import SimulatedCell, workpiece_cell
+from stereoservo_sim.world.simulated_cell import SimulatedCell, solid_cell, workpiece_cell
 from stereoservo_sim.world.workpiece import Moved
 
 POLL_S = 1.0
@@ -35,9 +35,12 @@ def true_cell(cell: CellFile, folder: Path = Path()) -> SimulatedCell:
     """
     options = [_simulated_options(section, cell) for section in cell.camera]
     shown = any(option.get("workpiece", False) for option in options)
-    simulated = (
-        workpiece_cell() if shown else cell_of(place_of(cell.arm_options), cell.camera[0].mount, folder)
-    )
+    if shown:
+        simulated = workpiece_cell()
+    elif any(option.get("solid", False) for option in options):
+        simulated = solid_cell()
+    else:
+        simulated = cell_of(place_of(cell.arm_options), cell.camera[0].mount, folder)
     cameras = []
     for section, option in zip(cell.camera, options, strict=True):
         view = option.get("view") or section.name

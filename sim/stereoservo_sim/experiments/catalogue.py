@@ -178,6 +178,18 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(3),),
         ),
         Experiment(
+            "edge-parts",
+            "a part without markers aligned by its edges, in rendered cells of other lights, lenses and distances",
+            "laws.edge_parts",
+            (repetitions(10),),
+        ),
+        Experiment(
+            "edge-transfer",
+            "goals carried over to a moved workpiece by its edges, beside the same by markers, from rendered pictures",
+            "laws.edge_transfer",
+            (repetitions(20),),
+        ),
+        Experiment(
             "singularities",
             "goals from wrist, elbow and shoulder singularities by every law: reached, refused, time-outs",
             "laws.singularities",

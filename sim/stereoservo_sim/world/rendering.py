@@ -19,7 +19,7 @@ import numpy.typing as npt
 from stereoservo.geometry.distortion import distort
 from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo_sim.world.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
-from stereoservo_sim.world.body import MarkerBody
+from stereoservo_sim.world.body import MarkerBody, SolidBody
 from stereoservo_sim.world.camera_rig import PinholeCamera, project
 from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
@@ -191,12 +191,14 @@ def draw_faces(
 ) -> Region | None:
     """Draw a body at ``body_pose`` (4, 4) into ``image`` (height, width), [grey levels], without blur and noise.
 
-    Faces turned away show their dull backs and are drawn first: the body is convex, so no face that looks
-    at the camera is hidden by another.
+    Of a solid the faces that look at the camera, shaded by its light. Else faces turned away show their dull backs and
+    are drawn first: the body is convex, so no face that looks at the camera is hidden by another.
 
     Returns:
         The region touched (left, top, right, bottom) [px], or None where nothing was drawn.
     """
+    if isinstance(body, SolidBody):
+        return _draw_solid(image, body, body_pose, camera)
     faces = []
     for face, flange_to_face in zip(body.faces, body.flange_to_face, strict=True):
         pose = body_pose @ flange_to_face
@@ -219,6 +221,38 @@ def draw_faces(
             for centre in face.positions:
                 _draw_dot(image, camera, H, centre, face.radius, DOT_LEVEL * shade)
     return _region(boxes, camera)
+
+
+def _draw_solid(
+    image: npt.NDArray[np.float32], body: SolidBody, pose: FloatArray, camera: PinholeCamera
+) -> Region | None:
+    """Draw a convex solid by the coverage of its faces, so that no background shines through where two meet."""
+    placed = body.vertices @ pose[:3, :3].T + pose[:3, 3]
+    pixels, depths = project(camera.P, placed)
+    if depths.min() < 0.05:
+        return None
+    normals = body.face_normals @ pose[:3, :3].T
+    fronts = [
+        (np.array(outline), level)
+        for outline, level, normal in zip(body.outlines, body.shades(pose), normals, strict=True)
+        if normal @ (camera.centre - placed[outline[0]]) > 0.0
+    ]
+    outlines = [
+        pixels[rows] if camera.k1 == 0.0 else bend_outline(camera, pixels[rows]) for rows, _ in fronts
+    ]
+    region = _region([(outline.min(axis=0), outline.max(axis=0)) for outline in outlines], camera)
+    if region is None:
+        return None
+    left, top, right, bottom = region
+    part = image[top:bottom, left:right]
+    covered, light = np.zeros_like(part), np.zeros_like(part)
+    for outline, (_, level) in zip(outlines, fronts, strict=True):
+        face = np.zeros_like(part)
+        blend_polygon(face, outline - np.array([left, top]), 1.0)
+        covered += face
+        light += np.float32(level) * face
+    part[...] = part * (1.0 - np.minimum(covered, 1.0)) + light
+    return region
 
 
 def _draw_dot(

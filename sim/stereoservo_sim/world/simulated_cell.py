@@ -11,7 +11,7 @@ import numpy as np
 
 from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import BoolArray, FloatArray
-from stereoservo_sim.world.body import MarkerBody, roof_body
+from stereoservo_sim.world.body import LIGHT, MarkerBody, roof_body, wedge
 from stereoservo_sim.world.camera_rig import PinholeCamera, StereoRig, inverse_pose, look_at, stereo_rig
 from stereoservo_sim.world.robots import RX90, Robot, flange_pose, shape_segments
 from stereoservo_sim.world.synthetic import rotation, translation
@@ -122,13 +122,12 @@ def turned_to(
     """
     points = body.marker_points @ pose[:3, :3].T + pose[:3, 3]
     normals = body.marker_normals @ pose[:3, :3].T
-    radii = np.concatenate([np.full(len(face.ids), face.radius) for face in body.faces])
     pixels, depths = camera.image_of(points)
     sight = camera.centre - points
     distances = np.linalg.norm(sight, axis=1)
     turned = np.sum(sight * normals, axis=1) > np.cos(max_incidence) * distances
     stretch = 1.0 + 3.0 * max(camera.k1, 0.0) * (distances / np.maximum(depths, 1e-6)) ** 2
-    border = stretch * camera.K[0, 0] * radii / np.maximum(depths, 1e-6) + 2.0
+    border = stretch * camera.K[0, 0] * body.marker_radii / np.maximum(depths, 1e-6) + 2.0
     inside = (
         (depths > 0.05)
         & np.all(pixels >= border[:, None], axis=1)
@@ -160,6 +159,12 @@ def demo_cell() -> SimulatedCell:
     eye = target + 1.4 * pose[:3, 2]
     rig = stereo_rig(look_at(eye, target, np.array([0.0, 0.0, 1.0])))
     return SimulatedCell(robot=RX90, body=body, rig=rig, base=base)
+
+
+@lru_cache(maxsize=8)
+def solid_cell(light: tuple[float, float, float] = LIGHT) -> SimulatedCell:
+    """The embedded cell with a solid without markers on its flange, and the direction of its ``light``."""
+    return replace(demo_cell(), body=replace(wedge(), light=np.array(light)))
 
 
 @lru_cache(maxsize=1)

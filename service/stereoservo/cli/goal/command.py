@@ -60,6 +60,16 @@ CommonOption = Annotated[
     str | None,
     typer.Option(metavar="IDS", help="Markers seen when it was taught and now: 10,11,12 (default: all)."),
 ]
+LinesOption = Annotated[
+    str | None,
+    typer.Option(metavar="A-B,...", help="Edges seen when it was taught and now, each by two ids on it."),
+]
+PlanesOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="A-B-C,...", help="Faces, each by ids of points on it; others then than now will do."
+    ),
+]
 JointOption = Annotated[
     list[str] | None,
     typer.Option("--joint", metavar="NAME=RAD", help="Joint position [rad or m]; repeatable."),
@@ -183,6 +193,8 @@ def goal(
     name: NameArgument = "",
     relative_to: RelativeToOption = None,
     common: CommonOption = None,
+    lines: LinesOption = None,
+    planes: PlanesOption = None,
     joint: JointOption = None,
     set_points: SetPointsOption = None,
     images: ImagesOption = None,
@@ -235,7 +247,7 @@ def goal(
         target = feature_tree(found)
     elif file is None:
         files = {"points": points, "displacement": displacement, "incidence": incidence}
-        target = target_tree(name, joint, set_points, files, relative_to, common)
+        target = target_tree(name, joint, set_points, files, relative_to, common, lines, planes)
     local = target if file is None and stream is None and endpoint is None else {}
     ends_in = None if posture is None else _ends_in(cell, local, posture, operator)
     if file is not None:

@@ -43,6 +43,8 @@ def target_tree(
     files: dict[str, Path | None],
     relative_to: str | None,
     common: str | None,
+    lines: str | None = None,
+    planes: str | None = None,
 ) -> dict[str, Any]:
     """The target as on the wire. Exactly one of a name, joints, set-points or a file of ``files`` must be given."""
     given = [bool(name), bool(joints), set_points is not None, *(path is not None for path in files.values())]
@@ -52,14 +54,19 @@ def target_tree(
             "one of NAME (a taught goal), --joint, --set-points, --images, --points, --displacement, --incidence, "
             "--follow or --file is needed",
         )
-    if (relative_to or common) and not name:
-        raise CommandError("usage", "--relative-to and --common go with NAME, a taught goal")
+    if (relative_to or common or lines or planes) and not name:
+        raise CommandError(
+            "usage", "--relative-to, --common, --lines and --planes go with NAME, a taught goal"
+        )
     if name:
         tree: dict[str, Any] = {"kind": "taught", "name": name}
         if relative_to is not None:
             tree["relative_to"] = relative_to
         if common is not None:
             tree["common"] = marker_ids(common, "--common")
+        for key, text, least, most in (("lines", lines, 2, 2), ("planes", planes, 3, 64)):
+            if text is not None:
+                tree[key] = _id_groups(text, f"--{key}", least, most)
         return tree
     if joints:
         return {"kind": "joints", "positions": pairs(joints, "--joint")}
@@ -75,6 +82,22 @@ def target_tree(
     if kind == "displacement" and isinstance(matrix, list) and all(isinstance(row, list) for row in matrix):
         tree["matrix"] = [number for row in matrix for number in row]
     return {**tree, "kind": KINDS[kind]}
+
+
+def _id_groups(text: str, what: str, least: int, most: int) -> list[list[int]]:
+    """Parse ``400-401,402-407`` as groups of ids. Raises CommandError."""
+    try:
+        groups = [[int(part) for part in group.split("-")] for group in text.split(",")]
+    except ValueError:
+        groups = []
+    if not groups or any(not least <= len(group) <= most for group in groups):
+        count, example = (
+            (f"{least}", "400-401,402-407")
+            if least == most
+            else (f"{least} or more", "400-401-406,402-403-408")
+        )
+        raise CommandError("argument", f"{what} {text!r}: groups of {count} ids are valid, {example} say")
+    return groups
 
 
 def _object(path: Path) -> dict[str, Any]:

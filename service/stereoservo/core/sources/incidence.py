@@ -100,7 +100,7 @@ def start_incidence(
 
 
 def _one_way(feature: Feature, name: str, which: str) -> None:
-    ways = [w for w in ("markers", "points", "pixels") if getattr(feature, w)]
+    ways = [w for w in ("markers", "points", "pixels", "segments") if getattr(feature, w)]
     if len(ways) != 1:
         raise RefusalError(
             "FEATURE_UNCLEAR",
@@ -149,6 +149,11 @@ def _fixed(
     if feature.markers:
         raise RefusalError(
             "FEATURE_UNCLEAR", f"{name}: markers move with the body; what stands is given by points or pixels"
+        )
+    if feature.segments:
+        raise RefusalError(
+            "FEATURE_UNCLEAR",
+            f"{name}: a line by segments is made to points by the gateway; send it through that",
         )
     if feature.points:
         if model_epoch is None:

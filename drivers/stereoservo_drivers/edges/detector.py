@@ -1,0 +1,271 @@
+"""Detector of the straight edges of a part without markers: its vertices, as crossings of edges measured sub-pixel.
+
+Where the edges are expected comes from a prior, from the frame before, or from the start of the part file; all are
+poses of the part, so that edges that it hides are not looked for. What is reported is measured anew in every frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, Frame, Prior
+from stereoservo_drivers.detectors.frame_images import sized_image
+from stereoservo_drivers.edges.line_measurement import (
+    MeasuredLine,
+    compile_kernels,
+    crossing,
+    measure_lines,
+    take_profiles,
+)
+from stereoservo_drivers.edges.part_file import LEAST_START, load_part
+from stereoservo_drivers.edges.part_pose import (
+    PartPose,
+    line_distances,
+    pose_from_lines,
+    pose_from_pixels,
+    segments_in_sight,
+)
+from stereoservo_drivers.options import decode_options
+
+Positive = Annotated[float, Meta(gt=0)]
+FINE_PX = 4.0
+"""Half the width of the last search, and how near another edge may be."""
+NEAR_PX = 6.0
+"""Least of a search beside an expected edge."""
+SETTLED_PX = 0.3
+"""By how much vertices may still move where the last search found the edges."""
+PRIOR_PX = 4.0
+"""Rms by which a prior may be off the part's shape, beside its own deviations."""
+LEAST_EDGES = 6
+"""That must agree on a pose, whose seven numbers they give twelve distances."""
+LEAST_SHARE, LEAST_OF_ALL = 0.6, 0.4
+"""Of the edges in sight that are long and free enough to be looked for: of those where the image has steps, of all."""
+DISAGREE = 5.0
+"""Standard deviations, per line, beyond which lines do not meet in one point."""
+
+
+class EdgeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[camera.detector_options]`` of the detector ``edges``."""
+
+    part: str
+    """Part file, relative to the cell file's directory."""
+    search_px: Annotated[float, Meta(ge=4, le=60)] = 16.0
+    """How far edges may be from where the start has them."""
+    min_slope: Positive = 2.5
+    """Least steepness of an edge [grey levels/px]; a step of 10 levels in a sharp picture has 3."""
+    max_residual_px: Positive = 1.0
+    """How far an edge may be off the part's shape: lenses bend, parts are not made to the drawing."""
+    max_sigma_px: Positive = 0.5
+    """Vertices that are known no better are not reported: near-parallel edges, short ones."""
+    max_gap_s: Positive = 0.5
+    """A frame older than this is no start for the next."""
+    max_prior_age_s: Positive = 0.25
+    floor_px: Annotated[float, Meta(ge=0)] = 0.02
+    """Systematic standard deviation [px] of a line, part of every covariance."""
+
+
+@dataclass(frozen=True, eq=False)
+class _FoundPart:
+    """A frame in which the part was found."""
+
+    seq: int
+    t_ns: int
+    size: tuple[int, int]
+    pose: PartPose
+    vertices: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """Vertices found: ``rows`` (k,) of the part, ``pixels`` (k, 2), ``covariances`` (k, 2, 2); why others in sight are
+    not, by marker id.
+    """
+
+    rows: list[int]
+    pixels: list[FloatArray]
+    covariances: list[FloatArray]
+    refused: dict[int, str]
+
+
+class EdgeDetector:
+    """Detects the vertices of one part by its edges in one camera. One thread at a time.
+
+    It remembers where the part was in the last frame, and forgets it where the sequence goes back or time has passed:
+    the same *series* of frames and priors gives the same observations. Nothing is reported unless most of the edges in
+    sight, and six, agree on a pose of the part. ``refused``: of the newest frame, why vertices are not reported.
+
+    Raises DriverError: ``option``, ``part`` at construction; ``image_format``, ``image_size`` by :meth:`detect`.
+    Content never raises.
+    """
+
+    def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
+        self.options = decode_options(EdgeOptions, options, f"detector of camera {context.camera!r}")
+        self.camera = context.camera
+        self._part, self._start_rows, self._start_pixels = load_part(
+            context.cell_dir / self.options.part, context.camera
+        )
+        compile_kernels()
+        self._place = {marker: k for k, marker in enumerate(self._part.ids.tolist())}
+        self._seen: _FoundPart | None = None
+        self.refused: dict[int, str] = {}
+
+    def describe(self) -> DetectorDescription:
+        """The ids of the part's vertices."""
+        return DetectorDescription("edges", tuple(self._part.ids.tolist()), self.options.floor_px)
+
+    def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
+        """Vertices in ``frame``. Raises DriverError (``image_format``, ``image_size``); never on content."""
+        raw = sized_image(frame, self.camera, None)
+        image, size = raw.astype(np.float32), (raw.shape[1], raw.shape[0])
+        found: Vertices | None = None
+        for pose, widths in self._expectations(frame, prior, size):
+            registered = self._register(image, pose, widths)
+            if registered is None:
+                continue
+            pose, lines = registered
+            found = self._vertices(pose, lines, size)
+            self._seen = _FoundPart(frame.seq, frame.t_shutter_ns, size, pose, pose.pixels(self._part.points))
+            break
+        if found is None:
+            found = Vertices([], [], [], {-1: "no pose of the part explains enough edges"})
+            self._seen = None
+        self.refused = found.refused
+        return self._observation(frame, found)
+
+    # -- where the part is expected ----------------------------------------------------------------------------
+
+    def _expectations(
+        self, frame: Frame, prior: Prior | None, size: tuple[int, int]
+    ) -> Iterator[tuple[PartPose, tuple[float, ...]]]:
+        """Poses to look at, each with half the widths [px] of its searches, the likeliest first."""
+        seen = self._seen
+        if seen is not None:
+            gap_s = (frame.t_shutter_ns - seen.t_ns) * 1e-9
+            if frame.seq <= seen.seq or seen.size != size or not 0.0 <= gap_s <= self.options.max_gap_s:
+                seen = None
+        known = None if seen is None else seen.pose
+        expected = None if prior is None else self._by_prior(frame, prior, size, known)
+        if expected is not None:
+            yield expected
+        if seen is not None:
+            yield seen.pose, (self.options.search_px, NEAR_PX)
+        start = pose_from_pixels(self._part.points[self._start_rows], self._start_pixels, size, None)
+        if start is not None:
+            yield start[0], (self.options.search_px, 0.5 * self.options.search_px, NEAR_PX)
+
+    def _by_prior(
+        self, frame: Frame, prior: Prior, size: tuple[int, int], known: PartPose | None
+    ) -> tuple[PartPose, tuple[float, ...]] | None:
+        dt_s = (frame.t_shutter_ns - prior.t_ns) * 1e-9
+        if abs(dt_s) > self.options.max_prior_age_s:
+            return None
+        pixels = prior.pixels + dt_s * prior.velocities
+        variances = 0.5 * np.trace(prior.covariances, axis1=1, axis2=2)
+        good = [
+            k for k, marker in enumerate(prior.ids.tolist())
+            if marker in self._place and np.isfinite(pixels[k]).all() and variances[k] >= 0.0
+        ]  # fmt: skip
+        if len(good) < LEAST_START:
+            return None
+        rows = [self._place[marker] for marker in prior.ids[good].tolist()]
+        fitted = pose_from_pixels(self._part.points[rows], pixels[good], size, known)
+        sigma = float(np.sqrt(variances[good].mean()))
+        if fitted is None or fitted[1] > PRIOR_PX + 2.0 * sigma:
+            return None
+        return fitted[0], (min(self.options.search_px, max(FINE_PX, 3.0 + 3.0 * sigma)),)
+
+    # -- the part in the image ---------------------------------------------------------------------------------
+
+    def _register(
+        self, image: FloatArray, pose: PartPose, widths: tuple[float, ...]
+    ) -> tuple[PartPose, dict[int, MeasuredLine]] | None:
+        """The part's pose by its edges, and those that agree with it; None where too few do."""
+        for half in widths:
+            lines, *_ = self._lines(image, pose, half, coarse=True)
+            better = (
+                pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
+            )
+            if better is None:
+                return None
+            pose = better
+        for _ in range(2):
+            lines, tried, steep = self._lines(image, pose, FINE_PX, coarse=False)
+            better = pose_from_lines(self._part, pose, lines, 0.5) if len(lines) >= LEAST_EDGES else None
+            if better is None:
+                return None
+            moved = float(np.abs(better.pixels(self._part.points) - pose.pixels(self._part.points)).max())
+            pose = better
+            if moved < SETTLED_PX:
+                break
+        off = np.abs(line_distances(self._part, pose, lines)[0]).max(axis=1)
+        kept = {
+            number: line for (number, line), px in zip(lines.items(), off.tolist(), strict=True)
+            if px <= self.options.max_residual_px
+        }  # fmt: skip
+        needed = max(LEAST_EDGES, LEAST_SHARE * steep, LEAST_OF_ALL * tried)
+        return (pose, kept) if len(kept) >= needed else None
+
+    def _lines(
+        self, image: FloatArray, pose: PartPose, half: float, *, coarse: bool
+    ) -> tuple[dict[int, MeasuredLine], int, int]:
+        """Lines near the edges in sight by number, how many edges were long and free enough to look for, and at how
+        many of these the image has steps: where two faces look alike there is nothing to find.
+        """
+        numbers, ends = segments_in_sight(self._part, pose)
+        good = np.isfinite(ends).all(axis=(1, 2))
+        numbers, ends = numbers[good], ends[good]
+        profiles = take_profiles(image, ends, numbers, ends, half, FINE_PX)
+        lines = measure_lines(profiles, ends, numbers, self.options.min_slope, coarse=coarse)
+        steps = np.abs(profiles.slopes).max(axis=1, initial=0.0) >= self.options.min_slope
+        steep = sum(bool(steps[profiles.edge == number].mean() > 0.5) for number in np.unique(profiles.edge))
+        return lines, len(np.unique(profiles.edge)), steep
+
+    def _vertices(self, pose: PartPose, lines: dict[int, MeasuredLine], size: tuple[int, int]) -> Vertices:
+        found = Vertices([], [], [], {})
+        expected = pose.pixels(self._part.points)
+        seen = pose.in_sight(self._part)
+        width, height = size
+        for row, marker in enumerate(self._part.ids.tolist()):
+            own = np.flatnonzero((self._part.edges == row).any(axis=1))
+            if not seen[own].any():
+                continue
+            there = [lines[number] for number in own.tolist() if number in lines]
+            if len(there) < 2:
+                found.refused[marker] = f"{len(there)} of its {int(seen[own].sum())} edges in sight are found"
+                continue
+            point, covariance, squares = crossing(there, self.options.floor_px)
+            sigma = float(np.sqrt(np.trace(covariance)))
+            away = float(np.linalg.norm(point - expected[row]))
+            if not sigma <= self.options.max_sigma_px:
+                found.refused[marker] = (
+                    f"its edges leave it uncertain by {sigma:.2f} px, {self.options.max_sigma_px:g} px is allowed: "
+                    "they are near-parallel, short or far from it"
+                )
+            elif squares > DISAGREE**2 * (len(there) - 1):
+                found.refused[marker] = f"its {len(there)} edges do not meet in one point"
+            elif away > 1.5 * self.options.max_residual_px:
+                found.refused[marker] = f"its edges meet {away:.1f} px from where the part's shape has it"
+            elif not (0.0 <= point[0] <= width - 1.0 and 0.0 <= point[1] <= height - 1.0):
+                found.refused[marker] = "it is outside of the image"
+            else:
+                found.rows.append(row)
+                found.pixels.append(point)
+                found.covariances.append(covariance)
+        return found
+
+    def _observation(self, frame: Frame, found: Vertices) -> CameraObservation:
+        ids = self._part.ids[np.array(found.rows, dtype=np.int64)]
+        order = np.argsort(ids)
+        pixels = np.array(found.pixels).reshape(-1, 2)[order]
+        covariances = np.array(found.covariances).reshape(-1, 2, 2)[order]
+        return CameraObservation(
+            self.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, ids[order],
+            np.ascontiguousarray(pixels), np.ascontiguousarray(0.5 * (covariances + covariances.transpose(0, 2, 1))),
+        )  # fmt: skip
