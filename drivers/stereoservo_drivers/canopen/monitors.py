@@ -287,7 +287,8 @@ class JumpMonitor:
             f"{JUMP_FACTOR:g} times max_velocity it is {limit:.3g}",
             moved,
             limit,
-            "check the encoder, its cable, and counts_per_rev and gear_ratio",
+            "check the encoder, its cable, and counts_per_rev and gear_ratio; where the computer or its adapter was "
+            "busy, readings came late and then close together: see `uptime`, and give the loop real-time priority",
             axis=axis,
         )
 

@@ -256,10 +256,10 @@ def goal(
         requested = make_goal(
             target, law=law, points=point_source, jacobian=jacobian,
             centre=None if centre is None else {"markers": marker_ids(centre, "--centre")},
-            cameras=camera or None, profile=profile, posture=ends_in,
-            gain=_one_gain(gain, adaptive_gain), damping=damping,
-            tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale, lease_s=lease,
-            time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend, acknowledge_s=acknowledge,
+            cameras=camera or None, profile=profile, gain=_one_gain(gain, adaptive_gain), damping=damping,
+            posture=ends_in, tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale,
+            lease_s=lease, time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend,
+            acknowledge_s=acknowledge,
             follow_markers=None if follow_markers is None else marker_ids(follow_markers, "--follow-markers"),
         )  # fmt: skip
     if wait and requested.lease_s is None:
