@@ -259,8 +259,7 @@ def goal(
             cameras=camera or None, profile=profile, gain=_one_gain(gain, adaptive_gain), damping=damping,
             posture=ends_in, tolerance_px=tolerance, hold_frames=hold_frames, speed_scale=speed_scale,
             lease_s=lease, time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend,
-            acknowledge_s=acknowledge,
-            follow_markers=None if follow_markers is None else marker_ids(follow_markers, "--follow-markers"),
+            acknowledge_s=acknowledge, follow_markers=_followed_ids(follow_markers),
         )  # fmt: skip
     if wait and requested.lease_s is None:
         requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
@@ -284,6 +283,10 @@ def _ends_in(cell: str, target: dict[str, Any], number: int, operator: str | Non
     from stereoservo.cli.ik import posture  # numerics: for this alone
 
     return posture(cell, target, number, operator)
+
+
+def _followed_ids(text: str | None) -> tuple[int, ...] | None:
+    return None if text is None else marker_ids(text, "--follow-markers")
 
 
 def _one_gain(gain: float | None, adaptive_gain: str | None) -> float | dict[str, float] | None:
