@@ -67,7 +67,10 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
     [
         (("pick", "--points", "predicted"), "one of NAME"),
         (("--points", "predicted"), "--points takes a file; predicted goes with --point-source"),
-        (("--joint", "j1=0", "--relative-to", "workpiece"), "--relative-to and --common go with NAME"),
+        (
+            ("--joint", "j1=0", "--relative-to", "workpiece"),
+            "--relative-to, --common, --lines and --planes go with NAME",
+        ),
         (("pick", "--relative-to", "moon"), "target.relative_to: Invalid enum value 'moon'"),
         (("pick", "--common", "ten"), "--common 'ten': marker ids with commas, 10,11,12, are valid"),
         (("pick", "--centre", "0;1"), "--centre '0;1'"),

@@ -261,8 +261,6 @@ def goal(
             lease_s=lease, time_limit_s=time_limit, mode="queue" if queue else "preempt", blend_px=blend,
             acknowledge_s=acknowledge, follow_markers=_followed_ids(follow_markers),
         )  # fmt: skip
-    if wait and requested.lease_s is None:
-        requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
     with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
         require_cameras(client, found)
         if check or requested.check:
@@ -285,7 +283,7 @@ def _ends_in(cell: str, target: dict[str, Any], number: int, operator: str | Non
     return posture(cell, target, number, operator)
 
 
-def _followed_ids(text: str | None) -> tuple[int, ...] | None:
+def _followed_ids(text: str | None) -> list[int] | None:
     return None if text is None else marker_ids(text, "--follow-markers")
 
 
@@ -317,6 +315,8 @@ def _run(
     wait: bool,
     as_json: bool,
 ) -> None:
+    if wait and requested.lease_s is None:
+        requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
     try:
         handle = client.send(requested)
         note(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
