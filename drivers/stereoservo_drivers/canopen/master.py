@@ -55,9 +55,11 @@ class _Monitors:
 
 @dataclass
 class _Cycle:
-    """The cycle in progress."""
+    """The cycle in progress; ``owed_ns``: the first poll since the last complete answer, which this may be."""
 
     poll_ns: int = 0
+    owed_ns: int = 0
+    answered_ns: int = 0
     received: int = 0
     open: bool = False
     states: list[JointState] = field(default_factory=list)
@@ -224,6 +226,7 @@ class Master:
         )
         self._sample = sample
         self._cycle.states.append(sample)
+        self._cycle.answered_ns = now_ns
         self.statistics.answered_ns = now_ns - poll_ns
         self.statistics.answered_max_ns = max(self.statistics.answered_max_ns, now_ns - poll_ns)
 
@@ -236,7 +239,8 @@ class Master:
         frames = [*self.codec.poll(), *axes]
         if self._heartbeat_due(now_ns):
             frames += self.codec.heartbeat()
-        self._cycle = _Cycle(poll_ns=now_ns, open=True)
+        owed_ns = self._cycle.owed_ns if self._cycle.open and not complete else now_ns
+        self._cycle = _Cycle(poll_ns=now_ns, owed_ns=owed_ns, open=True)
         return frames
 
     def _heartbeat_due(self, now_ns: int) -> bool:
@@ -275,7 +279,10 @@ class Master:
     def _watch_encoders(self, cycle_ns: int) -> list[Trip | None]:
         trips = []
         for sample in self._cycle.states:
-            trips.append(self._monitors.jump.check(sample.t_ns, sample.positions.tolist()))
+            cycle = self._cycle
+            trips.append(
+                self._monitors.jump.check(cycle.owed_ns, cycle.answered_ns, sample.positions.tolist())
+            )
             if self.mode is Mode.RUNNING:
                 trips.append(self._monitors.reversal.check(cycle_ns * 1e-9, self._sent, sample.positions))
         return trips

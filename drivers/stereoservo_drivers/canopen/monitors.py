@@ -260,18 +260,25 @@ class FloodMonitor:
 
 
 class JumpMonitor:
-    """Monitors position changes larger than the axis can move."""
+    """Monitors position changes larger than the axis can move.
+
+    An answer that came late, or was read late by a busy computer, counts in a later cycle than it was asked for. So of
+    a set is known only that it was measured between the first poll that was not answered and its arrival; what can lie
+    between two sets is the time from the former of one to the latter of the next.
+    """
 
     def __init__(self, max_velocities: FloatArray, resolutions: FloatArray) -> None:
         fastest = (JUMP_FACTOR * max_velocities).tolist()
         self._axes = list(zip(fastest, (JUMP_COUNTS * resolutions).tolist(), strict=True))
         self._positions: list[float] | None = None
-        self._t_ns = 0
+        self._earliest_ns = 0
 
-    def check(self, t_ns: int, positions: list[float]) -> Trip | None:
-        """Check a complete set (n,) with its stamp. Of several axes that jump, the first is reported."""
-        last, elapsed_s = self._positions, (t_ns - self._t_ns) * 1e-9
-        self._positions, self._t_ns = positions, t_ns
+    def check(self, earliest_ns: int, latest_ns: int, positions: list[float]) -> Trip | None:
+        """Check a complete set (n,) that was measured between two times. Of several axes that jump, the first is
+        reported.
+        """
+        last, elapsed_s = self._positions, (latest_ns - self._earliest_ns) * 1e-9
+        self._positions, self._earliest_ns = positions, earliest_ns
         if last is None:
             return None
         for axis, (fastest, margin) in enumerate(self._axes):
@@ -283,12 +290,11 @@ class JumpMonitor:
     def _trip(self, axis: int, moved: float, limit: float, elapsed_s: float) -> Trip:
         return Trip(
             "encoder_jump",
-            f"position jumped by {moved:.6g} within {elapsed_s * 1e3:.1f} ms; at "
+            f"position jumped by {moved:.6g} within at most {elapsed_s * 1e3:.1f} ms; at "
             f"{JUMP_FACTOR:g} times max_velocity it is {limit:.3g}",
             moved,
             limit,
-            "check the encoder, its cable, and counts_per_rev and gear_ratio; where the computer or its adapter was "
-            "busy, readings came late and then close together: see `uptime`, and give the loop real-time priority",
+            "check the encoder, its cable, and counts_per_rev and gear_ratio",
             axis=axis,
         )
 

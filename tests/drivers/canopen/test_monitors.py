@@ -244,6 +244,29 @@ def test_full_speed_after_tolerated_misses_is_no_jump(bus) -> None:
     assert bus.master.fault is None
 
 
+def test_answers_that_are_read_late_by_a_busy_computer_are_no_jump(bus) -> None:
+    """They count three cycles after they were measured; the next set comes at once after them."""
+    bus.enable()
+    held: list = []
+
+    def late(cycle: int, answers: list) -> list:
+        phase = cycle % 8
+        if phase == 0:
+            held[:] = answers
+            return []
+        if phase in (1, 2):
+            return []
+        return held if phase == 3 else answers
+
+    bus.answers = late
+    bus.run(1.0, -1.0, cycles=100)
+    assert bus.master.fault is None
+    bus.answers = lambda cycle, answers: answers
+    bus.run(1.0, -1.0, cycles=8)
+    bus.positions = bus.positions + np.array([0.0, 0.05])
+    assert until_latched(bus, 5, 1.0, -1.0) <= 2
+
+
 def reversed_axis(bus):
     """The second axis counts backwards from where it stands now."""
     pivot = float(bus.positions[1])
