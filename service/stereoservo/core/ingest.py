@@ -305,12 +305,14 @@ def fill_sample(sample: JointState, values: FloatArray) -> bool:
 def _late(sample: JointState, context: StepContext) -> Reason:
     age_s, timeout_s = (context.now_ns - sample.t_ns) * 1e-9, context.settings.limits.joint_timeout_s
     what = (
-        f"{age_s:.3f} s old, {timeout_s:g} s is allowed" if age_s > 0.0 else f"{-age_s:.6g} s in the future"
+        f"{age_s:.3f} s old, {timeout_s:g} s is allowed (safety.joint_timeout_s): the computer was busy (`uptime`), or "
+        "the joint driver's clock or its bus is late"
+        if age_s > 0.0
+        else f"{-age_s:.6g} s in the future: check the joint driver's clock"
     )
     return Reason(
         "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
-        f"the stamp of joint sample {sample.seq} is {what}: check the joint driver's clock and its bus; then "
-        "resume",
+        f"the stamp of joint sample {sample.seq} is {what}; then resume",
     )  # fmt: skip
 
 
