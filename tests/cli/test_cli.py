@@ -11,13 +11,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from stereoservo.cli import dispatch, output
 from stereoservo.cli import main as cli
+from stereoservo.cli.warmup import _wait
 from stereoservo.client import InvalidReplyError
 from stereoservo.daemon.seqlock import StopSlot, create_stop_slot
 from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.compilation_progress import CompilationProgress, progress_path
 from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
 from stereoservo.messages.wire import MessageError
@@ -407,3 +410,24 @@ def test_warmup_of_a_cell_makes_its_detectors_too(
     assert "no detector today" in json.loads(capfd.readouterr().out)["error"]["message"]
     assert cli.invoke(["warmup", "nowhere", "--json"]) == 2
     assert "hil-video" in capfd.readouterr().out
+
+
+def test_warmup_tells_how_far_it_is_once_it_is_farther(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    class Compiling:
+        """A process that compiles in steps, and ends well."""
+
+        done = iter([3, 3, 40])
+
+        def wait(self, timeout_s: float) -> int:
+            done = next(self.done, None)
+            if done is None:
+                return 0
+            told = CompilationProgress("rest", 1, done, 300)
+            progress_path(tmp_path, "rest").write_bytes(msgspec.json.encode(told))
+            raise subprocess.TimeoutExpired("compile", timeout_s)
+
+    assert _wait(Compiling(), tmp_path) == 0  # type: ignore[arg-type]
+    lines = capfd.readouterr().err.splitlines()
+    assert lines == ["compiling: 3 of about 300 kernels", "compiling: 40 of about 300 kernels"]

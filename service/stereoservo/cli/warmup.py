@@ -7,13 +7,17 @@ import subprocess
 import sys
 import time
 from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
+from stereoservo.cli.output import CommandError, JsonOption, emit, note, shipped_or_path
 from stereoservo.daemon.process_control import child_environment
+from stereoservo.messages.compilation_progress import CompilationProgress, read_progress
 from stereoservo.messages.directories import cell_directories
+from stereoservo.messages.discovery import TELL_EVERY_S
 
 
 def warmup(
@@ -32,14 +36,36 @@ def warmup(
     began = time.monotonic()
     if cell:
         _warm_up_detectors(cell)
-    command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid())]
-    done = subprocess.run(command, env=child_environment(), stdout=sys.stderr, check=False)
-    if done.returncode != 0:
-        raise CommandError(
-            "compilation", f"compiling ended with exit code {done.returncode}; its message is above"
-        )
+    code = _compile()
+    if code != 0:
+        raise CommandError("compilation", f"compiling ended with exit code {code}; its message is above")
     seconds = time.monotonic() - began
     emit({"seconds": seconds}, f"kernels are compiled ({seconds:.1f} s)", json)
+
+
+def _compile() -> int:
+    """Compile in a process of its own, and tell how far it is; returns its exit code."""
+    with TemporaryDirectory(prefix="stereoservo-warmup-") as told:
+        command = [
+            sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid()), "alone", told,
+        ]  # fmt: skip
+        with subprocess.Popen(command, env=child_environment(), stdout=sys.stderr) as process:
+            try:
+                return _wait(process, Path(told))
+            finally:
+                process.kill()  # it leaves Ctrl-C to this command
+
+
+def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
+    known: tuple[CompilationProgress, ...] = ()
+    while True:
+        try:
+            return process.wait(TELL_EVERY_S)
+        except subprocess.TimeoutExpired:
+            progress = read_progress(told)
+        if progress != known:
+            known = progress
+            note(f"compiling: {progress[0].words}")
 
 
 def _warm_up_detectors(cell: str) -> None:

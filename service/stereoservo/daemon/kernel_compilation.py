@@ -79,7 +79,7 @@ CAMERAS = ("left", "right")
 MARKERS = tuple(range(6))
 STEPS = 40  # a short plan is executed in a third of them
 PERIOD_NS = 4_000_000
-MODULE, RECORD, BESIDE = "stereoservo.daemon.kernel_compilation", "record", "beside"
+MODULE, RECORD, BESIDE, ALONE = "stereoservo.daemon.kernel_compilation", "record", "beside", "alone"
 """This module, and its second arguments: for the second part of its work, and for low priority."""
 NICE = 10
 """Of the process that compiles while cameras and arm work."""
@@ -549,8 +549,8 @@ def main() -> int:
     if sys.argv[2:] == [RECORD]:
         record_compiled()
     elif _has_cache():
-        if sys.argv[2:3] == [BESIDE]:
-            os.nice(NICE)
+        if sys.argv[2:3] in ([BESIDE], [ALONE]):
+            os.nice(NICE if sys.argv[2] == BESIDE else 0)
             tell_progress(Path(sys.argv[3]), "rest", int(sys.argv[1]), KERNELS_IN_ALL)
         _wait_for_others()
         if compiled() is None:
