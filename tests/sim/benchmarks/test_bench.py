@@ -122,6 +122,7 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "faults",
         "features",
         "idle",
+        "ik",
         "kills",
         "loop",
         "page",

