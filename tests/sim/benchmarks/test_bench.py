@@ -84,8 +84,8 @@ def test_cycle_times_kernels_and_core():
         for pace in ("tight", "paced"):
             assert found[pace]["between frames"]["repetitions"] >= 100
             assert found[pace]["with frames"]["repetitions"] >= 10
-        for kind, stages in found["stages"].items():
-            assert 0.0 < sum(stages.values()) < 2.0 * found["tight"][kind]["max"]
+        for stages in found["stages"].values():
+            assert min(stages.values()) > 0.0
 
 
 def test_features_find_the_dots():
