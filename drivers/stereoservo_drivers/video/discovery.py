@@ -11,8 +11,8 @@ from typing import Any
 
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.discovery import FoundCamera
-from stereoservo_drivers.video.live import live_source
 from stereoservo_drivers.video.options import decode_video_options
+from stereoservo_drivers.video.reader import live_source
 
 CLASS = Path("/sys/class/video4linux")
 BY_ID = Path("/dev/v4l/by-id")

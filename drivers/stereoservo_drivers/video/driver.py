@@ -14,10 +14,9 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.ports.discovery import FoundCamera
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
-from stereoservo_drivers.video.live import live_source
 from stereoservo_drivers.video.options import DRIVER, decode_video_options
 from stereoservo_drivers.video.playback import Playback
-from stereoservo_drivers.video.reader import Reader
+from stereoservo_drivers.video.reader import Reader, live_source
 from stereoservo_drivers.video.sources import Settings
 from stereoservo_drivers.video.stream_monitor import Watch
 

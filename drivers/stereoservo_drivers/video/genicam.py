@@ -14,7 +14,7 @@ import numpy as np
 
 from stereoservo.ports.devices import Clock
 from stereoservo_drivers.video.options import Place, VideoOptions
-from stereoservo_drivers.video.sources import OLDEST_NS, Settings, SourcePicture
+from stereoservo_drivers.video.sources import Settings, SourcePicture, received_ns
 
 LIBRARY = "libaravis-0.8.so.0"
 BUFFERS = 8
@@ -223,10 +223,9 @@ class GenicamSource:
         if data is None or width <= 0 or height <= 0 or size.value < width * height:
             return None
         pixels = np.ctypeslib.as_array(ctypes.cast(data, POINTER(ctypes.c_uint8)), (height, width))
-        age_ns = wall_ns - call("arv_buffer_get_system_timestamp", buffer)
-        received_ns = now_ns - age_ns if 0 <= age_ns < OLDEST_NS else now_ns
+        t_ns = received_ns(now_ns, wall_ns - call("arv_buffer_get_system_timestamp", buffer))
         number = self._numbers.whole(call("arv_buffer_get_frame_id", buffer))
-        return SourcePicture(pixels.copy(), received_ns, number)
+        return SourcePicture(pixels.copy(), t_ns, number)
 
     def interrupt(self) -> None:
         """Wake :meth:`read`, within a tenth of a second."""

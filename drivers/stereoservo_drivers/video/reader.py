@@ -1,4 +1,4 @@
-"""Thread of one live camera, which waits for images and keeps the newest."""
+"""Live cameras: the source by the kind of its place, and the thread that waits for its images and keeps the newest."""
 
 from __future__ import annotations
 
@@ -7,16 +7,27 @@ import time
 
 import cv2
 
-from stereoservo.ports.devices import DriverError, Frame
+from stereoservo.ports.devices import Clock, DriverError, Frame
+from stereoservo_drivers.video.genicam import GenicamSource
+from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import Place, VideoOptions, frozen_frames
 from stereoservo_drivers.video.pictures import check_size, one_channel
-from stereoservo_drivers.video.sources import LiveSource, Settings, SourcePicture
+from stereoservo_drivers.video.sources import CaptureSource, LiveSource, Settings, SourcePicture
 from stereoservo_drivers.video.stream_monitor import Watch
 
 JOIN_S = 0.5
 """How long :meth:`Reader.close` waits for its thread. One that hangs in a library is left to end by itself; it is a
 daemon, and nothing that it still receives gets out.
 """
+
+
+def live_source(place: Place, options: VideoOptions, clock: Clock) -> LiveSource:
+    """A source for a ``place`` that delivers images by itself; not connected yet."""
+    if place.kind == "http":
+        return MjpegSource(place, options, clock)
+    if place.kind == "genicam":
+        return GenicamSource(place, options, clock)
+    return CaptureSource(place, options, clock)
 
 
 class Reader:

@@ -155,11 +155,13 @@ class CaptureSource:
             raise self._place.error(
                 "connection_lost", "gives no more pictures: unplugged, ended, or silent too long", retry=True
             )
-        received_ns = self._clock.now_ns()
-        if self._place.kind == "device":
-            received_ns = kernel_stamp(capture.get(cv2.CAP_PROP_POS_MSEC), received_ns)
+        t_ns = self._clock.now_ns()
+        if (
+            self._place.kind == "device"
+        ):  # OpenCV passes on the kernel's time, of UVC cameras by the monotonic clock
+            t_ns = received_ns(t_ns, t_ns - capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         whole, image = capture.retrieve()
-        return SourcePicture(image, received_ns) if whole else None
+        return SourcePicture(image, t_ns) if whole else None
 
     def interrupt(self) -> None:
         """No effect: `cv2.VideoCapture.grab` ends by its own time-out."""
@@ -170,11 +172,10 @@ class CaptureSource:
             self._capture.release()
 
 
-def kernel_stamp(told_ms: float, now_ns: int) -> int:
-    """When the kernel received a picture [ns, monotonic], by the time ``told_ms`` that OpenCV passes on; ``now_ns``
-    where that is none of this clock (UVC devices' is): in the future, or more than ``OLDEST_NS`` ago.
+def received_ns(now_ns: int, age_ns: float) -> int:
+    """When a picture came [ns, monotonic] that is said to be ``age_ns`` old at ``now_ns``; now, where that is not
+    believed: it is of another clock, or its age more than ``OLDEST_NS``.
     """
-    age_ns = now_ns - told_ms * 1e6
     return now_ns - round(age_ns) if 0.0 <= age_ns < OLDEST_NS else now_ns
 
 

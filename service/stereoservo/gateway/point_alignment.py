@@ -78,32 +78,31 @@ def align_points(
     )
     ids = [common[k] for k in np.flatnonzero(usable)]
     if worst > limit:
+        others = np.arange(usable.size)
+        fits = [
+            (f"marker {common[k]}", lambda k=k: fit(usable & (others != k))[1])
+            for k in np.flatnonzero(usable)
+        ]
         raise TransferError(
             f"{what}: markers {listed(ids)} have not moved as one body: {worst:.1f} px is left at marker "
             f"{ids[int(np.nanargmax(residuals))]}, {limit:.1f} px is allowed"
-            f"{_outlier_marker(fit, usable, common, limit)}"
+            f"{_outlier(fits, limit, 'it has slipped, or is taken for another')}"
         )
     count = f"{len(ids)} markers ({listed(ids)})"
     return change, f"{what} by {count} as a {family} map, which agree within {worst:.2f} px"
 
 
-def _outlier_marker(fit: Fit, usable: BoolArray, common: list[int], limit: float) -> str:
-    """The single marker without which the others agree; empty where there is none, or too few are left."""
-    best = (limit, -1)
-    for k in np.flatnonzero(usable):
-        without = usable.copy()
-        without[k] = False
+def _outlier(fits: Iterable[tuple[str, Callable[[], FloatArray]]], limit: float, why: str) -> str:
+    """The single feature, by name, without which what its fit leaves [px] is below ``limit``, and ``why`` that may be;
+    empty where there is none, or too few are left.
+    """
+    best = (limit, "")
+    for name, left in fits:
         try:
-            _, residuals = fit(without)
+            best = min(best, (float(np.nanmax(left(), initial=0.0)), name))
         except GeometryError:
             continue  # too few are left, or they are coplanar: this one cannot be tested
-        best = min(best, (float(np.nanmax(residuals)), int(k)))
-    if best[1] < 0:
-        return ""
-    return (
-        f"; without marker {common[best[1]]} the others agree within {best[0]:.2f} px: it has slipped, or is taken for "
-        "another"
-    )
+    return f"; without {best[1]} the others agree within {best[0]:.2f} px: {why}" if best[1] else ""
 
 
 def reproject_set_points(
@@ -225,9 +224,11 @@ def align_features(
     limit = max(RESIDUAL_PX, DEVIATIONS * float(known.max(initial=0.0)))
     worst = float(away.max(initial=0.0))
     if worst > limit:
+        fits = [(name, lambda k=k: fit(features.without(k))[1]) for k, name in enumerate(features.names)]
         raise TransferError(
             f"{what}: {_counted(features)} have not moved as one body: {worst:.1f} px is left at "
-            f"{features.names[int(away.argmax())]}, {limit:.1f} px is allowed{_outlier_feature(fit, features, limit)}"
+            f"{features.names[int(away.argmax())]}, {limit:.1f} px is allowed"
+            f"{_outlier(fits, limit, 'it is another one, or was taken for another')}"
         )
     note = f"{what} by {_counted(features)} as a {family} map, which agree within {worst:.2f} px"
     if left_out:
@@ -286,25 +287,6 @@ def _require_seen(features: CommonFeatures, views: MarkerViews, when: str) -> No
             raise TransferError(
                 f"of the plane of {listed(plane)}, two cameras see {listed(found)} {when}; {needed} or more are needed"
             )
-
-
-def _outlier_feature(
-    fit: Callable[[CommonFeatures], tuple[FrameChange, FloatArray]], features: CommonFeatures, limit: float
-) -> str:
-    """The single point or edge without which the others agree; empty where there is none, or too few are left."""
-    best = (limit, -1)
-    for k in range(len(features.names)):
-        try:
-            _, away = fit(features.without(k))
-        except GeometryError:
-            continue  # too few are left: this one cannot be tested
-        best = min(best, (float(away.max(initial=0.0)), k))
-    if best[1] < 0:
-        return ""
-    return (
-        f"; without {features.names[best[1]]} the others agree within {best[0]:.2f} px: it is another one, or was "
-        "taken for another"
-    )
 
 
 def _counted(features: CommonFeatures) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 
 import msgspec
@@ -90,12 +90,7 @@ class TaughtGoalRegistry:
         """Raw pixels of those of the ``markers`` that are not on the body, by camera, when it was taught. Raises
         KeyError.
         """
-        others = self._store.goals[target.name].others
-        seen = {
-            camera: {marker: pixels[marker] for marker in markers if marker in pixels}
-            for camera, pixels in others.items()
-        }
-        return {camera: pixels for camera, pixels in seen.items() if pixels}
+        return _where(markers, self._store.goals[target.name].others)
 
     def resolve_incidence(
         self, target: IncidenceTarget, follow: tuple[MarkerId, ...] = ()
@@ -104,13 +99,11 @@ class TaughtGoalRegistry:
         the model's frame; and, where markers were, where those to ``follow`` are in these pictures (raw pixels by
         camera). Raises TransferError.
         """
-        observations, epoch = self._seen(), target.model_epoch
-        incidences, seen = [], {}
+        observations, epoch, incidences = self._seen(), target.model_epoch, []
         for spec in target.incidences:
             fixed = spec.fixed
             if fixed.markers:
                 fixed = _scene_feature(fixed, observations, bool(follow))
-                seen = _pixels_of(follow, observations)
             elif fixed.segments:
                 model = self._model()
                 if model is None:
@@ -121,7 +114,11 @@ class TaughtGoalRegistry:
                     )
                 fixed, epoch = fixed_line(fixed, model), model.epoch
             incidences.append(msgspec.structs.replace(spec, fixed=fixed))
-        return msgspec.structs.replace(target, incidences=tuple(incidences), model_epoch=epoch), seen
+        resolved = msgspec.structs.replace(target, incidences=tuple(incidences), model_epoch=epoch)
+        if not any(spec.fixed.markers for spec in target.incidences):
+            return resolved, {}
+        now = {camera: {m: one.pixel for m, one in shown.items()} for camera, shown in observations.items()}
+        return resolved, _where(follow, now)
 
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())
@@ -141,13 +138,13 @@ class TaughtGoalRegistry:
         return False
 
 
-def _pixels_of(
-    markers: tuple[MarkerId, ...], observations: MarkerObservations
+def _where(
+    markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel]]
 ) -> dict[str, dict[int, Pixel]]:
-    """Where ``markers`` are seen now, by camera and marker; cameras that see none are not in it."""
+    """Those of the ``markers`` that are ``shown``, by camera and marker; cameras that show none are not in it."""
     found = {
-        camera: {marker: shown[marker].pixel for marker in markers if marker in shown}
-        for camera, shown in observations.items()
+        camera: {marker: pixels[marker] for marker in markers if marker in pixels}
+        for camera, pixels in shown.items()
     }
     return {camera: pixels for camera, pixels in found.items() if pixels}
 

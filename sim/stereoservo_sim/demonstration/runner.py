@@ -51,11 +51,16 @@ class Demonstration:
     recording: Path
     out: Path
     loop: LoopInfo | None
+    """None in lockstep: virtual time is never late."""
     seed: int
-    lockstep: bool
     truth: SimulatedCell
     goals: Sequence[ShownGoal]
     belt: Belt | None
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether it ran in virtual time, not as real processes."""
+        return self.loop is None
 
 
 def conduct_lockstep(
@@ -86,24 +91,10 @@ def conduct_lockstep(
                 belt,
             )
             times, positions = log.end()
-    return _kept(
-        Demonstration(
-            cell,
-            names,
-            calibrated,
-            outcomes,
-            times,
-            positions,
-            recording,
-            out,
-            None,
-            seed,
-            True,
-            truth,
-            goals,
-            belt,
-        )
-    )
+    demonstration = Demonstration(
+        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, truth, goals, belt,
+    )  # fmt: skip
+    return _kept(demonstration)
 
 
 def _shown(
@@ -182,24 +173,10 @@ def conduct_live(
             code = daemon.stop()
             if code != 0:
                 raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
-    return _kept(
-        Demonstration(
-            cell,
-            names,
-            calibrated,
-            outcomes,
-            times,
-            positions,
-            recording,
-            out,
-            loop,
-            seed,
-            False,
-            truth,
-            goals,
-            belt,
-        )
-    )
+    demonstration = Demonstration(
+        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, truth, goals, belt,
+    )  # fmt: skip
+    return _kept(demonstration)
 
 
 def _emulate_drives(

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import DriverContext
+from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.video.driver import VideoCameraDriver
 
 WIDTH, HEIGHT = 64, 48
@@ -168,6 +168,21 @@ def camera(context: DriverContext) -> Iterator[Callable[..., VideoCameraDriver]]
     yield make
     for driver in made:
         driver.close()
+
+
+def connected(driver: VideoCameraDriver, limit_s: float = 20.0) -> VideoCameraDriver:
+    """The driver, active once its source answers."""
+    end = time.monotonic() + limit_s
+    while True:
+        try:
+            driver.configure()
+            driver.activate()
+            return driver
+        except DriverError as error:
+            driver.close()
+            if not error.retry or time.monotonic() > end:
+                raise
+            time.sleep(0.05)
 
 
 def poll_until(driver: VideoCameraDriver, count: int, limit_s: float = 20.0) -> list[Any]:

@@ -10,10 +10,9 @@ import time
 import numpy as np
 import pytest
 
-from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video.driver import VideoCameraDriver
 
-from .conftest import poll_until
+from .conftest import connected, poll_until
 from .foreign import (
     DIALECTS,
     HEIGHT,
@@ -36,18 +35,7 @@ LEFT_OUT = (31, 50, 51)
 def opened(url, context, **options):
     """A driver of ``url``, once its server listens."""
     settings = {"source": url, "width": WIDTH, "height": HEIGHT, "rate_hz": RATE_HZ, "read_timeout_s": 5.0}
-    driver = VideoCameraDriver({**settings, **options}, context)
-    end = time.monotonic() + 20.0
-    while True:
-        try:
-            driver.configure()
-            driver.activate()
-            return driver
-        except DriverError as error:
-            driver.close()
-            if not error.retry or time.monotonic() > end:
-                raise
-            time.sleep(0.05)
+    return connected(VideoCameraDriver({**settings, **options}, context))
 
 
 @pytest.mark.parametrize("name", DIALECTS)

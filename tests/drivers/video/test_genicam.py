@@ -18,7 +18,7 @@ from stereoservo_drivers.video.driver import VideoCameraDriver
 from stereoservo_drivers.video.genicam import LIBRARY, FrameNumbers
 from stereoservo_drivers.video.options import decode_video_options
 
-from .conftest import poll_until
+from .conftest import connected, poll_until
 
 CONTROL_PORT = 3956
 FAKE = "arv-fake-gv-camera-0.8"
@@ -60,19 +60,9 @@ def answers(address: str) -> bool:
     return False
 
 
-def connected(context: Any, address: str) -> VideoCameraDriver:
-    """A driver of the camera at ``address``, once it answers."""
-    driver = VideoCameraDriver({"source": f"genicam://{address}", **OPTIONS}, context)
-    end = time.monotonic() + 20.0
-    while True:
-        try:
-            driver.configure()
-            driver.activate()
-            return driver
-        except DriverError as error:
-            if not error.retry or time.monotonic() > end:
-                raise
-            time.sleep(0.1)
+def camera_at(address: str, context: Any) -> VideoCameraDriver:
+    """A driver of the camera at ``address``, not connected."""
+    return VideoCameraDriver({"source": f"genicam://{address}", **OPTIONS}, context)
 
 
 @pytest.fixture
@@ -89,7 +79,7 @@ def test_pictures_come_whole_and_those_that_do_not_are_counted(
     context: Any, address: str, lost: tuple[str, ...]
 ) -> None:
     with fake_camera(address, *lost):
-        driver = connected(context, address)
+        driver = connected(camera_at(address, context))
         try:
             frames = poll_until(driver, 50)
             statistics = driver.statistics()
@@ -106,9 +96,9 @@ def test_pictures_come_whole_and_those_that_do_not_are_counted(
 @with_aravis
 def test_a_camera_that_goes_away_is_told_and_taken_again_when_it_is_back(context: Any, address: str) -> None:
     with fake_camera(address):
-        driver = connected(context, address)
+        driver = connected(camera_at(address, context))
         poll_until(driver, 3)
-        other = VideoCameraDriver({"source": f"genicam://{address}", **OPTIONS}, context)
+        other = camera_at(address, context)
         with pytest.raises(DriverError, match="another program controls this camera") as caught:
             other.configure()
         assert caught.value.retry
@@ -135,7 +125,7 @@ def test_a_network_that_loses_packets_of_every_picture_is_the_cause_that_is_told
     context: Any, address: str
 ) -> None:
     with fake_camera(address, "-r", "100"):
-        driver = VideoCameraDriver({"source": f"genicam://{address}", **OPTIONS}, context)
+        driver = camera_at(address, context)
         end = time.monotonic() + 20.0
         code = ""
         while code in ("", "not_opened") and time.monotonic() < end:
@@ -175,4 +165,4 @@ class TestGenicam(CameraDriverContract):
             yield
 
     def make_driver(self, context: DriverContext) -> CameraDriver:
-        return VideoCameraDriver({"source": f"genicam://{self.address}", **OPTIONS}, context)
+        return camera_at(self.address, context)

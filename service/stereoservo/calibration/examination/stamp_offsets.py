@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.calibration.examination.recorded_views import RecordedViews
-from stereoservo.kinematics.parameterization import exponentials
+from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 SOUGHT_S, GRID_S = 0.2, 0.02
@@ -79,11 +79,8 @@ def _misfit(views: RecordedViews, mine: IntArray, late: float) -> float:
 def _forms(views: RecordedViews, times: FloatArray) -> FloatArray:
     """Entries (k, r) of the displacements that change, each centred and of deviation 1, and a column of ones."""
     assert views.generators is not None
-    factors = exponentials(views.generators, views.joint_kinds, views.at(times))
-    product = factors[:, 0]
-    for j in range(1, factors.shape[1]):
-        product = product @ factors[:, j]
-    entries = product[:, :3].reshape(len(times), 12)
+    chain = ProjectiveChain(views.joint_kinds, views.generators, np.zeros(len(views.joint_kinds)))
+    entries = chain.displacements(views.at(times))[:, :3].reshape(len(times), 12)
     spread = entries.std(axis=0)
     changing = spread > 1e-9
     centred = (entries - entries.mean(axis=0))[:, changing] / spread[changing]
