@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -19,9 +20,11 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.client import Client
-from stereoservo.messages.directories import CellDirectories, cell_directories
+from stereoservo.kinematics.model import CellModel, save_model
+from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo_sim.benchmarks.service_bench import processes_of
+from stereoservo_sim.cells import shipped_cell_path
 
 AUXILIARY = (
     '[{ name = "gripper", kind = "prismatic", low = 0.0, high = 0.08, velocity = 0.1 }, '
@@ -231,3 +234,18 @@ def serving(*arguments: str) -> Iterator[dict[str, Any]]:
                 assert process.wait(60) == 0
             finally:
                 process.kill()
+
+
+def cell_of_fakes(folder: Path, shipped: str, name: str, noise_px: float, model: CellModel) -> Path:
+    """A shipped cell under another name, with fakes for arm and cameras, and a ``model`` already learnt."""
+    text = shipped_cell_path(shipped).read_text(encoding="utf-8")
+    text = text.replace('driver = "pybullet"', 'driver = "fake"')
+    text = text.replace(f'name = "{shipped}"', f'name = "{name}"')
+    text = re.sub(r"^(detector|blur|background) = .*\n", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^noise = .*$", f"noise_px = {noise_px}", text, flags=re.MULTILINE)
+    path = folder / f"{name}.toml"
+    path.write_text(text, encoding="utf-8")
+    directories = cell_directories(name)
+    create_directories(directories)
+    save_model(model, directories.models / f"model-{model.epoch:06d}.json")
+    return path

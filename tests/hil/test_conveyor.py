@@ -5,7 +5,6 @@ followed where it comes again; when the belt stands, the goal is reached. Camera
 from __future__ import annotations
 
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -16,18 +15,16 @@ import numpy as np
 import pytest
 
 from stereoservo.client import Client
-from stereoservo.kinematics.model import save_model
-from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo.messages.goals import FeatureTarget
-from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.belt import Belt
 from stereoservo_sim.demonstration.truth import TruthLog
 from stereoservo_sim.world.conveyor import Conveyor
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.simulated_cell import hand_cell
 
-from .conftest import eventually, processes, recover
+from .conftest import cell_of_fakes, eventually, processes, recover
 
 pytestmark = pytest.mark.process
 
@@ -38,20 +35,8 @@ SPEED_M_S = 0.02
 
 
 def belt_cell(folder: Path) -> Path:
-    """The shipped cell with fakes for arm and cameras, and a model already learnt."""
-    text = shipped_cell_path("conveyor").read_text(encoding="utf-8")
-    text = text.replace('driver = "pybullet"', 'driver = "fake"').replace(
-        'name = "conveyor"', f'name = "{NAME}"'
-    )
-    text = re.sub(r"^(detector|blur|background) = .*\n", "", text, flags=re.MULTILINE)
-    text = re.sub(r"^noise = .*$", f"noise_px = {NOISE_PX}", text, flags=re.MULTILINE)
-    path = folder / f"{NAME}.toml"
-    path.write_text(text, encoding="utf-8")
-    directories = cell_directories(NAME)
-    create_directories(directories)
-    model = exact_simulated_model(hand_cell(), SEED)
-    save_model(model, directories.models / f"model-{model.epoch:06d}.json")
-    return path
+    """The shipped cell with fakes, and a model already learnt."""
+    return cell_of_fakes(folder, "conveyor", NAME, NOISE_PX, exact_simulated_model(hand_cell(), SEED))
 
 
 def goal_pixels() -> dict[str, dict[int, tuple[float, float]]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import time
 from pathlib import Path
 from typing import Any
@@ -14,15 +13,13 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.client import Client
-from stereoservo.kinematics.model import save_model
-from stereoservo.messages.directories import cell_directories, create_directories
+from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import DaemonProcess
-from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.truth import TruthLog
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.simulated_cell import demo_cell
 
-from .conftest import eventually, recover
+from .conftest import cell_of_fakes, eventually, recover
 
 pytestmark = pytest.mark.process
 
@@ -34,18 +31,9 @@ NOISE_PX = 0.1
 
 def wrong_cell(folder: Path) -> Path:
     """The demo's cell with fakes, and a model of before its encoders lost their zeros."""
-    text = shipped_cell_path("demo").read_text(encoding="utf-8")
-    text = text.replace('driver = "pybullet"', 'driver = "fake"').replace('name = "demo"', f'name = "{NAME}"')
-    text = re.sub(r"^(detector|blur|background) = .*\n", "", text, flags=re.MULTILINE)
-    text = re.sub(r"^noise = .*$", f"noise_px = {NOISE_PX}", text, flags=re.MULTILINE)
-    path = folder / f"{NAME}.toml"
-    path.write_text(text, encoding="utf-8")
-    directories = cell_directories(NAME)
-    create_directories(directories)
     model = exact_simulated_model(demo_cell(), 0)
-    model = msgspec.structs.replace(model, zero=model.zero + WRONG)
-    save_model(model, directories.models / f"model-{model.epoch:06d}.json")
-    return path
+    lost = msgspec.structs.replace(model, zero=model.zero + WRONG)
+    return cell_of_fakes(folder, "demo", NAME, NOISE_PX, lost)
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> Any:
