@@ -36,7 +36,9 @@ def test_a_goal_is_reached_in_another_posture(
     listed = told(capsys, "ik", CELL, "park")
     assert listed["case"] == "arm_with_wrist"
     park, there = sorted(listed["postures"], key=lambda row: apart(client, row))
-    assert apart(client, park) < SAME_RAD  # `park` is where the arm is, and a wrist turned over is there as well
+    assert (
+        apart(client, park) < SAME_RAD
+    )  # `park` is where the arm is, and a wrist turned over is there as well
     assert there["refused"] is None
     assert apart(client, there) > 2.0
     for row in (there, park):

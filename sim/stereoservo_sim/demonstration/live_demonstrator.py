@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.client import Client, ClientError, GoalHandle, GoalResult
+from stereoservo.client import Client, ClientError, FailedError, GoalHandle
 from stereoservo.daemon.servo import SILENCE
 from stereoservo.kinematics.model import load_model
 from stereoservo.messages.goals import JointTarget, LawName
@@ -25,13 +25,15 @@ from stereoservo_sim.demonstration.scenario import (
 LOOK_EVERY_S = 2.0
 RECENT_EVENTS = 50
 MOST_HOLDS = 20
+BUSY_COMPUTER = frozenset({"JOINT_STAMP", "LOOP_GAP"})
+"""Codes of the stops of a simulated cell whose computer was busy."""
 
 
 class LiveDemonstrator:
     """``scenario.Operator`` as a goal client of a running daemon.
 
-    As an operator would, it resumes an arm that was held since a busy computer left the gateway no time, ``MOST_HOLDS``
-    times at most, and tells so; any other hold ends what it waits for.
+    As an operator would, it resumes an arm that was held or stopped since the computer was busy, ``MOST_HOLDS`` times
+    at most, tells so, and begins anew what a stop ended; any other hold ends what it waits for.
     """
 
     def __init__(
@@ -53,10 +55,15 @@ class LiveDemonstrator:
 
     def calibrate(self) -> Calibrated:
         """Calibrate; the model is read from the daemon's file."""
-        start = time.monotonic()
-        result = self._client.calibrate(self._hear)
-        seconds = time.monotonic() - start
-        return Calibrated(load_model(Path(result.model)), seconds)
+        while True:
+            start = time.monotonic()
+            try:
+                result = self._client.calibrate(self._hear)
+            except FailedError as error:
+                if not self._goes_on(error.code in BUSY_COMPUTER, str(error)):
+                    raise
+            else:
+                return Calibrated(load_model(Path(result.model)), time.monotonic() - start)
 
     def _hear(self, event: EventMessage) -> None:
         if event.progress is not None:
@@ -64,7 +71,7 @@ class LiveDemonstrator:
 
     def move(self, joints: dict[str, float]) -> None:
         """Execute a joint goal."""
-        self._reach(self._client.goal(JointTarget(joints)))
+        self._drive(lambda: self._client.goal(JointTarget(joints))).reached()
 
     def teach(self, name: str, frames: int) -> None:
         """Teach the current view."""
@@ -72,7 +79,7 @@ class LiveDemonstrator:
 
     def home(self) -> None:
         """Move home."""
-        self._reach(self._client.home())
+        self._drive(self._client.home).reached()
 
     def joints(self) -> npt.NDArray[np.float64]:
         """Measured joint positions (n,)."""
@@ -99,7 +106,9 @@ class LiveDemonstrator:
 
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
         """Execute a goal to its end, under a lease."""
-        result: GoalResult = self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow).wait()
+        result = self._drive(
+            lambda: self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow)
+        ).wait()
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
     def _look(self) -> None:
@@ -116,14 +125,26 @@ class LiveDemonstrator:
             if event.kind == "held"
         ]
         cause = told[-1] if told else "no event says why"
-        self._holds += 1
-        if SILENCE not in cause or self._holds > MOST_HOLDS:
+        if not self._goes_on(SILENCE in cause, cause):
             raise ClientError(f"the cell was held and nobody resumed it: {cause}")
+
+    def _goes_on(self, was_busy: bool, cause: str) -> bool:
+        """Whether the cell was resumed, since the computer ``was_busy``, and not too often yet."""
+        self._holds += was_busy
+        if not was_busy or self._holds > MOST_HOLDS:
+            return False
         self._tell(f"{cause}: resumed")
         self._client.resume()
+        return True
 
-    def _reach(self, handle: GoalHandle) -> None:
-        handle.reached()
+    def _drive(self, send: Callable[[], GoalHandle]) -> GoalHandle:
+        """A goal that has ended, sent anew where a busy computer ended it."""
+        while True:
+            handle = send()
+            result = handle.wait()
+            codes = {reason.code for reason in result.reasons}
+            if result.outcome == "reached" or not self._goes_on(bool(codes & BUSY_COMPUTER), result.message):
+                return handle
 
     def rest(self, seconds: float) -> None:
         """Wait."""

@@ -7,15 +7,16 @@ from typing import Any
 
 import pytest
 
-from stereoservo.client import ClientError
+from stereoservo.client import ClientError, FailedError
 from stereoservo.daemon.servo import SILENCE
+from stereoservo.messages.goals import TaughtTarget
 from stereoservo_sim.demonstration import live_demonstrator
-from stereoservo_sim.demonstration.live_demonstrator import MOST_HOLDS, LiveDemonstrator
+from stereoservo_sim.demonstration.live_demonstrator import BUSY_COMPUTER, MOST_HOLDS, LiveDemonstrator
 
 
 class HeldCell:
-    """A client, and a goal, of a cell that is held from its ``looks``-th status on; the goal ends where the cell was
-    resumed as often as it is held.
+    """A client, and a goal, of a cell that is held from its ``looks``-th status on; the goal is reached where the cell
+    was resumed as often as it is held.
     """
 
     while_waiting: Any
@@ -26,9 +27,12 @@ class HeldCell:
     def goal(self, target: Any, **options: Any) -> HeldCell:
         return self
 
-    def reached(self) -> None:
+    def wait(self) -> Any:
         while self.left:
             self.while_waiting()
+        return SimpleNamespace(outcome="reached", reasons=(), message="")
+
+    reached = wait
 
     def resume(self) -> None:
         self.left -= 1
@@ -65,3 +69,56 @@ def test_an_arm_that_a_busy_computer_held_goes_on_and_not_without_end() -> None:
     cell = HeldCell(1, f"held by {SILENCE}", MOST_HOLDS + 1)
     with pytest.raises(ClientError, match="said nothing"):
         LiveDemonstrator(cell, lambda _: None).move({"j1": 0.0})
+
+
+class StoppedCell:
+    """A client, goal and result of a cell whose arm is stopped for ``code`` ``stops`` times, whatever it does."""
+
+    def __init__(self, code: str, stops: int) -> None:
+        self.reasons, self.message, self.left = (SimpleNamespace(code=code),), f"stop: {code}", stops
+
+    @property
+    def outcome(self) -> str:
+        return "aborted" if self.left else "reached"
+
+    def goal(self, target: Any, **options: Any) -> StoppedCell:
+        return self
+
+    def wait(self) -> StoppedCell:
+        return self
+
+    def calibrate(self, progress: Any) -> Any:
+        if self.left:
+            event: Any = SimpleNamespace(
+                kind="calibration_aborted", name="", message=self.message, reasons=self.reasons
+            )
+            raise FailedError("calibration", event)
+        return SimpleNamespace(model="model.json")
+
+    def resume(self) -> None:
+        self.left -= 1
+
+
+def test_what_a_busy_computer_ended_is_begun_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_demonstrator, "load_model", lambda path: path.name)
+    for code in BUSY_COMPUTER:
+        told: list[str] = []
+        cell: Any = StoppedCell(code, 2)
+        model: Any = LiveDemonstrator(cell, lambda _: None, told.append).calibrate().model
+        assert model == "model.json"
+        assert told == [f"calibration: calibration aborted: stop: {code}: resumed"] * 2
+        cell.left = 1
+        demonstrator = LiveDemonstrator(cell, lambda _: None, told.append)
+        assert demonstrator.servo(TaughtTarget("near"), "stereo") == "reached"
+
+
+def test_what_anything_else_ended_is_not() -> None:
+    cell: Any = StoppedCell("CONTACT", 1)
+    demonstrator = LiveDemonstrator(cell, lambda _: None)
+    with pytest.raises(FailedError, match="CONTACT"):
+        demonstrator.calibrate()
+    assert demonstrator.servo(TaughtTarget("near"), "stereo") == "aborted: stop: CONTACT"
+    cell = StoppedCell("LOOP_GAP", MOST_HOLDS + 1)
+    with pytest.raises(FailedError, match="LOOP_GAP"):
+        LiveDemonstrator(cell, lambda _: None).calibrate()
+    assert cell.left == 1
