@@ -16,10 +16,10 @@ from stereoservo.numerics.arrays import FloatArray, KindArray
 from stereoservo.numerics.compilation import kernel
 
 BATCH = 64
-FEWEST = 256
+FEWEST = 128
 MOST = 4096
 """Starts of a search: in batches, at least, at most."""
-HITS = 4
+HITS = 8
 """Starts that have to come to each solution before a search ends: what was found once may have unseen company."""
 TWINS = np.array([0.05, 0.2, 0.6])
 """Steps [rad] from a solution along its weakest direction, where the other one of a close pair lies."""
@@ -329,6 +329,14 @@ def descended(
         damping,
     )
     return ends, np.asarray(np.sqrt(errors) / np.linalg.norm(targets), dtype=np.float64)
+
+
+def equivalent_points(points: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Four points and their targets (4, 4) for ``points`` and ``targets`` (m, 4): of every 4x4 H the sum of squares
+    ``Σ |H M - M*|²`` is the same, but for what no H explains, and so are its derivatives.
+    """
+    Q, R = np.linalg.qr(points)
+    return np.ascontiguousarray(R), np.ascontiguousarray(Q.T @ targets)
 
 
 def linearised(

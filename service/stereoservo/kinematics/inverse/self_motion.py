@@ -17,7 +17,11 @@ PROBES = (0.2 * PROBE, -0.5 * PROBE, PROBE)
 """Motions [rad or m] after which a direction still has to leave the goal reached: a stretched elbow's does not."""
 STRICTER = 0.02
 """Share of the tolerance for that: before a wrist that is nearly aligned a stretched elbow hardly has to move."""
+STRIDE = 0.4
+"""Longest step [rad or m] towards a seed; halved where the goal is lost, or the seed is no nearer after it."""
 CORRECTIONS = 20
+SETTLED = 1e-6
+"""Step [rad or m] of a correction that is its last: what is left of a measured goal is noise."""
 
 
 def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
@@ -44,15 +48,16 @@ def corrected(
 ) -> tuple[FloatArray, float]:
     """``q`` (n,) corrected to reach the goal again by the least joint motion, and the residual left."""
     norm = float(np.linalg.norm(targets))
-    residual = np.inf
+    residual = longest = np.inf
     for _ in range(CORRECTIONS):
         moved, J, _ = linearised(chain, points, q)
         error = (moved - targets).ravel()
         residual = float(np.linalg.norm(error)) / norm
-        if residual <= 0.01 * tolerance or not np.isfinite(residual):
+        if residual <= 0.01 * tolerance or longest < SETTLED or not np.isfinite(residual):
             break
         step = -np.linalg.lstsq(J, error, rcond=NO_MOTION)[0]
-        q = q + step * min(1.0, 0.2 / max(float(np.abs(step).max()), 1e-300))
+        longest = float(np.abs(step).max())
+        q = q + step * min(1.0, 0.2 / max(longest, 1e-300))
     return q, residual
 
 
@@ -93,18 +98,20 @@ def nearest_by_self_motion(
     tolerance: float,
 ) -> FloatArray:
     """Configuration nearest to ``seed`` (n,) that a self-motion from ``q`` (n,) reaches with the goal kept."""
+    stride = STRIDE
     for _ in range(200):
         kernel = null_directions(chain, points, q)
         step = kernel.T @ (kernel @ (seed - q))
         length = float(np.abs(step).max(initial=0.0))
-        if length < 1e-9:
+        if length < SETTLED:
             break
-        ahead, residual = corrected(
-            chain, points, targets, q + step * min(1.0, 2.0 * PROBE / length), tolerance
-        )
-        if residual > tolerance or np.linalg.norm(ahead - seed) >= np.linalg.norm(q - seed):
+        ahead, residual = corrected(chain, points, targets, q + step * min(1.0, stride / length), tolerance)
+        if residual <= tolerance and np.linalg.norm(ahead - seed) < np.linalg.norm(q - seed):
+            q = ahead
+        elif stride > PROBE:
+            stride *= 0.5
+        else:
             break
-        q = ahead
     return q
 
 

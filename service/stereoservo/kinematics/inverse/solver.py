@@ -25,7 +25,7 @@ from stereoservo.kinematics.inverse.closed_forms import (
     two_parallel,
     wrist,
 )
-from stereoservo.kinematics.inverse.numerical import descended, linearised
+from stereoservo.kinematics.inverse.numerical import descended, equivalent_points, linearised
 from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
 from stereoservo.kinematics.inverse.self_motion import (
     NO_MOTION,
@@ -107,6 +107,9 @@ def inverse_kinematics(
     known = recognise(mechanism) if recognition is None else recognition
     problem = replace(problem, displacement=_displacement(problem, known))
     branches = _closed_form(problem, known)
+    if len(problem.points) > len(np.eye(4)):
+        at_zero, at_goal = equivalent_points(problem.points, problem.targets)
+        problem = replace(problem, points=at_zero, targets=at_goal)
     if branches is None:
         return _searched(problem)
     starts = chain.zero + branches.steps
