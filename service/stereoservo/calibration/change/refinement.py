@@ -39,8 +39,8 @@ from stereoservo.numerics.arrays import FloatArray
 CHANCE = 0.001
 """Probability with which each test fails where nothing is wrong, or passes where nothing is better."""
 LEAST_POSES = 16
-HELD_OUT = 4
-"""One in so many poses is held out of the estimate and judges it."""
+FOLDS = 4
+"""One in so many poses is held out of an estimate and judges it, in turn (cross-validation)."""
 LEAST_KNOWLEDGE = 0.01
 """Information of the poses about a direction, relative to the prior's, below which its step is not tested."""
 ROUNDS = 20
@@ -49,17 +49,16 @@ SETTLED = 1e-3
 
 
 class RefinementReport(msgspec.Struct, frozen=True):
-    """What a refinement of model ``base_epoch`` by so many ``poses`` found, ``held_out`` of them to judge it.
+    """What a refinement of model ``base_epoch`` by so many ``poses`` found.
 
-    ``before_px``, ``after_px``: rms distance of the held-out poses' pixels from the prediction of the model in use and
-    of the refined one, a coordinate. ``score``: by how many deviations of chance that is better, above ``limit``.
+    ``before_px``, ``after_px``: rms distance of the pixels from the prediction of the model in use, and of one refined
+    by the other poses, a coordinate. ``score``: by how many deviations of chance that is better, above ``limit``.
     ``step_chi2``: chi-square of the step from the calibrated model, below ``step_limit``. ``predicted_before_px``,
     ``predicted_after_px``: rms deviation of predicted pixels at the poses by the model's covariance, a coordinate.
     """
 
     base_epoch: int
     poses: int
-    held_out: int
     before_px: float
     after_px: float
     score: float
@@ -73,8 +72,8 @@ class RefinementReport(msgspec.Struct, frozen=True):
     def message(self) -> str:
         """The result as text."""
         return (
-            f"refined from epoch {self.base_epoch} by {self.poses} rest poses: at {self.held_out} of them that it was "
-            f"not made from, predictions are {self.after_px:.3g} px rms off instead of {self.before_px:.3g} "
+            f"refined from epoch {self.base_epoch} by {self.poses} rest poses: at poses held out, predictions are "
+            f"{self.after_px:.3g} px rms off instead of {self.before_px:.3g} "
             f"({self.score:.1f} deviations of chance, {self.limit:.1f} needed); by covariance the deviation of a "
             f"predicted pixel falls from {self.predicted_before_px:.2g} to {self.predicted_after_px:.2g} px; "
             f"chi-square of the step {self.step_chi2:.0f} of {self.step_limit:.0f} allowed"
@@ -112,16 +111,13 @@ def refine_model(
         )
     data = examined.problem.data
     poses = len(np.unique(data.stop))
-    apart = data.stop % HELD_OUT == HELD_OUT - 1
-    learnt = estimate_step(base, data.select(~apart))
-    held = data.select(apart)
     current = base if used is None else used
-    score, before, after = _judged(base, current, displaced_model(base, learnt.x), held, samples)
+    score, before, after = _cross_validated(base, current, data, samples)
     limit = float(norm.isf(CHANCE))
     if score <= limit:
         raise CalibrationError(
             "not_better",
-            f"not refined: at {len(np.unique(held.stop))} rest poses that it was not made from, the refined model "
+            f"not refined: at each of {poses} rest poses, a model refined by the others "
             f"predicts the pixels to {after:.3g} px rms, the one in use to {before:.3g}: better by {score:.1f} "
             f"deviations of chance, {limit:.1f} are needed. The model in use stays",
             score=score, limit=limit,
@@ -137,7 +133,7 @@ def refine_model(
         )  # fmt: skip
     model = _refined(base, whole, created)
     report = RefinementReport(
-        base.epoch, poses, len(np.unique(held.stop)), before, after, score, limit, whole.chi2, whole.limit,
+        base.epoch, poses, before, after, score, limit, whole.chi2, whole.limit,
         _predicted(current, samples.positions), _predicted(model, samples.positions),
     )  # fmt: skip
     return msgspec.structs.replace(model, source=f"{base.source or 'model'}; {report.message}"), report
@@ -212,26 +208,33 @@ def _squares(error: FloatArray, B: FloatArray) -> float:
     return float(error @ error - inner @ inner)
 
 
-def _judged(
-    base: CellModel, used: CellModel, new: CellModel, held: Measurements, samples: TrialData
+def _cross_validated(
+    base: CellModel, used: CellModel, data: Measurements, samples: TrialData
 ) -> tuple[float, float, float]:
-    """By how many deviations of chance ``new`` predicts the pixels ``held`` out better than ``used``, and the rms
-    [px] of either.
+    """By how many deviations of chance models refined without some poses predict these better than ``used``, and the
+    rms [px] of either.
 
-    Were ``used`` exact, ``-rᵀ W δ / √(δᵀ W δ)`` of its residuals r and the change δ of the prediction, which does not
-    depend on them, would be standard normal. Noise that the new residuals show beyond the stated makes it smaller.
+    Were ``used`` exact, ``-rᵀ W δ`` of its residuals r and the change δ of the prediction, which does not depend on the
+    same r, would have mean zero and variance ``δᵀ W δ``; over all folds at most twice the sum, since r of one is in δ
+    of the others. Noise that the new residuals show beyond the stated makes the score smaller.
     """
-    seen = [_seen(model, held, samples) for model in (used, new)]
-    B = bounded(joint_uncertainty(base, held, acting_order(base)))
-    before, after = (_squares(error, B) for error in seen)
-    rms = [float(np.sqrt((_pixels(error, held) ** 2).mean())) for error in seen]
-    change = seen[1] - seen[0]
-    size = _squares(change, B)
+    gain = size = before = after = 0.0
+    errors: list[tuple[FloatArray, FloatArray]] = []
+    for fold in range(FOLDS):
+        apart = data.stop % FOLDS == fold
+        held = data.select(apart)
+        found = displaced_model(base, estimate_step(base, data.select(~apart)).x)
+        old, new = (_seen(model, held, samples) for model in (used, found))
+        B = bounded(joint_uncertainty(base, held, acting_order(base)))
+        change = new - old
+        gain -= float(old @ change - (B.T @ old) @ (B.T @ change))
+        size, before, after = size + _squares(change, B), before + _squares(old, B), after + _squares(new, B)
+        errors.append((_pixels(old, held), _pixels(new, held)))
+    rms = [float(np.sqrt((np.concatenate(one) ** 2).mean())) for one in zip(*errors, strict=True)]
     if size <= 0.0 or after >= before:
         return 0.0, rms[0], rms[1]
-    projected = float(seen[0] @ change - (B.T @ seen[0]) @ (B.T @ change))
-    noise = np.sqrt(max(1.0, after / len(change)))
-    return float(-projected / np.sqrt(size) / noise), rms[0], rms[1]
+    noise = max(1.0, after / (2 * len(data.camera)))
+    return float(gain / np.sqrt(2.0 * size * noise)), rms[0], rms[1]
 
 
 def _pixels(error: FloatArray, data: Measurements) -> FloatArray:

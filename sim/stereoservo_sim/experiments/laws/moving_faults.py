@@ -47,7 +47,7 @@ FAULT_PX: dict[Fault, tuple[float, float]] = {
     "marker slipped": (2.0, 10.0),
 }  # fmt: skip
 """How far it moves the markers that it moves in the images [px], rms."""
-BEFORE_S, AFTER_S = 1.5, 2.5
+BEFORE_S, AFTER_S = 1.5, 1.5
 """The target moves, then there is a fault, and the watch has so long to name it."""
 DRIFT_NS, JUMP_NS = 1_000_000_000, 20_000_000
 """In which a joint's zero drifts, and jumps: within a frame."""
