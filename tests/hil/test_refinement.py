@@ -21,12 +21,20 @@ from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo_sim.world.simulated_cell import demo_cell
+from stereoservo_sim.world.workpiece import Moved, MovedFile
 
 from .conftest import CELL, at_rest, eventually, recover
 
 pytestmark = pytest.mark.process
 COARSER = 4.0
 SEED = 5
+
+
+def refining(calibrated: Path) -> Path:
+    """The cell file, with refinement."""
+    path = calibrated.with_name("refining.toml")
+    path.write_text(calibrated.read_text().replace("[calibration]\n", "[calibration]\nrefine = true\n"))
+    return path
 
 
 def coarse(directories: CellDirectories) -> CellModel:
@@ -60,9 +68,7 @@ def test_goals_refine_the_model_and_one_command_undoes_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     base = coarse(directories)
-    path = calibrated.with_name("refining.toml")
-    path.write_text(calibrated.read_text().replace("[calibration]\n", "[calibration]\nrefine = true\n"))
-    start(path)
+    start(refining(calibrated))
     rng = np.random.default_rng(SEED)
     with Client(CELL) as client:
         recover(client)
@@ -99,3 +105,32 @@ def test_goals_refine_the_model_and_one_command_undoes_it(
         assert client.goal("park").wait(60.0).outcome == "reached"
         assert cli.invoke(["calibrate", CELL, "--undo-refinement"]) != 0
         assert "nothing to undo" in capsys.readouterr().err
+
+
+def test_a_bumped_camera_is_named_and_nothing_is_learnt_of_it(
+    kept_state: None, calibrated: Path, directories: CellDirectories, start: Callable[..., DaemonProcess]
+) -> None:
+    start(refining(calibrated))
+    rng = np.random.default_rng(SEED)
+    bumps = MovedFile(directories.runtime, "simulated-camera-left.json")
+    with Client(CELL) as client:
+        recover(client)
+        epoch, first = client.status().model_epoch, client.events(1 << 60).next
+        home = dict(client.status().joints)
+        for _ in range(4):
+            client.goal({name: q + float(rng.uniform(-0.12, 0.12)) for name, q in home.items()}).reached(60.0)
+            time.sleep(0.5)
+        try:
+            bumps.write(Moved((0.03, 0.0, 0.0), (0.0, 5.0, 0.0)))
+            eventually(
+                "the camera is found anew",
+                lambda: client.status().health.verdict == "ok" and client.status().model_epoch > epoch,
+            )
+        finally:
+            bumps.path.unlink()
+        events = client.events(first).events
+        assert "camera_moved" in [e.name for e in events if e.kind == "health"]
+        told = [(e.accepted, e.name) for e in events if e.kind == "refined"]
+        assert told == [(False, "watch")], [e.message for e in events]
+        found = load_model(max(directories.models.glob("model-??????.json")))
+        assert found.refined_from == 0

@@ -17,7 +17,6 @@ import numpy as np
 
 from stereoservo.core.cycle import Event
 from stereoservo.daemon.lockstep import LockstepCell
-from stereoservo.messages.goals import LawName
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointState
 from stereoservo_sim.experiments.laws.driven_tasks import labelled, picture, saved
@@ -119,25 +118,29 @@ def disturb(place: str, fault: Fault, name: str, seed: int) -> Named:
     """Follow a target, and disturb the cell; deterministic given the seed."""
     world = world_of(place)
     history = TrueJointHistory.in_memory(len(world.base), capacity=1 << 14)
-    law: LawName = LAWS[place][-1]
+    with under_way(place, LAWS[place][-1], name, seed, history, follows=True) as (cell, _, _):
+        cell.run_for(BEFORE_S)
+        return named_after(cell, world, history, fault, name, seed)
+
+
+def named_after(
+    cell: LockstepCell, world: SimulatedCell, history: TrueJointHistory, fault: Fault, name: str, seed: int
+) -> Named:
+    """What is named after a fault that comes now."""
     rng = np.random.default_rng([seed, list(FAULTS).index(fault), 37])
     size_px = float(rng.uniform(*FAULT_PX[fault]))
-    with under_way(place, law, name, seed, history, follows=True) as (cell, _, _):
-        cell.run_for(BEFORE_S)
-        onset_ns = cell.clock.now_ns()
-        q = history.newest()
-        assert q is not None  # the arm was enabled
-        subject = _DISTURBANCES[fault](cell, world, q[1].copy(), size_px, rng)
-        cell.run_for(AFTER_S)
-        told = [e for e in cell.events if (e.kind == "health" and e.name != "ok") or e.kind == "fault"]
+    onset_ns, newest = cell.clock.now_ns(), history.newest()
+    assert newest is not None  # the arm was enabled
+    subject = _DISTURBANCES[fault](cell, world, newest[1].copy(), size_px, rng)
+    cell.run_for(AFTER_S)
+    told = [e for e in cell.events if (e.kind == "health" and e.name != "ok") or e.kind == "fault"]
     early = tuple(_verdict(e) for e in told if e.t_ns <= onset_ns)
     late = [e for e in told if e.t_ns > onset_ns]
     if not late:
         return Named("", "", False, float("nan"), size_px, name, early)
-    first = late[0]
-    verdict = _verdict(first)
-    right = verdict in FAULTS[fault] and _subject(first) == subject
-    return Named(verdict, _subject(first), right, 1e-9 * (first.t_ns - onset_ns), size_px, name, early)
+    verdict, delay_s = _verdict(late[0]), 1e-9 * (late[0].t_ns - onset_ns)
+    right = verdict in FAULTS[fault] and _subject(late[0]) == subject
+    return Named(verdict, _subject(late[0]), right, delay_s, size_px, name, early)
 
 
 def _number(value: float) -> float | None:

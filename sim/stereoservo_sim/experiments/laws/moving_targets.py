@@ -210,6 +210,7 @@ def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> 
     with under_way(place, law, name, seed, history, follows=follows, watch=watch) as (cell, goal, motion):
         cell.run_for(SETTLE_S + JUDGED_S)
         ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
+    assert motion.since_ns is not None  # it sets out in mid-run
     judged = [(t, q) for t, q in seen if t >= motion.since_ns + round(SETTLE_S * 1e9)]
     judged_by = _judged_by(place, world)
     errors = np.array([_errors(world, motion.at(t), q)[judged_by] for t, q in judged[::3]])
