@@ -25,7 +25,7 @@ from stereoservo.gateway.persistence import ModelStore, TaughtStore
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.goals import TaughtTarget
 from stereoservo.messages.status import Health
-from stereoservo.messages.wire import MessageError
+from stereoservo.messages.wire import MessageError, RunningGoals
 from stereoservo.ports.devices import CameraObservation
 
 STATE_NS, FRAME_NS = 50_000_000, 30_000_000
@@ -159,6 +159,7 @@ class Gateway:
         save_model(self.base, self.models.path(1))
         self.sent: list[CellModel] = []
         self.told: list[Any] = []
+        self.running: tuple[Any, ...] = ()
         self.calibration = SimpleNamespace(model=self.base, busy=False)
         self.taught = TaughtStore(folder / "taught.json")
         self.taught.add("park", taught_goal(self.shown(), self.base, "2026"))
@@ -168,7 +169,7 @@ class Gateway:
         link = SimpleNamespace(send_model=lambda model: self.sent.append(model) or True)
         self.jobs = RefinementJobs(
             self.settings, True, self.models, link, log, self.calibration, SimpleNamespace(busy=False),  # type: ignore[arg-type]
-            self.taught,
+            self.taught, lambda: RunningGoals(self.running),
         )  # fmt: skip
         self.bench = Bench(self.jobs, self.settings)
 
@@ -203,8 +204,11 @@ def test_a_refined_model_is_taken_in_between_goals_and_undone(gateway: Gateway) 
     gateway.visit(3, seed=1)
     assert len(Job.made) == 1
     assert not gateway.sent
-    gateway.bench.source = "hold"
+    gateway.bench.source, gateway.running = "hold", ("queued",)
     gateway.bench.run(0.2)
+    gateway.jobs.poll()
+    assert not gateway.sent
+    gateway.running = ()
     gateway.jobs.poll()
     assert [model.epoch for model in gateway.sent] == [2]
     assert not gateway.told  # until the core works with it
@@ -267,7 +271,8 @@ def test_nothing_is_refined_where_it_is_not_wanted_or_things_move(tmp_path: Path
         log,
         nothing,
         nothing,
-        TaughtStore(tmp_path / "t.json"),  # type: ignore[arg-type]
+        TaughtStore(tmp_path / "t.json"),
+        RunningGoals,
     )
     assert "marker body moves by itself" in told[0]
     Bench(jobs, settings).run(2.0)

@@ -24,7 +24,7 @@ from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model
 from stereoservo.messages.goals import ReanchorRefused
-from stereoservo.messages.wire import MessageError
+from stereoservo.messages.wire import MessageError, RunningGoals
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 
@@ -182,13 +182,14 @@ class RefinementJobs:
     def __init__(
         self, settings: CoreSettings, on: bool, models: ModelStore, link: ServoConnection, log: EventLog,
         calibration: CalibrationJobs, relocalization: RelocalizationJobs, taught: TaughtStore,
+        running: Callable[[], RunningGoals],
     ) -> None:  # fmt: skip
         moving = settings.body_moves or any(camera.mobile for camera in settings.cameras)
         self._on = on and not moving
         if on and moving:
             log.add("warning", message=f"[calibration] refine: {NOT_WHERE_THINGS_MOVE}", origin="gateway")
         self._models, self._link, self._log, self._taught = models, link, log, taught
-        self._calibration, self._relocalization = calibration, relocalization
+        self._calibration, self._relocalization, self._running = calibration, relocalization, running
         self._poses = RestPoses(settings)
         self._cameras = frozenset(camera.name for camera in settings.cameras)
         self._due = LEAST_POSES
@@ -250,18 +251,18 @@ class RefinementJobs:
         """Start a refinement that is due, handle the result of one, take in a model while no goal runs."""
         if not self._on:
             return
-        model = self._calibration.model
-        at_work = self._calibration.busy or self._relocalization.busy
         if self._job is not None:
             self._poll_job(self._job)
-        elif self._found is not None:
-            if self._idle and not at_work and model is not None and model.epoch == self._epoch:
-                (found, report), self._found = self._found, None
-                self._hand_over(model, found, f"{report.message}. {UNDO}")
-        elif (
-            len(self._poses.poses) >= self._due and model is not None and model.epoch == self._epoch and not at_work
-        ):  # fmt: skip
-            self._start(model)
+            return
+        model = self._calibration.model
+        if model is None or model.epoch != self._epoch or self._calibration.busy or self._relocalization.busy:
+            return
+        if self._found is None:
+            if len(self._poses.poses) >= self._due:
+                self._start(model)
+        elif self._idle and not self._running().goals:
+            (found, report), self._found = self._found, None
+            self._hand_over(model, found, f"{report.message}. {UNDO}")
 
     def _start(self, model: CellModel) -> None:
         self._due = 2 * self._due if self._due < MOST_POSES else MOST_POSES + 1
@@ -318,7 +319,8 @@ class RefinementJobs:
         used = self._calibration.model
         if used is None or not used.refined_from:
             raise MessageError("the model in use is not refined: there is nothing to undo")
-        if not self._idle or self._calibration.busy or self._relocalization.busy:
+        busy = self._calibration.busy or self._relocalization.busy
+        if busy or not self._idle or self._running().goals:
             raise MessageError("the arm is at work: wait until no goal runs, or cancel it, then undo again")
         base = self._models.of_epoch(used.refined_from)
         if base is None:

@@ -156,13 +156,13 @@ class Gateway:
         self._teaching = TaughtGoalRegistry(
             taught, self._marker_cache, lambda: self._calibration.model, self.log
         )
-        self._refinement = RefinementJobs(
-            self.settings, plan.cell.calibration is not None and plan.cell.calibration.refine, self._models,
-            self._servo, self.log, self._calibration, self._relocalization, taught,
-        )  # fmt: skip
         self._intake = Intake(
             self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot
         )
+        self._refinement = RefinementJobs(
+            self.settings, plan.cell.calibration is not None and plan.cell.calibration.refine, self._models,
+            self._servo, self.log, self._calibration, self._relocalization, taught, self._intake.running,
+        )  # fmt: skip
         self._reports = ChannelServer(directories.reports_socket)
         slots = [directories.observation_slot(name) for name in cameras]
         log = partial(write_log, "gateway")
