@@ -48,6 +48,8 @@ FAULT_PX: dict[Fault, tuple[float, float]] = {
 """How far it moves the markers that it moves in the images [px], rms."""
 BEFORE_S, AFTER_S = 1.5, 1.5
 """The target moves, then there is a fault, and the watch has so long to name it."""
+UNCLEAR = "unclear"
+"""The verdict that something is wrong which several causes explain alike; it names none."""
 DRIFT_NS, JUMP_NS = 1_000_000_000, 20_000_000
 """In which a joint's zero drifts, and jumps: within a frame."""
 
@@ -55,7 +57,8 @@ DRIFT_NS, JUMP_NS = 1_000_000_000, 20_000_000
 @dataclass(frozen=True)
 class Named:
     """What was named: the ``verdict`` and its ``subject``, '' where nothing was, ``delay_s`` after the fault, whether
-    that is ``right``, of a fault of ``size_px``; ``early``: verdicts before it.
+    that is ``right``, of a fault of ``size_px``; ``early``: verdicts before it; ``unclear``: whether it was told that
+    something is wrong before, or without, what it is.
     """
 
     verdict: str
@@ -65,6 +68,7 @@ class Named:
     size_px: float
     motion: str
     early: tuple[str, ...]
+    unclear: bool
 
 
 def run_moving_faults(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
@@ -88,6 +92,7 @@ def run_moving_faults(*, seeds: int, seed: int, progress: ProgressCall) -> dict[
                 "right": sum(one.right for one in flown),
                 "wrong": sum(wrong.values()),
                 "none": len(missed),
+                "unclear_first": sum(one.unclear for one in flown),
                 "delay_median_s": _number(float(np.median(delays))),
                 "delay_largest_s": _number(float(np.max(delays))),
                 "largest_missed_px": max(missed, default=0.0),
@@ -107,7 +112,9 @@ def run_moving_faults(*, seeds: int, seed: int, progress: ProgressCall) -> dict[
             f"motions in turn: {', '.join(MOTIONS)}",
             f"the fault comes {BEFORE_S:g} s after the target sets out, and moves what it moves by "
             + ", ".join(f"{low:g} to {high:g} px ({fault})" for fault, (low, high) in FAULT_PX.items())
-            + f"; the first verdict or fault within {AFTER_S:g} s counts, right where it names the subject",
+            + f"; the first verdict or fault within {AFTER_S:g} s that names a cause counts",
+            "unclear_first: one that names none came before, or alone",
+            "before carried cameras a zero that drifts looks like a target that moves otherwise: it is followed",
             "bumped: one camera turned; zeros drift within 1 s, jump within 20 ms; a marker slips in its face's plane",
             "false verdicts: all that came before the fault, in watched_s seconds in all",
         ],
@@ -135,12 +142,13 @@ def named_after(
     cell.run_for(AFTER_S)
     told = [e for e in cell.events if (e.kind == "health" and e.name != "ok") or e.kind == "fault"]
     early = tuple(_verdict(e) for e in told if e.t_ns <= onset_ns)
-    late = [e for e in told if e.t_ns > onset_ns]
+    late = [e for e in told if e.t_ns > onset_ns and _verdict(e) != UNCLEAR]
+    unclear = any(_verdict(e) == UNCLEAR for e in told if e.t_ns > onset_ns)
     if not late:
-        return Named("", "", False, float("nan"), size_px, name, early)
+        return Named("", "", False, float("nan"), size_px, name, early, unclear)
     verdict, delay_s = _verdict(late[0]), 1e-9 * (late[0].t_ns - onset_ns)
     right = verdict in FAULTS[fault] and _subject(late[0]) == subject
-    return Named(verdict, _subject(late[0]), right, delay_s, size_px, name, early)
+    return Named(verdict, _subject(late[0]), right, delay_s, size_px, name, early, unclear)
 
 
 def _number(value: float) -> float | None:
