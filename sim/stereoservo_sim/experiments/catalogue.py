@@ -181,7 +181,7 @@ EXPERIMENTS: dict[str, Experiment] = {
             "moving-faults",
             "cameras bumped, joint zeros off, markers slipped while moving targets are followed: what the watch names",
             "laws.moving_faults",
-            (repetitions(10),),
+            (repetitions(3),),
         ),
         Experiment(
             "edge-parts",
