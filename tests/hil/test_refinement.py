@@ -20,6 +20,7 @@ from stereoservo.kinematics.covariance import covariance_axes, displaced_model, 
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.recording.replay import replay
 from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.workpiece import Moved, MovedFile
 
@@ -73,6 +74,7 @@ def test_goals_refine_the_model_and_one_command_undoes_it(
     with Client(CELL) as client:
         recover(client)
         assert client.status().model_epoch == base.epoch
+        client.record()
         first = client.events(1 << 60).next
         home = dict(client.status().joints)
 
@@ -103,6 +105,8 @@ def test_goals_refine_the_model_and_one_command_undoes_it(
         back = load_model(directories.models / f"model-{epoch + 1:06d}.json")
         assert (back.generators == base.generators).all()
         assert client.goal("park").wait(60.0).outcome == "reached"
+        flight = Path(client.record(False).message.split(": ")[0])
+        assert replay(flight).identical is True  # with both models in it
         assert cli.invoke(["calibrate", CELL, "--undo-refinement"]) != 0
         assert "nothing to undo" in capsys.readouterr().err
 

@@ -32,6 +32,8 @@ APART = 0.02
 """Distance of two poses [rad or m, over all joints] below which they are one."""
 STILL = 2e-4
 """Motion of a joint [rad or m] that ends a rest."""
+MOST_READINGS = 200
+"""Of a rest, whose mean is its pose."""
 FRAMES, SETTLE_S = 5, 0.15
 """Where the cell has no [calibration]: frames of each camera that are averaged, and time to settle before them."""
 
@@ -86,7 +88,8 @@ class RestPoses:
             return False
         if not self._readings:
             self._settled_ns = status.t_ns + self._settle_ns
-        if status.t_ns >= self._settled_ns or not self._readings:
+        settled = status.t_ns >= self._settled_ns or not self._readings
+        if settled and not self._done and len(self._readings) < MOST_READINGS:
             self._readings.append(positions.copy())
         if self._done or len(self._waiting) < self._frames * len(self._settings.cameras):
             return False
