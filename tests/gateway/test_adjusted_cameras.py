@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import Event
+from stereoservo.gateway.model_updates import RelocalizationJobs
 from stereoservo.gateway.persistence import ModelStore
-from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import rx90

@@ -22,11 +22,11 @@ from stereoservo.daemon.supervisor import record_run
 from stereoservo.gateway import persistence, recordings
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.crash_records import OpenGoalRecord
+from stereoservo.gateway.model_updates import RelocalizationJobs
 from stereoservo.gateway.observation_cache import ObservationCache
 from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.publisher import EventLog, KeeperNotes
 from stereoservo.gateway.recordings import Recordings
-from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.kinematics.model import save_model

@@ -43,6 +43,7 @@ from stereoservo.messages.wire import (
     FeaturesMessage,
     Record,
     Reply,
+    Restore,
     RunningGoal,
     RunningGoals,
     StateMessage,
@@ -226,6 +227,10 @@ class Client(Connection):
     def synthesise(self, wanted: Synthesise) -> Reply:
         """Make a goal from CAD drawings; the workpiece's markers must be in view. Raises RefusedError."""
         return self.request("synthesise", self.keys.command("synthesise", self.operator), encode(wanted))
+
+    def undo_refinement(self) -> Reply:
+        """Bring the calibrated model back that the one in use was refined from on-line. Raises RefusedError."""
+        return self.request("undo refinement", self.keys.command("restore", self.operator), encode(Restore()))
 
     def calibrate(
         self,

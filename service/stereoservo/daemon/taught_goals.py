@@ -127,6 +127,22 @@ def taught_model(model: CellModel) -> TaughtModel:
     )
 
 
+def refined_goal(goal: TaughtGoal, used: CellModel, model: CellModel) -> TaughtGoal:
+    """The goal after an on-line refinement of model ``used`` to ``model``: its pixels are what they were, for nothing
+    moved, and the cameras that saw them, where they are those of ``used``, are better known.
+    """
+    if goal.model is None:
+        return goal
+    before, after = taught_model(used), taught_model(model)
+    known = dict(zip(before.cameras, after.cameras, strict=True))
+    cameras = tuple(known.get(camera, camera) for camera in goal.model.cameras)
+    if goal.model.epoch != used.epoch:
+        return msgspec.structs.replace(goal, model=msgspec.structs.replace(goal.model, cameras=cameras))
+    return msgspec.structs.replace(
+        goal, model=after, target=msgspec.structs.replace(goal.target, model_epoch=model.epoch)
+    )
+
+
 def _pixels(event: Event) -> dict[str, dict[int, Pixel]]:
     return {
         sample.camera: {

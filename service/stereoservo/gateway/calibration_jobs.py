@@ -47,6 +47,11 @@ class CalibrationJobs:
         self.model: CellModel | None = None
         self.notes: tuple[str, ...] = ()
 
+    @property
+    def busy(self) -> bool:
+        """Whether a new model is being computed, or waits to be used."""
+        return self._fit is not None or self._check is not None or self._handed is not None
+
     def load(self, core_epoch: int) -> None:
         """Send the newest fitting model on disk to the core, unless that (epoch ``core_epoch``) has it."""
         try:

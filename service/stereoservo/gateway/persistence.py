@@ -18,6 +18,7 @@ from stereoservo.daemon.taught_goals import (
     TaughtFileError,
     TaughtGoal,
     load_taught,
+    refined_goal,
     save_taught,
 )
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model
@@ -54,7 +55,15 @@ class TaughtStore:
 
     def add(self, name: str, goal: TaughtGoal) -> None:
         """Store a goal, replacing one of the same name. Raises OSError, and the goal is not there then."""
-        goals = {**self.goals, name: goal}
+        self._replace({**self.goals, name: goal})
+
+    def refine(self, used: CellModel, model: CellModel) -> None:
+        """State the goals in ``model`` in the place of ``used``, where nothing but the estimate changed (see
+        `refined_goal`). Raises OSError, and they are as they were then.
+        """
+        self._replace({name: refined_goal(goal, used, model) for name, goal in self.goals.items()})
+
+    def _replace(self, goals: dict[str, TaughtGoal]) -> None:
         save_taught(self._path, goals)
         self.goals = goals
 

@@ -45,6 +45,7 @@ from stereoservo.daemon.seqpacket import ChannelServer
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
 from stereoservo.gateway.intake import Intake, payload_of
+from stereoservo.gateway.model_updates import RefinementJobs, RelocalizationJobs
 from stereoservo.gateway.observation_cache import ObservationCache
 from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
 from stereoservo.gateway.publisher import (
@@ -58,7 +59,6 @@ from stereoservo.gateway.publisher import (
     features_message,
 )
 from stereoservo.gateway.recordings import CannotRecordError, Recordings
-from stereoservo.gateway.relocalization_jobs import RelocalizationJobs
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.stop_thread import StopThread
 from stereoservo.gateway.teaching import TaughtGoalRegistry
@@ -84,6 +84,7 @@ from stereoservo.messages.wire import (
     MessageError,
     Record,
     Reply,
+    Restore,
     StateMessage,
     Synthesise,
     decode,
@@ -113,7 +114,7 @@ SUPERVISOR_SILENT = (
     "The arm and every stop work as before, but a process that hangs is not killed and one that ends is not started "
     "again: let it go on (`kill -CONT` its process), or stop the arm, end the daemon and run the cell again"
 )
-GATEWAY_VERBS = ("record", "synthesise")
+GATEWAY_VERBS = ("record", "synthesise", "restore")
 """Commands that the gateway carries out itself."""
 
 
@@ -151,15 +152,17 @@ class Gateway:
         self._marker_cache = ObservationCache(
             {camera.name: camera.systematic_px for camera in self.settings.cameras}
         )
+        taught = TaughtStore(directories.taught, self._models.of_epoch, self._notes.tell)
         self._teaching = TaughtGoalRegistry(
-            TaughtStore(directories.taught, self._models.of_epoch, self._notes.tell),
-            self._marker_cache,
-            lambda: self._calibration.model,
-            self.log,
+            taught, self._marker_cache, lambda: self._calibration.model, self.log
         )
         self._intake = Intake(
             self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot
         )
+        self._refinement = RefinementJobs(
+            self.settings, plan.cell.calibration is not None and plan.cell.calibration.refine, self._models,
+            self._servo, self.log, self._calibration, self._relocalization, taught, self._intake.running,
+        )  # fmt: skip
         self._reports = ChannelServer(directories.reports_socket)
         slots = [directories.observation_slot(name) for name in cameras]
         log = partial(write_log, "gateway")
@@ -274,6 +277,7 @@ class Gateway:
         self.goals.poll()
         self._calibration.poll()
         self._relocalization.poll()
+        self._refinement.poll()
         self._announce()
         if self._announce_due_s is None:
             self._heartbeat.beat(GATEWAY_HANG_S)
@@ -329,6 +333,9 @@ class Gateway:
         verb, _ = self.keys.command_of(str(query.key_expr))
         if verb == "record":
             return encode(self._record(decode(payload, Record)))
+        if verb == "restore":
+            decode(payload, Restore)
+            return encode(Reply(True, self._refinement.restore(), boot=self.boot))
         return encode(Reply(True, self._teaching.synthesise(decode(payload, Synthesise)), boot=self.boot))
 
     def _record(self, request: Record) -> Reply:
@@ -415,6 +422,7 @@ class Gateway:
                 observation = decode_observation(data)
                 publisher = self._publishers.features[observation.camera]
                 self._marker_cache.add(observation)
+                self._refinement.take_frame(observation)
                 if publisher.matching_status.matching:
                     publisher.put(encode(features_message(observation)))
 
@@ -423,6 +431,7 @@ class Gateway:
         state = self._servo.state()
         if state is not None:
             self._state_heard = now
+            self._refinement.take_state(state.status)
             self._collect_notes()
             self._state = state_message(
                 self.plan,
@@ -506,6 +515,7 @@ class Gateway:
         """Finish the recording, cancel the fit, close the sessions within a time limit."""
         self._calibration.cancel()
         self._relocalization.cancel()
+        self._refinement.cancel()
         self._take_steps(100_000)
         self._recordings.close()
         with suppress(zenoh.ZError):  # telling is good manners, not needed

@@ -179,6 +179,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Errors of the joint readings; None where none are known: predictions then take them for exact."""
     shutter_offsets: tuple[ShutterOffset, ...] = ()
     """Of the cameras whose stamps the trial motions could tell against the joints' stamps."""
+    refined_from: int = 0
+    """Epoch of the model that this one was refined from on-line; 0: it was not."""
 
     @property
     def tip_first(self) -> bool:

@@ -184,6 +184,8 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     known_length: str = ""
     """One length of arm, markers or cameras, as WHAT:OF=METRES (markers:10,11=0.05, baseline:left,right=0.2,
     prismatic:j1=1, a:j2=0.4, d:j3=0.1): by it the report tells the arm's Denavit-Hartenberg parameters in metres."""
+    refine: bool = False
+    """Refine the model on-line by the rest poses that goals leave behind; the calibrated one is kept."""
 
 
 class TlsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

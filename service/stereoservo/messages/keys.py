@@ -23,6 +23,7 @@ VERBS = (
     "acknowledge",
     "record",
     "synthesise",
+    "restore",
 )
 """Commands with an operator; ``stop`` has a key of its own."""
 

@@ -94,6 +94,10 @@ class Synthesise(
     pose: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)] = IDENTITY
 
 
+class Restore(msgspec.Struct, frozen=True, tag="restore", tag_field="command", forbid_unknown_fields=True):
+    """Bring the calibrated model back that the one in use was refined from on-line. Handled by the gateway."""
+
+
 class MessageError(ValueError):
     """An invalid message: names the place in it, the value and what would have been valid."""
 
@@ -357,6 +361,7 @@ SCHEMAS: dict[str, Any] = {
     "reply": Reply,
     "command-record": Record,
     "command-synthesise": Synthesise,
+    "command-restore": Restore,
     **{f"command-{verb}": kind for verb, kind in COMMANDS.items()},
 }
 

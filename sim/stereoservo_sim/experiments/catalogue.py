@@ -178,6 +178,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(3),),
         ),
         Experiment(
+            "moving-faults",
+            "cameras bumped, joint zeros off, markers slipped while moving targets are followed: what the watch names",
+            "laws.moving_faults",
+            (repetitions(3),),
+        ),
+        Experiment(
             "edge-parts",
             "a part without markers aligned by its edges, in rendered cells of other lights, lenses and distances",
             "laws.edge_parts",

@@ -170,21 +170,28 @@ def _stated_uncertainty(
     slopes, columns = covariance_jacobian(model, stated, data, order)
     values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
     root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.hstack([root, joint_uncertainty(model, data, order)])
+
+
+def joint_uncertainty(model: CellModel, data: Measurements, order: tuple[int, ...]) -> FloatArray:
+    """Root (2 k, e) of the covariance [sigmas²] of the pixels of ``data`` by the errors of the joints' readings that
+    the model states, at stops that its trials have not seen; e = 0 where it states none.
+    """
     accuracy = model.joint_accuracy
     if accuracy is None:
-        return root
+        return np.zeros((2 * len(data.camera), 0))
     unseen = msgspec.structs.replace(
         accuracy, random=np.sqrt(np.maximum(accuracy.stated**2 - accuracy.repeatable**2, accuracy.random**2))
     )
     noise = noise_of_accuracy(unseen.in_order(np.array(order)), readings(data.offsets))
-    return np.hstack([root, error_columns(acting_rig(model), data.with_joint_noise(noise))])
+    return error_columns(acting_rig(model), data.with_joint_noise(noise))
 
 
-def covariance_jacobian(
-    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
-) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and which of them (p,) each
-    column belongs to.
+def covariance_charts(
+    model: CellModel, stated: ModelCovariance, order: tuple[int, ...]
+) -> tuple[RigModel, Charts, npt.NDArray[np.int64]]:
+    """The model as a rig in its own frame, joints in ``order``, the charts of its covariance there, and which of the
+    covariance's parameters (p,) each parameter of the charts is.
     """
     rig = RigModel(
         tuple(model.joint_kinds[j] for j in order),
@@ -197,7 +204,16 @@ def covariance_jacobian(
     sizes = [len(basis) for basis in stated.generators]
     starts = np.cumsum([0, *sizes])
     columns = np.concatenate([np.arange(starts[j], starts[j + 1]) for j in order])
-    columns = np.append(columns, np.arange(starts[-1], charts.size))
+    return rig, charts, np.append(columns, np.arange(starts[-1], charts.size))
+
+
+def covariance_jacobian(
+    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and which of them (p,) each
+    column belongs to.
+    """
+    rig, charts, columns = covariance_charts(model, stated, order)
     return jacobian(rig, charts, np.zeros(charts.size), data), columns
 
 

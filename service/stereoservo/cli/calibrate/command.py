@@ -53,6 +53,13 @@ UnattendedOption = Annotated[
         help="With --check, for timers: enable nothing, disturb nobody; exit code 1 where the model does not hold.",
     ),
 ]
+UndoOption = Annotated[
+    bool,
+    typer.Option(
+        "--undo-refinement",
+        help="The calibrated model again, in place of one refined from it on-line; nothing moves.",
+    ),
+]
 TrialsOption = Annotated[
     Path | None,
     typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
@@ -135,6 +142,7 @@ def calibrate(
     check: CheckOption = False,
     reset_zeros: ResetZerosOption = False,
     unattended: UnattendedOption = False,
+    undo_refinement: UndoOption = False,
     trials: TrialsOption = None,
     images: ImagesOption = None,
     lines: LinesOption = None,
@@ -169,6 +177,13 @@ def calibrate(
         raise CommandError("argument", "--board, --pitch, --layout and --length go with --rig")
     if not cell:
         raise typer.BadParameter("CELL is needed, but for --rig with pictures of a board", param_hint="CELL")
+    if undo_refinement:
+        if check or trials is not None or images is not None:
+            raise CommandError("argument", "--undo-refinement goes with no other option")
+        with Client(cell, endpoint=endpoint, operator=operator) as client:
+            reply = client.undo_refinement()
+        emit(msgspec.to_builtins(reply), reply.message, json)
+        return
     if (reset_zeros or unattended) and not check:
         raise CommandError("argument", "--reset-zeros and --unattended go with --check")
     if (trials is not None or images is not None) and check:

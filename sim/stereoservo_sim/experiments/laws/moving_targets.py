@@ -10,6 +10,8 @@ one marker where it was in one camera. Judged by the truth, which the core never
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -195,7 +197,6 @@ def _three(vector: FloatArray) -> tuple[float, float, float]:
 def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> Followed:
     """Follow a target that moves in one way; deterministic given the seed."""
     world = world_of(place)
-    judged_by = _judged_by(place, world)
     history = TrueJointHistory.in_memory(len(world.base), capacity=1 << 14)
     seen: list[tuple[int, FloatArray]] = []
     verdicts: set[str] = set()
@@ -206,6 +207,26 @@ def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> 
             seen.append((newest[0], newest[1].copy()))
         verdicts.update(e.name for e in outputs.events if e.kind == "health" and e.name != "ok")
 
+    with under_way(place, law, name, seed, history, follows=follows, watch=watch) as (cell, goal, motion):
+        cell.run_for(SETTLE_S + JUDGED_S)
+        ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
+    assert motion.since_ns is not None  # it sets out in mid-run
+    judged = [(t, q) for t, q in seen if t >= motion.since_ns + round(SETTLE_S * 1e9)]
+    judged_by = _judged_by(place, world)
+    errors = np.array([_errors(world, motion.at(t), q)[judged_by] for t, q in judged[::3]])
+    return Followed(
+        float(errors.max()), float(np.sqrt((errors**2).mean())), tuple(sorted(verdicts)),
+        "; ".join(reason.code for event in ends for reason in event.reasons),
+    )  # fmt: skip
+
+
+@contextmanager
+def under_way(
+    place: str, law: LawName, name: str, seed: int, history: TrueJointHistory, *, follows: bool,
+    watch: Callable[[StepInputs, StepOutputs], None] | None = None,
+) -> Iterator[tuple[LockstepCell, Goal, Motion]]:  # fmt: skip
+    """The cell with its goal at the moment at which the target sets out, and that motion."""
+    world = world_of(place)
     with (
         tempfile.TemporaryDirectory(prefix="stereoservo-moving-") as scratch,
         LockstepCell(
@@ -217,20 +238,12 @@ def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> 
         LockstepOperator(cell, seed=seed).enable()
         cell.update_model(ModelUpdate(exact_simulated_model(world, seed)))
         cell.run_for(0.5)
-        goal = _goal(world, law, follows, judged_by)
+        goal = _goal(world, law, follows, _judged_by(place, world))
         cell.submit(RunGoal(goal))
         cell.run_for(REST_S)
-        since_ns = cell.clock.now_ns()
-        motion = motion_of(world, name, seed, since_ns)
+        motion = motion_of(world, name, seed, cell.clock.now_ns())
         MovedFile(Path(scratch)).write(motion)
-        cell.run_for(SETTLE_S + JUDGED_S)
-        ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
-    judged = [(t, q) for t, q in seen if t >= since_ns + round(SETTLE_S * 1e9)]
-    errors = np.array([_errors(world, motion.at(t), q)[judged_by] for t, q in judged[::3]])
-    return Followed(
-        float(errors.max()), float(np.sqrt((errors**2).mean())), tuple(sorted(verdicts)),
-        "; ".join(reason.code for event in ends for reason in event.reasons),
-    )  # fmt: skip
+        yield cell, goal, motion
 
 
 def _judged_by(place: str, world: SimulatedCell) -> BoolArray:

@@ -1,0 +1,283 @@
+"""On-line refinement of a calibrated model (recursive calibration, thesis 9.3): its kinematics, cameras, lenses and
+markers estimated again, by what was seen at the rest poses of goals, with the calibrated model and its covariance as
+the prior.
+
+The estimate is the bundle's, linearised in the directions of the model's covariance. It is a step within that
+covariance or none: a chi-square test of the pixels with named causes (`model_check`) and one of the step itself stand
+before it, and it must predict poses that it was not made from significantly better than the model in use.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import norm
+
+from stereoservo.calibration.bundle_adjustment import jacobian
+from stereoservo.calibration.change.model_changes import (
+    bounded,
+    covariance_charts,
+    joint_uncertainty,
+)
+from stereoservo.calibration.change.model_check import examine_model, make_check_report
+from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, acting_order, residuals, rig_at
+from stereoservo.calibration.static_points import with_static_points
+from stereoservo.calibration.trial_data import CalibrationError, StaticObservations, TrialData
+from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.covariance import (
+    NoCovarianceError,
+    covariance_axes,
+    displaced_model,
+    pixel_covariances,
+)
+from stereoservo.kinematics.model import CellModel
+from stereoservo.numerics.arrays import FloatArray
+
+CHANCE = 0.001
+"""Probability with which each test fails where nothing is wrong, or passes where nothing is better."""
+LEAST_POSES = 16
+FOLDS = 4
+"""One in so many poses is held out of an estimate and judges it, in turn (cross-validation)."""
+LEAST_KNOWLEDGE = 0.01
+"""Information of the poses about a direction, relative to the prior's, below which its step is not tested."""
+ROUNDS = 20
+SETTLED = 1e-3
+"""Last step [sigmas of the prior] at which the estimate has converged."""
+
+
+class RefinementReport(msgspec.Struct, frozen=True):
+    """What a refinement of model ``base_epoch`` by so many ``poses`` found.
+
+    ``before_px``, ``after_px``: rms distance of the pixels from the prediction of the model in use, and of one refined
+    by the other poses, a coordinate. ``score``: by how many deviations of chance that is better, above ``limit``.
+    ``step_chi2``: chi-square of the step from the calibrated model, below ``step_limit``. ``predicted_before_px``,
+    ``predicted_after_px``: rms deviation of predicted pixels at the poses by the model's covariance, a coordinate.
+    """
+
+    base_epoch: int
+    poses: int
+    before_px: float
+    after_px: float
+    score: float
+    limit: float
+    step_chi2: float
+    step_limit: float
+    predicted_before_px: float
+    predicted_after_px: float
+
+    @property
+    def message(self) -> str:
+        """The result as text."""
+        return (
+            f"refined from epoch {self.base_epoch} by {self.poses} rest poses: at poses held out, predictions are "
+            f"{self.after_px:.3g} px rms off instead of {self.before_px:.3g} "
+            f"({self.score:.1f} deviations of chance, {self.limit:.1f} needed); by covariance the deviation of a "
+            f"predicted pixel falls from {self.predicted_before_px:.2g} to {self.predicted_after_px:.2g} px; "
+            f"chi-square of the step {self.step_chi2:.0f} of {self.step_limit:.0f} allowed"
+        )
+
+
+def refine_model(
+    base: CellModel, samples: TrialData, *, used: CellModel | None = None, created: str = ""
+) -> tuple[CellModel, RefinementReport]:
+    """The model ``base`` refined by rest poses (trial data, all of any posture), epoch 0, and the report. ``used``: the
+    model in use, itself perhaps a refinement of ``base``, which the new one must be better than; default ``base``.
+
+    Raises CalibrationError: ``too_few_stops``, ``no_covariance``; ``model_does_not_fit`` with the causes of the check
+    where the poses contradict the calibrated model; ``step_too_large``; ``not_better``.
+    """
+    if base.covariance is None:
+        raise CalibrationError(
+            "no_covariance",
+            f"model epoch {base.epoch} carries no covariance, which a refinement starts from: calibrate anew",
+        )
+    poses = len(samples.positions)
+    if poses < LEAST_POSES:
+        raise CalibrationError(
+            "too_few_stops", f"{poses} rest poses; {LEAST_POSES} are needed", stops=poses, minimum=LEAST_POSES
+        )
+    examined = examine_model(base, samples)
+    check = make_check_report(examined)
+    if check.causes:
+        raise CalibrationError(
+            "model_does_not_fit",
+            f"not refined: the model does not fit any more: {check.message}. That is what the poses together are most "
+            "like; where the cell changed while they were collected, `calibrate --check` tells what it is. Remove the "
+            "cause, or calibrate anew",
+            causes=[cause.message for cause in check.causes],
+        )
+    data = examined.problem.data
+    poses = len(np.unique(data.stop))
+    current = base if used is None else used
+    score, before, after = _cross_validated(base, current, data, samples)
+    limit = float(norm.isf(CHANCE))
+    if score <= limit:
+        raise CalibrationError(
+            "not_better",
+            f"not refined: at each of {poses} rest poses, a model refined by the others "
+            f"predicts the pixels to {after:.3g} px rms, the one in use to {before:.3g}: better by {score:.1f} "
+            f"deviations of chance, {limit:.1f} are needed. The model in use stays",
+            score=score, limit=limit,
+        )  # fmt: skip
+    whole = estimate_step(base, data)
+    if whole.chi2 > whole.limit:
+        raise CalibrationError(
+            "step_too_large",
+            f"not refined: the step away from calibrated model epoch {base.epoch} has chi-square {whole.chi2:.0f} by "
+            f"that model's covariance, {whole.limit:.0f} is allowed: the model does not fit any more. Check it "
+            "(`calibrate --check`), or calibrate anew",
+            chi2=whole.chi2, limit=whole.limit,
+        )  # fmt: skip
+    model = _refined(base, whole, created)
+    report = RefinementReport(
+        base.epoch, poses, before, after, score, limit, whole.chi2, whole.limit,
+        _predicted(current, samples.positions), _predicted(model, samples.positions),
+    )  # fmt: skip
+    return msgspec.structs.replace(model, source=f"{base.source or 'model'}; {report.message}"), report
+
+
+@dataclass(frozen=True)
+class RefinementStep:
+    """A step ``x`` (p,) of the parameters of a model's covariance, and the ``covariance`` (p, p) after it; ``chi2`` of
+    the step under a prior that holds, and its ``limit``.
+    """
+
+    x: FloatArray
+    covariance: FloatArray
+    chi2: float
+    limit: float
+
+
+def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
+    """Maximum a posteriori estimate by ``data``, its joints in the model's acting order, with the prior of ``base``.
+
+    Gauss-Newton in coordinates z of unit covariance, ``x = L z``: least ``zᵀz + rᵀ W r``, with the errors of the joints
+    in the weights W. Raises NoCovarianceError.
+    """
+    stated = base.covariance
+    if stated is None:
+        raise NoCovarianceError("the model carries no covariance")
+    order = acting_order(base)
+    rig, charts, columns = covariance_charts(base, stated, order)
+    axes = covariance_axes(base)
+    L = axes[columns]
+    B = bounded(joint_uncertainty(base, data, order))
+    z = np.zeros(L.shape[1])
+    error = residuals(rig, data)
+    cost = _squares(error, B)
+    for _ in range(ROUNDS):
+        slopes, J = _slopes(rig, charts, L, z, data, B)
+        M = J.T @ slopes
+        step = np.linalg.solve(np.eye(len(z)) + M, -(slopes.T @ error) - z)
+        for _ in range(8):
+            there = residuals(rig_at(rig, charts, L @ (z + step)), data)
+            least = float((z + step) @ (z + step)) + _squares(there, B)
+            if least <= cost:
+                break
+            step = 0.5 * step
+        else:
+            break
+        z, error, cost = z + step, there, least
+        if float(step @ step) < SETTLED**2:
+            break
+    slopes, J = _slopes(rig, charts, L, z, data, B)
+    values, vectors = np.linalg.eigh(J.T @ slopes)
+    values = np.maximum(values, 0.0)
+    covariance = (axes @ vectors / (1.0 + values)) @ (axes @ vectors).T
+    told = values > LEAST_KNOWLEDGE
+    steps = (vectors.T @ z)[told]
+    # Of a prior that holds, the estimate has the covariance M (I + M)⁻¹.
+    chi2 = float((steps**2 * (1.0 + values[told]) / values[told]).sum())
+    limit = float(chi2_distribution.isf(CHANCE, max(1, int(told.sum()))))
+    return RefinementStep(axes @ z, 0.5 * (covariance + covariance.T), chi2, limit)
+
+
+def _slopes(
+    rig: RigModel, charts: Charts, L: FloatArray, z: FloatArray, data: Measurements, B: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivative (2 k, r) of the residuals by ``z``, weighted and not."""
+    J = jacobian(rig, charts, L @ z, data) @ L
+    return J - B @ (B.T @ J), J
+
+
+def _squares(error: FloatArray, B: FloatArray) -> float:
+    inner = B.T @ error
+    return float(error @ error - inner @ inner)
+
+
+def _cross_validated(
+    base: CellModel, used: CellModel, data: Measurements, samples: TrialData
+) -> tuple[float, float, float]:
+    """By how many deviations of chance models refined without some poses predict these better than ``used``, and the
+    rms [px] of either.
+
+    Were ``used`` exact, ``-rᵀ W δ`` of its residuals r and the change δ of the prediction, which does not depend on the
+    same r, would have mean zero and variance ``δᵀ W δ``; over all folds at most twice the sum, since r of one is in δ
+    of the others. Noise that the new residuals show beyond the stated makes the score smaller.
+    """
+    gain = size = before = after = 0.0
+    errors: list[tuple[FloatArray, FloatArray]] = []
+    for fold in range(FOLDS):
+        apart = data.stop % FOLDS == fold
+        held = data.select(apart)
+        found = displaced_model(base, estimate_step(base, data.select(~apart)).x)
+        old, new = (_seen(model, held, samples) for model in (used, found))
+        B = bounded(joint_uncertainty(base, held, acting_order(base)))
+        change = new - old
+        gain -= float(old @ change - (B.T @ old) @ (B.T @ change))
+        size, before, after = size + _squares(change, B), before + _squares(old, B), after + _squares(new, B)
+        errors.append((_pixels(old, held), _pixels(new, held)))
+    rms = [float(np.sqrt((np.concatenate(one) ** 2).mean())) for one in zip(*errors, strict=True)]
+    if size <= 0.0 or after >= before:
+        return 0.0, rms[0], rms[1]
+    noise = max(1.0, after / (2 * len(data.camera)))
+    return float(gain / np.sqrt(2.0 * size * noise)), rms[0], rms[1]
+
+
+def _pixels(error: FloatArray, data: Measurements) -> FloatArray:
+    return np.asarray(error.reshape(-1, 2) * data.sigmas[:, None])
+
+
+def _seen(model: CellModel, held: Measurements, samples: TrialData) -> FloatArray:
+    """Residuals (2 k,) of a model at measurements of its poses."""
+    order = list(acting_order(model))
+    rig = RigModel(
+        tuple(model.joint_kinds[j] for j in order),
+        model.generators[order],
+        np.array([camera.matrix for camera in model.cameras]),
+        model.marker_points,
+        np.array([camera.lens for camera in model.cameras]),
+    )
+    return residuals(rig, replace(held, offsets=(samples.positions - model.zero)[:, order]))
+
+
+def _refined(base: CellModel, step: RefinementStep, created: str) -> CellModel:
+    """The model after a step, with its covariance in the same directions, static points seen by the new cameras."""
+    stated = base.covariance
+    assert stated is not None
+    model = msgspec.structs.replace(
+        displaced_model(base, step.x), epoch=0, created=created, statistics=base.statistics,
+        covariance=msgspec.structs.replace(stated, covariance=step.covariance), refined_from=base.epoch,
+    )  # fmt: skip
+    return model if not base.scene_ids else _with_scene(base, model)
+
+
+def _with_scene(base: CellModel, model: CellModel) -> CellModel:
+    """The refined model with the static points where its cameras see what the base's saw; their covariance stays."""
+    pixels = []
+    for camera in base.cameras:
+        images = base.scene_points @ camera.matrix.T
+        pixels.append(distort(camera.lens, images[:, :2] / images[:, 2:]))
+    static = StaticObservations(base.scene_ids, np.array(pixels), np.ones((len(pixels), len(base.scene_ids))))
+    placed, _ = with_static_points(model, static)
+    kept = [base.scene_ids.index(marker) for marker in placed.scene_ids]
+    return msgspec.structs.replace(placed, scene_covariances=base.scene_covariances[kept])
+
+
+def _predicted(model: CellModel, positions: FloatArray) -> float:
+    """Root mean variance [px] of a coordinate of predicted pixels at joint ``positions`` (s, n)."""
+    covariances = pixel_covariances(msgspec.structs.replace(model, joint_accuracy=None), positions)[1]
+    return float(np.sqrt(0.5 * np.trace(covariances, axis1=-2, axis2=-1).mean()))

@@ -1,0 +1,160 @@
+"""Refinement job (own process, low priority): refines a calibrated model by rest poses; and the collection of these
+poses for it, from the servo process's states and the cameras' observations.
+
+``python -m stereoservo.daemon.jobs.refinement_job POSES.npz BASE.json USED.json NEW.json`` prints one JSON object:
+``{"refined": …}`` once the new model, of epoch 0, is saved, or ``{"error": …}`` with exit code 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from stereoservo.calibration.change.refinement import refine_model
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
+from stereoservo.core.cycle import Event, Status
+from stereoservo.core.monitor_state import ObservationStatistics
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
+from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
+from stereoservo.kinematics.model import ModelFileError, load_model, save_model
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation
+
+MOST_POSES = 128
+APART = 0.02
+"""Distance of two poses [rad or m, over all joints] below which they are one."""
+STILL = 2e-4
+"""Motion of a joint [rad or m] that ends a rest."""
+MOST_READINGS = 200
+"""Of a rest, whose mean is its pose."""
+FRAMES, SETTLE_S = 5, 0.15
+"""Where the cell has no [calibration]: frames of each camera that are averaged, and time to settle before them."""
+
+
+class RestPoses:
+    """Rest poses that goals left behind: mean joint readings, and each camera's mean pixels over some frames.
+
+    A pose counts once; of more than `MOST_POSES` those are kept that lie farthest apart in joint space. A frame counts
+    where its shutter lies between two states of the arm at rest, settled.
+    """
+
+    def __init__(self, settings: CoreSettings) -> None:
+        self._settings = settings
+        trials = settings.trials
+        self._frames, settle_s = (FRAMES, SETTLE_S) if trials is None else (trials.frames, trials.settle_s)
+        self._settle_ns = round(1e9 * settle_s)
+        self._readings: list[FloatArray] = []
+        self._places: list[FloatArray] = []
+        self._settled_ns = 0
+        self._waiting: list[CameraObservation] = []
+        self._done = False
+        self.poses: list[Event] = []
+
+    def clear(self) -> None:
+        """Forget all poses, also the one that is being looked at."""
+        self.poses.clear()
+        self._places.clear()
+        self.leave()
+
+    def leave(self) -> None:
+        """The arm moves, or is not to be trusted: what this rest has shown so far does not count."""
+        self._readings.clear()
+        self._waiting.clear()
+        self._done = False
+
+    def add_frame(self, observation: CameraObservation) -> None:
+        """A frame of a camera; kept until a later state tells whether the arm was at rest."""
+        late = self._readings and not self._done and observation.t_shutter_ns >= self._settled_ns
+        mine = sum(one.camera == observation.camera for one in self._waiting)
+        newer = all(one.seq != observation.seq for one in self._waiting if one.camera == observation.camera)
+        if late and newer and mine < self._frames and observation.t_received_ns >= observation.t_shutter_ns:
+            self._waiting.append(observation)
+
+    def add_state(self, status: Status) -> bool:
+        """A trusted state of the arm; returns whether a pose was added."""
+        positions = status.positions
+        if status.command.any() or (
+            self._readings and float(np.abs(positions - self._readings[0]).max()) > STILL
+        ):
+            self.leave()
+        if status.command.any():
+            return False
+        if not self._readings:
+            self._settled_ns = status.t_ns + self._settle_ns
+        settled = status.t_ns >= self._settled_ns or not self._readings
+        if settled and not self._done and len(self._readings) < MOST_READINGS:
+            self._readings.append(positions.copy())
+        if self._done or len(self._waiting) < self._frames * len(self._settings.cameras):
+            return False
+        if max(one.t_shutter_ns for one in self._waiting) > status.t_ns:
+            return False
+        sums = ObservationStatistics(**measurement_buffers(self._settings))
+        for observation in self._waiting:
+            add_observation(sums, self._settings, observation, self._frames, self._settled_ns - 1)
+        joints = np.mean(self._readings[1:] or self._readings, axis=0)
+        self._done = True
+        self._waiting.clear()
+        samples = averages(sums, self._settings)
+        pose = Event(0, status.t_ns, "calibration_sample", id="rest", joints=joints, samples=samples)
+        return self._keep(pose, joints)
+
+    def _keep(self, pose: Event, joints: FloatArray) -> bool:
+        away = [float(np.linalg.norm(place - joints)) for place in self._places]
+        if away and min(away) < APART:
+            self.poses[int(np.argmin(away))] = pose  # the newer one tells how the cell is now
+            return False
+        self.poses.append(pose)
+        self._places.append(joints)
+        if len(self.poses) > MOST_POSES:
+            places = np.array(self._places)
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+            apart[np.diag_indices(len(places))] = np.inf
+            # Of the two that are nearest to each other the one with the nearer second neighbour goes.
+            pair = np.unravel_index(int(apart.argmin()), apart.shape)
+            second = [float(np.partition(apart[k], 1)[1]) for k in pair]
+            gone = int(pair[int(np.argmin(second))])
+            del self.poses[gone], self._places[gone]
+        return True
+
+    def trials(self) -> TrialData:
+        """The poses as trial data. Raises CalibrationError."""
+        collector = TrialCollector(self._settings)
+        for pose in self.poses:
+            collector.add(pose)
+        return collector.trials()
+
+
+def main() -> int:
+    """Entry of the process."""
+    parser = argparse.ArgumentParser(
+        prog="python -m stereoservo.daemon.jobs.refinement_job", description=__doc__
+    )
+    parser.add_argument("poses", type=Path)
+    parser.add_argument("base", type=Path)
+    parser.add_argument("used", type=Path)
+    parser.add_argument("new", type=Path)
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
+    arguments = parser.parse_args()
+    become_child(arguments.parent)
+    try:
+        created = datetime.now(UTC).isoformat(timespec="seconds")
+        model, report = refine_model(
+            load_model(arguments.base), load_trials(arguments.poses), used=load_model(arguments.used), created=created
+        )  # fmt: skip
+        save_model(model, arguments.new)
+    except (CalibrationError, ModelFileError, OSError) as error:
+        print_line(error_line(error))
+        return 1
+    print_line({"refined": msgspec.to_builtins(report)})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,351 @@
+"""Jobs of the gateway that bring the model in use up to date: relocalization of moved cameras on request of the core,
+and on-line refinement by the rest poses of goals. Each collects observations at rest, computes a new model in a child
+process, and sends it to the core. Also stores cameras that the core re-estimated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from stereoservo.calibration.change.refinement import LEAST_POSES, RefinementReport
+from stereoservo.calibration.trial_data import CalibrationError, save_trials
+from stereoservo.core.cycle import Event, Status
+from stereoservo.core.settings import CoreSettings
+from stereoservo.daemon.jobs.refinement_job import MOST_POSES, RestPoses
+from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, RelocalizationReport, save_events
+from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.child_jobs import ChildJob, FitFailedError
+from stereoservo.gateway.persistence import ModelStore, TaughtStore
+from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model
+from stereoservo.messages.goals import ReanchorRefused
+from stereoservo.messages.wire import MessageError, RunningGoals
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation
+
+OPERATOR = "the gateway"
+
+
+class RelocalizationJob(ChildJob):
+    """A running relocalization of ``cameras`` in a child process."""
+
+    def __init__(self, job: RelocalizationPoses, model_path: Path, new_path: Path, epoch: int) -> None:
+        self.cameras = job.events[-1].cameras
+        self.goal = job.events[-1].id
+        events_file = new_path.with_name("reanchor.msgpack")
+        save_events(events_file, job.events)
+        super().__init__(
+            "stereoservo.daemon.jobs.relocalization_job",
+            str(events_file),
+            str(model_path),
+            str(new_path),
+            "--epoch",
+            str(epoch),
+        )
+
+    def report(self) -> tuple[CellModel, RelocalizationReport]:
+        """The new model and a message on it. Raises FitFailedError, ModelFileError."""
+        report = msgspec.convert(self.require("reanchored"), RelocalizationReport)
+        return load_model(Path(report.model)), report
+
+
+class RelocalizationJobs:
+    """Handles the core's events ``reanchor``. ``model``: returns the model in use, ``take`` replaces it."""
+
+    def __init__(
+        self,
+        models: ModelStore,
+        link: ServoConnection,
+        log: EventLog,
+        model: Callable[[], CellModel | None],
+        take: Callable[[CellModel], None],
+    ) -> None:
+        self._models, self._link, self._log = models, link, log
+        self._model, self._take = model, take
+        self._job = RelocalizationPoses()
+        self._fit: RelocalizationJob | None = None
+        self._handed: CellModel | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a new model is being computed."""
+        return self._fit is not None
+
+    def core_event(self, event: Event, *, fresh: bool) -> None:
+        """Handle an event of the core; ``fresh``: it was not handled before a restart of the gateway."""
+        if event.kind == "reanchor":
+            self._job.add(event)
+            if fresh:
+                self._start()
+        elif event.kind == "model" and self._handed is not None:
+            self._take(self._handed)
+            self._handed = None
+        elif event.kind == "camera_adjusted" and fresh:
+            self._keep_adjusted(event)
+
+    def _keep_adjusted(self, event: Event) -> None:
+        """Store the re-estimated matrix of a mobile camera in the model and in its file."""
+        model = self._model()
+        if model is None or event.matrix is None or model.epoch != event.epoch:
+            return
+        adjusted = with_matrix(model, event.name, event.matrix)
+        self._take(adjusted)
+        try:
+            save_model(adjusted, self._models.path(adjusted.epoch))
+        except (OSError, ModelFileError) as error:
+            self._log.add(
+                "warning", origin="gateway", name=event.name,
+                message=f"where camera {event.name} stands now is not kept for the next start: {error}",
+            )  # fmt: skip
+
+    def _start(self) -> None:
+        self.cancel()
+        model = self._model()
+        if model is None:
+            self._refuse("the model that the cameras belong to is gone: calibrate")
+            return
+        try:
+            epoch = self._models.next_epoch()
+            self._fit = RelocalizationJob(
+                self._job, self._models.path(model.epoch), self._models.path(epoch), epoch
+            )
+        except OSError as error:
+            self._refuse(str(error))
+
+    def poll(self) -> None:
+        """Once the process has ended, send its model to the core, or report why there is none."""
+        fit = self._fit
+        if fit is None:
+            return
+        ended = fit.ended  # read first, so that the output before the end is processed, too
+        for _ in fit.poll():
+            pass
+        if not ended:
+            return
+        self._fit = None
+        try:
+            model, report = fit.report()
+        except FitFailedError as error:
+            self._refuse(str(error), error.code)
+        except ModelFileError as error:
+            self._refuse(str(error))
+        else:
+            self._hand_over(model, report, fit)
+        fit.close()
+
+    def _hand_over(self, model: CellModel, report: RelocalizationReport, fit: RelocalizationJob) -> None:
+        if not self._link.send_model(model, fit.cameras):
+            self._refuse(f"the servo process does not take the model; it is saved as {report.model}")
+            return
+        self._handed = model
+        self._log.add(
+            "reanchor_model",
+            message=report.message,
+            id=fit.goal,
+            name=", ".join(fit.cameras),
+            origin="gateway",
+        )
+
+    def _refuse(self, message: str, code: str = "") -> None:
+        self._log.add("reanchor_model", message=message, name=code, accepted=False, origin="gateway")
+        self._link.send_command(ReanchorRefused(message), OPERATOR)
+
+    def cancel(self) -> None:
+        """Cancel the running job. Idempotent."""
+        if self._fit is not None:
+            self._fit.close()
+        self._fit = None
+
+
+def with_matrix(model: CellModel, camera: str, matrix: FloatArray) -> CellModel:
+    """The model with one camera's matrix (3, 4) replaced."""
+    cameras = tuple(
+        msgspec.structs.replace(known, matrix=matrix.copy()) if known.name == camera else known
+        for known in model.cameras
+    )
+    return msgspec.structs.replace(model, cameras=cameras)
+
+
+class RefinementJobs:
+    """On-line refinement of the model in use by rest poses of goals; ``on``: whether it is wanted.
+
+    Poses count while the watch over the model finds nothing; a verdict drops them all. With `LEAST_POSES`, and whenever
+    their number has doubled since, a child process refines the calibrated model. What it gives is taken in while no
+    goal runs, with the taught goals; the calibrated model stays, and `restore` brings it back.
+    """
+
+    def __init__(
+        self, settings: CoreSettings, on: bool, models: ModelStore, link: ServoConnection, log: EventLog,
+        calibration: CalibrationJobs, relocalization: RelocalizationJobs, taught: TaughtStore,
+        running: Callable[[], RunningGoals],
+    ) -> None:  # fmt: skip
+        moving = settings.body_moves or any(camera.mobile for camera in settings.cameras)
+        self._on = on and not moving
+        if on and moving:
+            log.add("warning", message=f"[calibration] refine: {NOT_WHERE_THINGS_MOVE}", origin="gateway")
+        self._models, self._link, self._log, self._taught = models, link, log, taught
+        self._calibration, self._relocalization, self._running = calibration, relocalization, running
+        self._poses = RestPoses(settings)
+        self._cameras = frozenset(camera.name for camera in settings.cameras)
+        self._due = LEAST_POSES
+        self._epoch = 0
+        self._job: ChildJob | None = None
+        self._found: tuple[CellModel, RefinementReport] | None = None
+        self._handed: tuple[int, int, str] | None = None
+        """Epoch that is replaced, the one that replaces it, and what is told once the core works with it."""
+        self._idle = False
+
+    def take_frame(self, observation: CameraObservation) -> None:
+        """A camera's newest observation."""
+        if self._on:
+            self._poses.add_frame(observation)
+
+    def take_state(self, status: Status) -> None:
+        """The core's newest state: a rest pose, or what ends the collection."""
+        if self._handed is not None and status.model_epoch == self._handed[0]:
+            self._poses.leave()
+            return
+        if self._handed is not None:
+            if status.model_epoch == self._handed[1]:
+                self._log.add("refined", message=self._handed[2], accepted=True, origin="gateway")
+            self._handed = None
+        self._idle = status.source == "hold" and not status.goal and not status.command.any()
+        if not self._on:
+            return
+        if status.model_epoch != self._epoch:
+            self._forget("")
+            self._epoch, self._due = status.model_epoch, LEAST_POSES
+        health = status.health
+        if health.verdict not in ("ok", "unknown") or health.masked or health.reanchoring:
+            self._forget(f"the watch over the model finds {health.verdict}: {health.text}")
+        elif self._trusted(status):
+            self._poses.add_state(status)
+        else:
+            self._poses.leave()
+
+    def _trusted(self, status: Status) -> bool:
+        """Whether the core itself goes by all cameras and their stamps, with a valid model, and does not calibrate."""
+        return (
+            status.model == "valid"
+            and status.health.verdict == "ok"
+            and status.source not in ("calibration", "check")
+            and self._cameras <= status.innovation_px.keys()
+            and all(math.isfinite(value) for value in status.innovation_px.values())
+            and not any(camera.timing for camera in status.health.cameras.values())
+        )
+
+    def _forget(self, why: str) -> None:
+        """Drop all poses, and what is being made of them."""
+        dropped = len(self._poses.poses)
+        self._poses.clear()
+        if why and (dropped or self._job is not None):
+            self._refuse(f"not refined: {why}. {dropped} rest poses are dropped", "watch")
+        self.cancel()
+
+    def poll(self) -> None:
+        """Start a refinement that is due, handle the result of one, take in a model while no goal runs."""
+        if not self._on:
+            return
+        if self._job is not None:
+            self._poll_job(self._job)
+            return
+        model = self._calibration.model
+        if model is None or model.epoch != self._epoch or self._calibration.busy or self._relocalization.busy:
+            return
+        if self._found is None:
+            if len(self._poses.poses) >= self._due:
+                self._start(model)
+        elif self._idle and not self._running().goals:
+            (found, report), self._found = self._found, None
+            self._hand_over(model, found, f"{report.message}. {UNDO}")
+
+    def _start(self, model: CellModel) -> None:
+        self._due = 2 * self._due if self._due < MOST_POSES else MOST_POSES + 1
+        base = self._models.path(model.refined_from or model.epoch)
+        poses, self._path = base.with_name("refine.npz"), base.with_name("refined.json")
+        try:
+            save_trials(self._poses.trials(), poses)
+            self._job = ChildJob(
+                "stereoservo.daemon.jobs.refinement_job", str(poses), str(base),
+                str(self._models.path(model.epoch)), str(self._path),
+            )  # fmt: skip
+        except (CalibrationError, OSError) as error:
+            self._refuse(str(error), getattr(error, "code", ""))
+
+    def _poll_job(self, job: ChildJob) -> None:
+        ended = job.ended  # read first, so that the output before the end is processed, too
+        for _ in job.poll():
+            pass
+        if not ended:
+            return
+        self._job = None
+        try:
+            report = msgspec.convert(job.require("refined"), RefinementReport)
+            self._found = load_model(self._path), report
+        except FitFailedError as error:
+            self._refuse(str(error), error.code)
+            if error.code not in ("not_better", "too_few_stops"):
+                self._poses.clear()
+        except ModelFileError as error:
+            self._refuse(str(error))
+        job.close()
+
+    def _hand_over(self, used: CellModel, found: CellModel, why: str) -> None:
+        """Use ``found`` in the place of ``used``: a new epoch, for the goals that were taught, too."""
+        epoch = self._models.next_epoch()
+        model = msgspec.structs.replace(found, epoch=epoch)
+        path = self._models.path(epoch)
+        try:
+            save_model(model, path)
+            self._taught.refine(used, model)
+        except (OSError, ModelFileError) as error:
+            path.unlink(missing_ok=True)
+            self._refuse(f"the refined model cannot be stored: {error}")
+            return
+        self._epoch, self._calibration.model = epoch, model
+        self._handed = used.epoch, epoch, f"model epoch {epoch}: {why}"
+        if not self._link.send_model(model):
+            self._refuse(f"the servo process does not take the model; it is saved as {path}")
+
+    def restore(self) -> str:
+        """Bring the calibrated model back that the one in use was refined from, and refine no more until the next
+        calibration or start. Returns what is done. Raises MessageError.
+        """
+        used = self._calibration.model
+        if used is None or not used.refined_from:
+            raise MessageError("the model in use is not refined: there is nothing to undo")
+        busy = self._calibration.busy or self._relocalization.busy
+        if busy or not self._idle or self._running().goals:
+            raise MessageError("the arm is at work: wait until no goal runs, or cancel it, then undo again")
+        base = self._models.of_epoch(used.refined_from)
+        if base is None:
+            raise MessageError(
+                f"the file of calibrated model epoch {used.refined_from} is gone: calibrate anew"
+            )
+        self.cancel()
+        self._poses.clear()
+        self._due = MOST_POSES + 1
+        text = f"the calibrated model epoch {base.epoch} is back, in place of refined epoch {used.epoch}"
+        self._hand_over(used, base, text)
+        return text
+
+    def _refuse(self, message: str, code: str = "") -> None:
+        self._log.add("refined", message=message, name=code, accepted=False, origin="gateway")
+
+    def cancel(self) -> None:
+        """Cancel the running job, and drop its result. Idempotent."""
+        if self._job is not None:
+            self._job.close()
+        self._job = self._found = None
+
+
+UNDO = "The calibrated model comes back by `calibrate CELL --undo-refinement`"
+NOT_WHERE_THINGS_MOVE = (
+    "nothing is refined in a cell whose cameras are mobile or whose marker body moves by itself: what its rest poses "
+    "show is not the arm alone"
+)

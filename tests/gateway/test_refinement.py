@@ -1,0 +1,284 @@
+"""On-line refinement in the gateway: what counts as a rest pose, what ends the collection, when a model is taken in,
+what becomes of taught goals, and the way back.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import msgspec
+import numpy as np
+import pytest
+
+from stereoservo.calibration.change.refinement import LEAST_POSES, RefinementReport
+from stereoservo.core.cycle import Event, Sample, Status
+from stereoservo.core.settings import CoreSettings
+from stereoservo.daemon.jobs.refinement_job import APART, MOST_POSES, RestPoses
+from stereoservo.daemon.kernel_compilation import example_model, example_settings
+from stereoservo.daemon.taught_goals import taught_goal
+from stereoservo.gateway import model_updates
+from stereoservo.gateway.goal_transfer import resolve
+from stereoservo.gateway.model_updates import RefinementJobs
+from stereoservo.gateway.persistence import ModelStore, TaughtStore
+from stereoservo.kinematics.model import CellModel, load_model, save_model
+from stereoservo.messages.goals import TaughtTarget
+from stereoservo.messages.status import Health
+from stereoservo.messages.wire import MessageError, RunningGoals
+from stereoservo.ports.devices import CameraObservation
+
+STATE_NS, FRAME_NS = 50_000_000, 30_000_000
+REPORT = RefinementReport(1, 16, 0.2, 0.1, 5.0, 3.1, 40.0, 90.0, 0.2, 0.1)
+
+
+def settings_at_rest() -> CoreSettings:
+    """Of a cell whose cameras stand."""
+    settings = example_settings()
+    cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
+    return msgspec.structs.replace(settings, cameras=cameras)
+
+
+class Bench:
+    """An arm in virtual time that shows states and frames to ``into``."""
+
+    def __init__(self, into: Any, settings: CoreSettings, epoch: int = 1) -> None:
+        self.into, self.settings, self.epoch = into, settings, epoch
+        self.t_ns, self.seq = 0, 0
+        self.q = np.zeros(len(settings.joint_names))
+        self.source, self.health = "hold", Health("ok")
+
+    def status(self, moves: bool) -> Status:
+        n = len(self.q)
+        names = [camera.name for camera in self.settings.cameras]
+        return Status(
+            t_ns=self.t_ns, step=0, lifecycle="active", model="valid", model_epoch=self.epoch, source=self.source,
+            goal="", law="", level="ok", reasons=(), positions=self.q.copy(), velocities=np.zeros(n),
+            command_raw=np.zeros(n), command=np.full(n, 0.1 if moves else 0.0), error_px=None,
+            task_error=np.zeros(0), innovation_px=dict.fromkeys(names, 0.1), visible=dict.fromkeys(names, 4),
+            health=self.health,
+        )  # fmt: skip
+
+    def run(self, seconds: float, *, moves: bool = False) -> None:
+        """States at 20 Hz, frames at 33 Hz."""
+        take_state = getattr(self.into, "take_state", getattr(self.into, "add_state", None))
+        take_frame = getattr(self.into, "take_frame", getattr(self.into, "add_frame", None))
+        end = self.t_ns + round(1e9 * seconds)
+        while self.t_ns < end:
+            self.t_ns += 10_000_000
+            if self.t_ns % FRAME_NS == 0:
+                self.seq += 1
+                for camera in self.settings.cameras:
+                    ids = np.array(camera.marker_ids[:4])
+                    pixels = 100.0 + 10.0 * ids[:, None] + 50.0 * self.q[:2]
+                    take_frame(
+                        CameraObservation(
+                            camera.name, self.seq, self.t_ns, self.t_ns + 1, ids, pixels,
+                            np.tile(0.01 * np.eye(2), (len(ids), 1, 1)),
+                        )
+                    )  # fmt: skip
+            if self.t_ns % STATE_NS == 0:
+                take_state(self.status(moves))
+
+    def visit(self, q: np.ndarray) -> None:
+        """Go there, and stand for a second."""
+        self.run(0.2, moves=True)
+        self.q = q
+        self.run(0.2, moves=True)
+        self.run(1.0)
+
+
+def test_a_rest_pose_counts_once_and_only_at_rest() -> None:
+    settings = settings_at_rest()
+    poses = RestPoses(settings)
+    bench, n = Bench(poses, settings), len(settings.joint_names)
+    bench.run(2.0, moves=True)
+    bench.run(0.2)
+    assert not poses.poses  # not settled, too few frames
+    bench.visit(np.full(n, 0.1))
+    bench.run(30.0)
+    assert len(poses.poses) == 1
+    assert (
+        sum(len(value) for value in vars(poses).values() if isinstance(value, list)) < 100
+    )  # no rest is long
+    kept = poses.poses[0]
+    assert kept.joints is not None
+    assert kept.joints == pytest.approx(0.1)
+    assert {sample.camera for sample in kept.samples} == {camera.name for camera in settings.cameras}
+    for sample in kept.samples:  # no frame of the way there is in it
+        assert sample.pixels == pytest.approx(100.0 + 10.0 * np.stack([sample.ids] * 2, 1) + 5.0)
+    bench.visit(np.full(n, 0.1 + 0.1 * APART / n))
+    assert len(poses.poses) == 1
+    bench.visit(np.full(n, -0.1))
+    assert len(poses.poses) == 2
+    assert poses.trials().positions.shape == (2, n)
+
+
+def test_poses_are_bounded_and_far_apart() -> None:
+    settings, rng = settings_at_rest(), np.random.default_rng(3)
+    poses = RestPoses(settings)
+    bench, n = Bench(poses, settings), len(settings.joint_names)
+    for k in range(MOST_POSES + 40):  # the later ones crowd about one place
+        bench.visit(rng.uniform(-1.0, 1.0, n) if k < MOST_POSES else 0.5 + rng.uniform(-0.03, 0.03, n))
+    assert len(poses.poses) == MOST_POSES
+    places = np.array([pose.joints for pose in poses.poses if pose.joints is not None])
+    assert (np.abs(places - 0.5).max(axis=1) < 0.05).sum() <= 3
+
+
+class Job:
+    """A child process that has refined a model."""
+
+    made: ClassVar[list[tuple[str, ...]]] = []
+    ended = True
+
+    def __init__(self, module: str, *arguments: str) -> None:
+        self.made.append(arguments)
+        base = load_model(Path(arguments[1]))
+        better = msgspec.structs.replace(
+            base, epoch=0, refined_from=base.epoch, cameras=tuple(
+                msgspec.structs.replace(one, matrix=one.matrix + 1e-3 * (np.arange(12).reshape(3, 4) == 7))
+                for one in base.cameras
+            ),
+        )  # fmt: skip
+        save_model(better, Path(arguments[3]))
+
+    def poll(self) -> tuple[()]:
+        return ()
+
+    def require(self, key: str) -> Any:
+        return msgspec.to_builtins(REPORT)
+
+    def close(self) -> None:
+        pass
+
+
+class Gateway:
+    """What of a gateway `RefinementJobs` talks to."""
+
+    def __init__(self, folder: Path) -> None:
+        self.settings = settings_at_rest()
+        self.models = ModelStore(folder)
+        self.base = msgspec.structs.replace(example_model(), epoch=1)
+        save_model(self.base, self.models.path(1))
+        self.sent: list[CellModel] = []
+        self.told: list[Any] = []
+        self.running: tuple[Any, ...] = ()
+        self.calibration = SimpleNamespace(model=self.base, busy=False)
+        self.taught = TaughtStore(folder / "taught.json")
+        self.taught.add("park", taught_goal(self.shown(), self.base, "2026"))
+        log = SimpleNamespace(
+            add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields))
+        )
+        link = SimpleNamespace(send_model=lambda model: self.sent.append(model) or True)
+        self.jobs = RefinementJobs(
+            self.settings, True, self.models, link, log, self.calibration, SimpleNamespace(busy=False),  # type: ignore[arg-type]
+            self.taught, lambda: RunningGoals(self.running),
+        )  # fmt: skip
+        self.bench = Bench(self.jobs, self.settings)
+
+    def shown(self) -> Event:
+        ids = np.array(self.base.marker_ids)
+        sample = Sample(
+            self.base.cameras[0].name, ids, np.arange(2.0 * len(ids)).reshape(-1, 2),
+            np.tile(0.01 * np.eye(2), (len(ids), 1, 1)), 5, np.full(len(ids), 5.0), np.zeros(len(ids)),
+        )  # fmt: skip
+        return Event(
+            1, 1, "taught", name="park", joints=np.zeros(len(self.base.joint_names)), samples=(sample,)
+        )
+
+    def visit(self, count: int, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        for _ in range(count):
+            self.bench.visit(rng.uniform(-1.0, 1.0, len(self.bench.q)))
+            self.jobs.poll()
+
+
+@pytest.fixture
+def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Gateway:
+    monkeypatch.setattr(model_updates, "ChildJob", Job)
+    Job.made.clear()
+    return Gateway(tmp_path)
+
+
+def test_a_refined_model_is_taken_in_between_goals_and_undone(gateway: Gateway) -> None:
+    before = gateway.taught.goals["park"]
+    gateway.bench.source = "law"  # streams that never end: they rest, but the goal goes on
+    gateway.visit(LEAST_POSES)
+    gateway.visit(3, seed=1)
+    assert len(Job.made) == 1
+    assert not gateway.sent
+    gateway.bench.source, gateway.running = "hold", ("queued",)
+    gateway.bench.run(0.2)
+    gateway.jobs.poll()
+    assert not gateway.sent
+    gateway.running = ()
+    gateway.jobs.poll()
+    assert [model.epoch for model in gateway.sent] == [2]
+    assert not gateway.told  # until the core works with it
+    gateway.bench.epoch = 2
+    gateway.bench.run(0.2)
+    assert [(e.kind, e.accepted) for e in gateway.told] == [("refined", True)]
+    assert "0.1 px rms off instead of 0.2" in gateway.told[0].message
+    refined = load_model(gateway.models.path(2))
+    assert refined.refined_from == 1
+    goal = gateway.taught.goals["park"]
+    assert goal.target.set_points == before.target.set_points
+    found = resolve(TaughtTarget("park"), goal, refined, {})
+    assert (found.target, found.note) == (goal.target, "")  # no camera is taken for a moved one
+    assert goal.target.model_epoch == 2
+    gateway.jobs.restore()
+    assert [model.epoch for model in gateway.sent] == [2, 3]
+    assert np.array_equal(gateway.sent[-1].cameras[0].matrix, gateway.base.cameras[0].matrix)
+    back = gateway.taught.goals["park"]
+    assert msgspec.structs.replace(back.target, model_epoch=1) == before.target
+    assert back.model is not None
+    assert before.model is not None
+    assert back.model.cameras == before.model.cameras
+    gateway.bench.epoch = 3
+    gateway.visit(2 * LEAST_POSES, seed=2)
+    assert len(Job.made) == 1  # no more until the next calibration or start
+    with pytest.raises(MessageError, match="nothing to undo"):
+        gateway.jobs.restore()
+
+
+def test_a_verdict_of_the_watch_ends_the_collection(gateway: Gateway) -> None:
+    gateway.visit(LEAST_POSES - 1)
+    gateway.bench.health = Health("camera_moved", ("left",), text="camera left has moved by 3 px")
+    gateway.bench.run(0.2)
+    assert [(e.kind, e.accepted, e.name) for e in gateway.told] == [("refined", False, "watch")]
+    assert "camera left has moved by 3 px" in gateway.told[0].message
+    gateway.visit(LEAST_POSES, seed=1)
+    gateway.bench.health = Health("ok")
+    gateway.visit(LEAST_POSES - 1, seed=2)
+    assert not Job.made
+    gateway.visit(1, seed=3)
+    assert len(Job.made) == 1
+    gateway.bench.health = Health("joint_zero", ("j1",), text="joint j1")
+    gateway.bench.run(0.2)
+    gateway.bench.health = Health("ok")
+    gateway.bench.run(0.2)
+    gateway.jobs.poll()
+    assert not gateway.sent  # what was found with it is dropped, too
+
+
+def test_nothing_is_refined_where_it_is_not_wanted_or_things_move(tmp_path: Path) -> None:
+    settings = msgspec.structs.replace(example_settings(), body_moves=True)
+    told: list[str] = []
+    log = SimpleNamespace(add=lambda kind, **fields: told.append(fields["message"]))
+    nothing: Any = SimpleNamespace(model=None, busy=False)
+    jobs = RefinementJobs(
+        settings,
+        True,
+        ModelStore(tmp_path),
+        nothing,
+        log,
+        nothing,
+        nothing,
+        TaughtStore(tmp_path / "t.json"),
+        RunningGoals,
+    )
+    assert "marker body moves by itself" in told[0]
+    Bench(jobs, settings).run(2.0)
+    jobs.poll()
+    with pytest.raises(MessageError, match="not refined"):
+        jobs.restore()
