@@ -142,6 +142,8 @@ def _listed(answer: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
         found.append(
             (f"the same with {implied['sigma_px']:g} px and {implied['baseline_m']:g} m", implied["rows"])
         )
+    if answer.get("rendered"):
+        found.append(("through rendered pictures", answer["rendered"]))
     return found
 
 
