@@ -159,14 +159,15 @@ def show_rows(answer: dict[str, Any], console: Console) -> None:
     if len(rows) > LISTED and answer.get("beside_thesis"):
         console.print(f"{title}; all {len(rows)} rows: --json, curves: --plot DIR")
     else:
-        _show_table(rows, title, console)
+        show_table(rows, title, console)
     if answer.get("rendered"):
-        _show_table(answer["rendered"], "through rendered pictures", console)
+        show_table(answer["rendered"], "through rendered pictures", console)
     for item in answer.get("beside_thesis", []):
         console.print("summary: " + ", ".join(f"{key} {cell_text(value)}" for key, value in item.items()))
 
 
-def _show_table(rows: list[dict[str, Any]], title: str, console: Console) -> None:
+def show_table(rows: list[dict[str, Any]], title: str, console: Console) -> None:
+    """Print rows as a table, a column for each key of the first."""
     names = list(rows[0])
     whole_table(
         console,

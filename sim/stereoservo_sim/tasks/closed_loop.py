@@ -108,7 +108,7 @@ class Sight(Protocol):
 
 @dataclass(frozen=True)
 class Projections:
-    """Sight of exact projections with the settings' noise, of what is inside an image of a camera that is not dropped."""
+    """Sight of exact projections with the settings' noise, inside an image of a camera that is not dropped."""
 
     settings: LoopSettings
 
