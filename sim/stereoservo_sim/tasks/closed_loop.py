@@ -94,7 +94,7 @@ class LoopSettings:
     coasts: bool = False
 
 
-class Sight(Protocol):
+class PlateSight(Protocol):
     """Protocol of what shows the controller the plate; by itself its projections with noise (`Projections`)."""
 
     def look(
@@ -115,7 +115,7 @@ class Projections:
     def look(
         self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """As `Sight` has it."""
+        """As `PlateSight` has it."""
         pixels = sight(pose).pixels
         seen = in_images(pixels).astype(np.float64)
         if self.settings.drop_camera is not None:
@@ -169,7 +169,7 @@ class Trace:
 
 
 def run_task(
-    task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings, shown: Sight | None = None
+    task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings, shown: PlateSight | None = None
 ) -> tuple[TaskResult, Trace]:
     """Run one task, as ``shown``; deterministic given task, calibration and settings."""
     arm = _placed_arm(task, calibration, settings)
@@ -372,7 +372,7 @@ def _run(
     controller: Controller | CoreController,
     settings: LoopSettings,
     rng: np.random.Generator,
-    shown: Sight,
+    shown: PlateSight,
 ) -> tuple[TaskResult, Trace]:
     dt_s = 1.0 / settings.rate_hz
     window = max(2, round(REST_STEPS * settings.rate_hz / DEFAULT_RATE_HZ))

@@ -67,6 +67,15 @@ def test_no_experiment_of_the_thesis_prints_raw_json():
     assert "verdicts: " in run.output
 
 
+def test_verdicts_of_the_inverse_kinematics_are_the_known_ones():
+    experiment = EXPERIMENTS["inverse-kinematics"]
+    compared = experiment.compare(experiment.run(0, {"seeds": 10}, silent))
+    assert {(row.item, row.what) for row in compared} == {
+        key[1:] for key in KNOWN if key[0] == experiment.name
+    }
+    assert changed(experiment.name, compared) == []
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_verdicts_of_the_whole_thesis_are_the_known_ones():

@@ -33,7 +33,7 @@ PERIOD_NS = 40_000_000
 
 
 class PlatePictures:
-    """Sight of the plate (`stereoservo_sim.tasks.closed_loop.Sight`) through rendered pictures.
+    """Sight of the plate (`stereoservo_sim.tasks.closed_loop.PlateSight`) through rendered pictures.
 
     ``predicts``: the detector is given what the controller expects, and the loop goes on where it finds nothing. Else
     it searches the whole images, and has to find all four markers in both.
@@ -61,7 +61,7 @@ class PlatePictures:
     def look(
         self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray] | None:
-        """As `Sight` has it."""
+        """As `PlateSight` has it."""
         if expected is not None:
             self.ahead += np.linalg.norm(expected - sight(pose).pixels, axis=-1).ravel().tolist()
         pixels, seen = self.extracted(pose, expected if self._predicts else None, rng)
