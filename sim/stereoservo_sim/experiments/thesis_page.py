@@ -116,7 +116,7 @@ def _section(one: Reproduction) -> str:
     ]
     figures = [
         f'<figure><img alt="{escape(file)}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-        f"<figcaption>{escape(file)}</figcaption></figure>"
+        f"<figcaption>{escape(Path(file).stem.replace('-', ' '))}</figcaption></figure>"
         for file, data in one.figures.items()
     ]
     assumed = "".join(f"<li>{escape(str(line))}</li>" for line in one.answer.get("assumptions", []))

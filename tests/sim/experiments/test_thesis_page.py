@@ -83,5 +83,6 @@ def test_verdicts_of_the_whole_thesis_are_the_known_ones():
     for one in found:
         assert changed(one.experiment.name, one.compared) == []
         assert one.figures
+        assert all(row.why or row.verdict in ("agrees", "better") for row in one.compared)
     assert {(one.experiment.name, row.item, row.what) for one in found for row in one.compared} == set(KNOWN)
     assert set(REPRODUCED) <= set(EXPERIMENTS)
