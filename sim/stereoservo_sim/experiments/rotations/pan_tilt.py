@@ -302,7 +302,8 @@ def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
         means = ("delta_u_mean", "delta_v_mean")
         found.append(
             of_limit("table 4.1", f"{row['condition']}: larger mean of Δu and Δv", max(abs(said[m]) for m in means),
-                     max(abs(row[m]["median"]) for m in means), "px", said="")
+                     max(abs(row[m]["median"]) for m in means), "px",
+                     f"of {row['seeds']} heads, each with its own error of calibration", said="")
         )  # fmt: skip
         for key, name in names.items():
             why = f"{row['perfect_calibration_delta_lr']['median']:.2f} px with the head known: noise"
