@@ -159,15 +159,22 @@ def show_rows(answer: dict[str, Any], console: Console) -> None:
     if len(rows) > LISTED and answer.get("beside_thesis"):
         console.print(f"{title}; all {len(rows)} rows: --json, curves: --plot DIR")
     else:
-        names = list(rows[0])
-        whole_table(
-            console,
-            title,
-            {name: "left" if isinstance(rows[0][name], str) else "right" for name in names},
-            [[cell_text(row[name]) for name in names] for row in rows],
-        )
+        show_table(rows, title, console)
+    if answer.get("rendered"):
+        show_table(answer["rendered"], "through rendered pictures", console)
     for item in answer.get("beside_thesis", []):
         console.print("summary: " + ", ".join(f"{key} {cell_text(value)}" for key, value in item.items()))
+
+
+def show_table(rows: list[dict[str, Any]], title: str, console: Console) -> None:
+    """Print rows as a table, a column for each key of the first."""
+    names = list(rows[0])
+    whole_table(
+        console,
+        title,
+        {name: "left" if isinstance(rows[0][name], str) else "right" for name in names},
+        [[cell_text(row[name]) for name in names] for row in rows],
+    )
 
 
 def whole_table(

@@ -116,7 +116,7 @@ def _section(one: Reproduction) -> str:
     ]
     figures = [
         f'<figure><img alt="{escape(file)}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-        f"<figcaption>{escape(file)}</figcaption></figure>"
+        f"<figcaption>{escape(Path(file).stem.replace('-', ' '))}</figcaption></figure>"
         for file, data in one.figures.items()
     ]
     assumed = "".join(f"<li>{escape(str(line))}</li>" for line in one.answer.get("assumptions", []))
@@ -142,6 +142,8 @@ def _listed(answer: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
         found.append(
             (f"the same with {implied['sigma_px']:g} px and {implied['baseline_m']:g} m", implied["rows"])
         )
+    if answer.get("rendered"):
+        found.append(("through rendered pictures", answer["rendered"]))
     return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -19,7 +19,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.goals.marker_body import goal_pose
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.kinematics.composition import Composition
-from stereoservo.kinematics.kernels import triangulate
+from stereoservo.kinematics.kernels import project_points, triangulate
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import DriverError
@@ -34,7 +34,6 @@ from stereoservo_sim.tasks.calibrations import (
 from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
 from stereoservo_sim.tasks.core_controller import CoreController
 from stereoservo_sim.tasks.ground_truth import (
-    PlateView,
     error_px,
     in_images,
     line_deviations,
@@ -57,6 +56,8 @@ from stereoservo_sim.world.presets import MechanicsPreset
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
 """Steps at 25 Hz over which an error at rest is averaged, after it has held as long; other rates: the same time."""
+LOST_S = 1.0
+"""For which the arm stands still for want of markers before the run has failed."""
 STILL_FALLING = 0.75
 """A mean error below this share of the one before it still falls: the task has not come to rest."""
 NEGLIGIBLE_PX = 1e-4
@@ -71,7 +72,8 @@ class LoopSettings:
     their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
     ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
     of the markers or the number of one. ``mechanics``: of the arm ``rx90``; None: it is perfect. ``core``: the servo
-    core drives the arm, which needs joints and a model; else the law alone.
+    core drives the arm, which needs joints and a model; else the law alone. ``coasts``: the law goes on with the
+    predicted pixels of markers that are not seen.
     """
 
     law: str = DEFAULT_LAW
@@ -89,6 +91,38 @@ class LoopSettings:
     joint_speed: float | None = None
     mechanics: MechanicsPreset | None = None
     core: bool = False
+    coasts: bool = False
+
+
+class PlateSight(Protocol):
+    """Protocol of what shows the controller the plate; by itself its projections with noise (`Projections`)."""
+
+    def look(
+        self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Pixels (c, m, 2), and 1 or 0 (c, m) for what is seen of them, with the plate at ``pose`` (4, 4); its
+        controller expects it at ``expected`` (c, m, 2), None at first. None where too little is seen to go on.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Projections:
+    """Sight of exact projections with the settings' noise, inside an image of a camera that is not dropped."""
+
+    settings: LoopSettings
+
+    def look(
+        self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """As `PlateSight` has it."""
+        pixels = sight(pose).pixels
+        seen = in_images(pixels).astype(np.float64)
+        if self.settings.drop_camera is not None:
+            start, duration = self.settings.drop_camera
+            if start <= time_s < start + duration:
+                seen[1] = 0.0
+        return pixels + rng.normal(0.0, 1.0, pixels.shape) * self.settings.noise_px, seen
 
 
 class TaskResult(msgspec.Struct, frozen=True):
@@ -135,9 +169,9 @@ class Trace:
 
 
 def run_task(
-    task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings
+    task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings, shown: PlateSight | None = None
 ) -> tuple[TaskResult, Trace]:
-    """Run one task; deterministic given task, calibration and settings."""
+    """Run one task, as ``shown``; deterministic given task, calibration and settings."""
     arm = _placed_arm(task, calibration, settings)
     if arm is None:
         return _unreachable(task, settings)
@@ -152,7 +186,7 @@ def run_task(
         joints = None if settings.arm == "free" else arm.joints
         controller = Controller(known_at_start(calibration, task, joints), task, settings, arm.limits)
     rng = np.random.default_rng([settings.seed, task.id])
-    return _run(task, arm, controller, settings, rng)
+    return _run(task, arm, controller, settings, rng, shown or Projections(settings))
 
 
 def _placed_arm(task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings) -> TaskArm | None:
@@ -193,7 +227,7 @@ class Controller:
         self._knowledge = knowledge
         self._dt_s = 1.0 / settings.rate_hz
         self._law = _law(settings.law, knowledge)
-        self._joint_speed = settings.joint_speed
+        self._joint_speed, self._coasts = settings.joint_speed, settings.coasts
         self.task_error = np.full(len(LAWS[settings.law].components) if settings.law in LAWS else 0, np.nan)
         self._options = Options(
             gain=settings.gain,
@@ -232,7 +266,7 @@ class Controller:
         task = self._task._replace(centre=self._centre_weights @ points)
         scene = Scene(
             self._operators, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points,
-            self.estimate.pixels, seen * self._wanted,
+            self.estimate.pixels, self._wanted if self._coasts else seen * self._wanted,
         )  # fmt: skip
         if self._plans:
             if self._path is None:
@@ -244,6 +278,12 @@ class Controller:
             return np.asarray(step.velocity)
         fastest = float(np.abs(step.velocity).max())
         return np.asarray(step.velocity * (self._joint_speed / max(fastest, self._joint_speed)))
+
+    @property
+    def expected(self) -> FloatArray | None:
+        """Pixels (c, m, 2) at which the markers are expected; None where no point is known yet."""
+        points = self.estimate.points
+        return project_points(self._knowledge.matrices, points)[0] if len(points) else None
 
     def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
         """Move the arm for a step from a frame; why it cannot be, or ''. Raises NoPathError, DriverError."""
@@ -332,6 +372,7 @@ def _run(
     controller: Controller | CoreController,
     settings: LoopSettings,
     rng: np.random.Generator,
+    shown: PlateSight,
 ) -> tuple[TaskResult, Trace]:
     dt_s = 1.0 / settings.rate_hz
     window = max(2, round(REST_STEPS * settings.rate_hz / DEFAULT_RATE_HZ))
@@ -344,7 +385,7 @@ def _run(
         np.empty((limit, len(controller.task_error))),
     )
     margin, back_face, out_of_view, reason, refused, stopped = np.inf, False, False, "", "", ""
-    steps = 0
+    steps, waited = 0, 0
     for k in range(limit + 1):
         truth = sight(arm.pose, used)
         steps = k + 1
@@ -358,9 +399,15 @@ def _run(
         errors[k] = error_px(truth.pixels, set_points, used)
         if k == limit or _settled(errors, k, window):
             break
-        frame = truth.pixels + rng.normal(0.0, 1.0, truth.pixels.shape) * settings.noise_px
+        frame = shown.look(arm.pose, k * dt_s, controller.expected, rng)
+        waited = waited + 1 if frame is None else 0
+        if waited > LOST_S * settings.rate_hz:
+            reason = "EXTRACTION_LOST"
+            break
+        if frame is None:
+            continue
         try:
-            reason = controller.advance(frame, _seen(truth, settings, k * dt_s), arm)
+            reason = controller.advance(*frame, arm)
         except NoPathError as error:
             reason, refused = "REFUSED", error.reason
         except DriverError as error:
@@ -376,16 +423,6 @@ def _run(
     flags = (back_face, out_of_view)
     result = _judged(task, settings, trace, flags, margin, (reason, refused), window)
     return msgspec.structs.replace(result, stopped=stopped), trace
-
-
-def _seen(truth: PlateView, settings: LoopSettings, time_s: float) -> FloatArray:
-    """Visibility (c, m): 1 for markers in the image of a camera that is not dropped, else 0."""
-    seen = in_images(truth.pixels).astype(np.float64)
-    if settings.drop_camera is not None:
-        start, duration = settings.drop_camera
-        if start <= time_s < start + duration:
-            seen[1] = 0.0
-    return seen
 
 
 def _settled(errors: FloatArray, k: int, window: int) -> bool:

@@ -42,7 +42,7 @@ class CoreController:
         self, model: CellModel, task: AlignmentTask, arm: TaskArm, *,
         law: LawName, points: PointsName, gain: float, rate_hz: float, noise_px: float, time_limit_s: float,
     ) -> None:  # fmt: skip
-        self.task_error = np.zeros(0)
+        self.task_error, self.expected = np.zeros(0), None
         self._core = ServoCore(_settings(model, arm.limits, law, points, gain, rate_hz))
         self._period_ns = round(1e9 / CORE_RATE_HZ)
         self._cycles = max(1, round(CORE_RATE_HZ / rate_hz))

@@ -5,11 +5,14 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from oracles.thesis_verdicts import changed
+from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.pictures.correlation import follow
+from stereoservo_sim.experiments.pictures.textured import texture
 from stereoservo_sim.experiments.rotations.homing import draw_homing, run_homing
 from stereoservo_sim.experiments.rotations.pan_tilt import (
     CONDITIONS,
@@ -87,6 +90,25 @@ def test_tracker_noise_is_what_it_is_said_to_be():
     assert np.array_equal(tracked(exact, "drifting", rng, first)[:, 0], first)
 
 
+def test_points_are_followed_to_a_part_of_a_pixel_and_a_lost_one_stays_lost():
+    """Shifts of a smooth texture by known parts of a pixel."""
+    rng = np.random.default_rng(11)
+    field = texture(rng, 300, 3.0)
+    shifts = np.array([(0.0, 0.0), (6.3, -3.6), (11.8, -9.1), (19.25, -4.5)])
+    pictures = []
+    for du, dv in shifts:
+        v, u = np.mgrid[0:300, 0:300].astype(np.float64)
+        grey = map_coordinates(field, [v - dv, u - du], order=3, mode="nearest") + rng.normal(0, 2.0, v.shape)
+        pictures.append(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+    first = np.array([*rng.uniform(80, 200, (40, 2)), (3.0, 150.0)])
+    found = follow(pictures, first, 6)
+    assert np.isnan(found[1:, -1]).all()
+    kept = np.isfinite(found).all(axis=(0, 2))
+    assert kept.sum() > 35
+    off = found[:, kept] - (first[kept] + shifts[:, None])
+    assert np.diff(off, axis=0).std() < 0.15
+
+
 def test_what_calibrates_does_not_evaluate():
     pairs = step_pairs(PAN_USED, 20)
     assert pairs
@@ -161,6 +183,13 @@ def test_pan_tilt_answers_and_draws(tmp_path):
         assert row["separate_rotations_delta_lr"]["median"] < 1.5 * row["delta_lr"]["median"]
     assert all(path.stat().st_size > 10_000 for path in draw_pan_tilt(answer, tmp_path / "new"))
     assert len(answer["example"]["feed-forward"]["pairs"]) == 35
+    for row in answer["rendered"]:
+        assert row["points"] > 80
+        # Through pictures as well, the head's calibration adds little to what the tracker errs by.
+        assert row["delta_lr"] < 1.5 * row["perfect_calibration_delta_lr"]
+    compared = EXPERIMENTS["pan-tilt"].compare(answer)
+    assert {(row.item, row.what) for row in compared} == {key[1:] for key in KNOWN if key[0] == "pan-tilt"}
+    assert changed("pan-tilt", [row for row in compared if row.what.startswith("rendered")]) == []
 
 
 @pytest.mark.parametrize("seeds", [2, pytest.param(5, marks=pytest.mark.slow)])

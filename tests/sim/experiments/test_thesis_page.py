@@ -67,6 +67,15 @@ def test_no_experiment_of_the_thesis_prints_raw_json():
     assert "verdicts: " in run.output
 
 
+def test_verdicts_of_the_inverse_kinematics_are_the_known_ones():
+    experiment = EXPERIMENTS["inverse-kinematics"]
+    compared = experiment.compare(experiment.run(0, {"seeds": 10}, silent))
+    assert {(row.item, row.what) for row in compared} == {
+        key[1:] for key in KNOWN if key[0] == experiment.name
+    }
+    assert changed(experiment.name, compared) == []
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_verdicts_of_the_whole_thesis_are_the_known_ones():
@@ -74,5 +83,6 @@ def test_verdicts_of_the_whole_thesis_are_the_known_ones():
     for one in found:
         assert changed(one.experiment.name, one.compared) == []
         assert one.figures
+        assert all(row.why or row.verdict in ("agrees", "better") for row in one.compared)
     assert {(one.experiment.name, row.item, row.what) for one in found for row in one.compared} == set(KNOWN)
     assert set(REPRODUCED) <= set(EXPERIMENTS)

@@ -10,6 +10,7 @@ from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo.cli.dispatch import app
 from stereoservo.geometry.cameras import triangulate
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.comparison import Comparison
 from stereoservo_sim.experiments.translations.affine_measures import (
     collinear_triplets,
     converging_rig,
@@ -254,6 +255,8 @@ def test_reproduce_prints_one_finite_json_object_and_the_same_for_the_same_seed(
     assert answer["thesis"]["figure"].startswith("3.")
     assert answer["assumptions"]
     if name == "house":
+        assert changed(name, [Comparison(**row) for row in answer["compared"]]) == []
+        assert len(answer["compared"]) == sum(key[0] == name for key in KNOWN)
         again = run_house(seeds=1, seed=3, progress=silent, pictures=False)
         assert again["rows"] == answer["rows"]
         (seen,) = answer["rendered"]

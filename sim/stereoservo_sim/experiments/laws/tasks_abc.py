@@ -10,6 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from stereoservo_sim.experiments.comparison import Comparison, of_statement
+from stereoservo_sim.experiments.laws.abc_pictures import ASSUMPTIONS as PICTURES_ASSUMED
+from stereoservo_sim.experiments.laws.abc_pictures import compare_pictures, draw_pictures, through_pictures
 from stereoservo_sim.experiments.laws.driven_tasks import (
     COLOURS,
     decay,
@@ -26,6 +28,7 @@ from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.tasks.arms import rx90_cell, rx90_reach
 from stereoservo_sim.tasks.calibrations import CalibrationName, calibrate, metric_model
 from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, Trace, run_task
+from stereoservo_sim.tasks.ground_truth import sight
 from stereoservo_sim.tasks.hard_tasks import straight_path_margins
 from stereoservo_sim.tasks.options import DEFAULT_RATE_HZ
 from stereoservo_sim.tasks.random_tasks import random_ends, unit, visible
@@ -35,6 +38,12 @@ from stereoservo_sim.tasks.task_file import AlignmentTask
 DRAWN = {"A": (40.0, 0.15), "B": (100.0, 0.10), "C": (60.0, 0.25)}
 """Angle [°] and distance [m] of the tasks; B is the one with the important rotation of the plate."""
 DEPTH_M, DEPTH_SPREAD_M = 1.0, 0.15
+END_FACING = 0.4
+"""Least cosine of the angle at which a camera sees the plate's normal in start and goal: the markers are extracted."""
+STRONG = 0.2
+"""At most so much on the law's way of task B, whose face gets a strong inclination."""
+TRIED_RATE_HZ = 5.0
+"""Of the runs that choose poses."""
 GAINS = (0.25, 0.5, 1.0, 2.0)
 """[1/s]"""
 SHOWN_GAIN = 0.5
@@ -58,7 +67,8 @@ THESIS = {
 ASSUMPTIONS = [
     "the thesis prints no poses: angle and distance are chosen (A 40°, 0.15 m; B 100°, 0.10 m; C 60°, 0.25 m), the "
     "rest is drawn by seed until the RX 90 reaches both ends, both cameras see them, the straight way keeps the plate "
-    "in view, and, as the thesis realized them, the law solves the task with an exact model",
+    "in view, and, as the thesis realized them, the law solves the task with an exact model; both ends are seen at "
+    "66° from the normal or less, and, as in 8.6, the law's way of B inclines the face strongly, to 78° or more",
     "beside the thesis, 'B drawn': poses with B's angle and distance of which no success is required",
     f"coarse: metric, {FOCAL_ERROR:.0%} focal and {HAND_EYE_ERROR_DEG:g}° hand-eye error; points are triangulated, as "
     "it does not know the markers' places on the plate; the thesis does not say how coarse its calibration was",
@@ -72,12 +82,17 @@ TITLE = "tasks-abc: law stereo on the RX 90; expected rate of the decay: the gai
 def abc_tasks(seed: int) -> tuple[AlignmentTask, ...]:
     """The three tasks of a seed."""
     exact = calibrate("rx90", "exact", 0.0, seed)
-    solvable = LoopSettings(law="stereo", arm="rx90", jacobian="current", noise_px=0.0)
+    tried = LoopSettings(law="stereo", arm="rx90", jacobian="current", noise_px=0.0, rate_hz=TRIED_RATE_HZ)
     found = []
-    for number, parameters in enumerate(DRAWN.values()):
+    for number, (name, parameters) in enumerate(DRAWN.items()):
         rng = np.random.default_rng([seed, number])
-        while not run_task(task := drawn(rng, number, seed, *parameters), exact, solvable)[0].success:
-            pass
+        while True:
+            task = drawn(rng, number, seed, *parameters)
+            if min(sight(task.start).facing, sight(task.goal).facing) < END_FACING:
+                continue
+            result, trace = run_task(task, exact, tried)
+            if result.success and (name != "B" or trace.facing.min() < STRONG):
+                break
         found.append(task)
     return tuple(found)
 
@@ -127,6 +142,9 @@ def run_tasks_abc(
         task = drawn(np.random.default_rng([seed, 100 + i]), 100 + i, seed, *DRAWN["B"])
         for name, model in known.items():
             more[name].append(run_task(task, model, _settings("current", SHOWN_GAIN, seed))[0].reason)
+    rendered, steepest = through_pictures(
+        dict(zip(DRAWN, tasks, strict=True)), _settings("current", SHOWN_GAIN, seed)
+    )
     coarser = [_coarser(level, dict(zip(DRAWN, tasks, strict=True)), seed) for level in COARSER]
     progress("tasks-abc", total, total)
     return {
@@ -138,8 +156,10 @@ def run_tasks_abc(
         "rows": rows,
         "beside_thesis": _beside(rows) + _drawn_more(more),
         "coarser": coarser,
+        "rendered": rendered,
+        "steepest": steepest.tolist(),
         "thesis": THESIS,
-        "assumptions": ASSUMPTIONS,
+        "assumptions": [*ASSUMPTIONS, *PICTURES_ASSUMED],
         "tasks": [
             {"task": name, "start": task.start.tolist(), "goal": task.goal.tolist()}
             for name, task in zip(DRAWN, tasks, strict=True)
@@ -192,12 +212,11 @@ def compare_tasks_abc(answer: dict[str, Any]) -> list[Comparison]:
                      straight > 0.999 and low > 0.95 and high < 1.05),
         of_statement("fig. 8.9", "simple task A, projective and coarse", "both servo it",
                      "both converge" if simple else "one does not", simple),
-        of_statement("fig. 8.10", "hard task B, coarse", "a run failed",
+        of_statement("fig. 8.10", "hard task B, coarse, markers given, not extracted", "a run failed",
                      f"{'fails' if failing else 'converges'} with {size}", bool(failing),
-                     "the thesis prints neither the poses nor how coarse its calibration was; its markers were lost by "
-                     "the extraction, and here markers are given, not extracted"),
-        Comparison("8.6", "extraction fails without prediction, recovers with it", "seen", "-", "not comparable",
-                   "no pictures are rendered here"),
+                     "as long as the markers are given the law converges with all these models: what fails in the rows "
+                     "through pictures is the extraction"),
+        *compare_pictures(answer["rendered"]),
         *(Comparison(f"fig. 8.{figure}", what, "curves", "drawn", "not comparable", poses)
           for figure, what in ((7, "joint trajectories"), (11, "image motion, projective and coarse"),
                                (12, "joint motion, projective and coarse"))),
@@ -320,6 +339,7 @@ def draw_tasks_abc(answer: dict[str, Any], folder: Path) -> list[Path]:
         saved(decays, folder, "tasks-abc-decay"),
         saved(motion, folder, "tasks-abc-images"),
         saved(joints, folder, "tasks-abc-joints"),
+        draw_pictures(answer, folder),
     ]
 
 

@@ -21,15 +21,18 @@ from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.joint_reprojection import SeenChain, points_seen, predicted_pixels, seen_chain
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.comparison import Comparison, of_error, of_limit, of_statement
-from stereoservo_sim.experiments.experiment import whole_table
+from stereoservo_sim.experiments.experiment import show_table, whole_table
+from stereoservo_sim.experiments.rotations.head_pictures import ASSUMPTIONS as PICTURES_ASSUMED
+from stereoservo_sim.experiments.rotations.head_pictures import head_before_pictures
 from stereoservo_sim.experiments.rotations.thesis_head import (
     ASSUMPTIONS,
     CALIBRATING_POINTS,
+    PAN_STEPS,
     PAN_USED,
     SIGMA,
     TILT_USED,
     Noise,
-    Tracks,
+    SeenHead,
     calibrated,
     general_positions,
     head,
@@ -119,29 +122,59 @@ def trial(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> dict[s
     with the ``perfect`` one, and of the calibrated one on ``exact`` images. Raises CalibrationError, GeometryError.
     """
     tracks = tracks_of(cell, noise, rng)
-    trials = trial_data(cell, tracks)
+    general = general_positions(cell, rng, POSITIONS)
+    exact = cell.pixels(general)
+    return errors_of(SeenHead(cell, tracks, general, tracked(exact, noise, rng), exact), CALIBRATING_POINTS)
+
+
+def errors_of(seen: SeenHead, calibrating: int) -> dict[str, dict[str, FloatArray]]:
+    """The errors of `trial` of what a head saw, of which the first ``calibrating`` points calibrate."""
+    trials = trial_data(seen.cell, seen.tracks, calibrating)
     heads = {
         "calibrated": calibrated(trials).seen,
         "separate": separate_rotations(trials),
-        "perfect": seen_chain(exact_model(cell)),
+        "perfect": seen_chain(exact_model(seen.cell)),
     }
     answer: dict[str, dict[str, FloatArray]] = {}
-    for condition, (positions, pixels, exact, pairs) in _sequences(cell, tracks, rng).items():
-        pixels, exact = pixels[:, :, CALIBRATING_POINTS:], exact[:, :, CALIBRATING_POINTS:]
+    for condition, (positions, pixels, exact, pairs) in _sequences(seen).items():
+        pixels, exact = pixels[:, :, calibrating:], exact[:, :, calibrating:]
         answer[condition] = {
-            name: step_errors(seen, positions, pixels, pixels, pairs) for name, seen in heads.items()
+            name: step_errors(head, positions, pixels, pixels, pairs) for name, head in heads.items()
         }
         answer[condition]["exact"] = step_errors(heads["calibrated"], positions, exact, exact, pairs)
     return answer
 
 
+def by_pictures(rng: np.random.Generator) -> list[dict[str, Any]]:
+    """The same through rendered pictures: a row a condition, with the tracker's error between consecutive pictures and
+    what it has drifted by at the end of the pan trajectory, rms [px]. Raises DriverError, CalibrationError,
+    GeometryError.
+    """
+    seen = head_before_pictures(rng, POSITIONS)
+    off = seen.tracks.pan - seen.tracks.pan_exact
+    calibrating = min(CALIBRATING_POINTS, off.shape[2] // 2)
+    about = {
+        "points": off.shape[2],
+        "tracker_px": float(np.diff(off, axis=1).std()),
+        "drift_px": float((off[:, -1] - off[:, 0]).std()),
+    }
+    return [
+        {
+            "condition": condition,
+            **about,
+            **measures(kinds["calibrated"]),
+            "perfect_calibration_delta_lr": measures(kinds["perfect"])["delta_lr"],
+        }
+        for condition, kinds in errors_of(seen, calibrating).items()
+    ]
+
+
 Sequence = tuple[FloatArray, FloatArray, FloatArray, list[tuple[int, int]]]
 
 
-def _sequences(cell: SyntheticCell, tracks: Tracks, rng: np.random.Generator) -> dict[str, Sequence]:
+def _sequences(seen: SeenHead) -> dict[str, Sequence]:
     """Positions, tracked and exact pixels, and the pairs to predict, of each condition."""
-    general = general_positions(cell, rng, POSITIONS)
-    exact = cell.pixels(general)
+    tracks = seen.tracks
     return {
         "pan calibration": (
             tracks.pan_positions,
@@ -156,10 +189,10 @@ def _sequences(cell: SyntheticCell, tracks: Tracks, rng: np.random.Generator) ->
             step_pairs(TILT_USED, len(tracks.tilt_positions) - 1),
         ),
         "feed-forward": (
-            general,
-            tracked(exact, tracks.noise, rng),
-            exact,
-            list(combinations(range(POSITIONS), 2))[:PAIRS],
+            seen.general,
+            seen.pixels,
+            seen.exact,
+            list(combinations(range(len(seen.general)), 2))[:PAIRS],
         ),
     }
 
@@ -197,6 +230,7 @@ def run_pan_tilt(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, 
                 if noise == "drifting" and condition not in example:
                     example[condition] = kinds["calibrated"]
         paths.append(_path_lengths(cell))
+    rendered = by_pictures(np.random.default_rng([seed, 3]))
     progress("pan-tilt", seeds, seeds)
     return {
         "experiment": "pan-tilt",
@@ -204,8 +238,9 @@ def run_pan_tilt(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, 
         "seeds": seeds,
         "sigma_px": SIGMA,
         "rows": [_row(noise, condition, found) for noise in NOISES for condition in CONDITIONS],
+        "rendered": rendered,
         "thesis": THESIS,
-        "assumptions": ASSUMPTIONS,
+        "assumptions": [*ASSUMPTIONS, *PICTURES_ASSUMED],
         "path_px": {
             "pan": float(np.mean([p for p, _ in paths])),
             "tilt": float(np.mean([t for _, t in paths])),
@@ -267,7 +302,8 @@ def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
         means = ("delta_u_mean", "delta_v_mean")
         found.append(
             of_limit("table 4.1", f"{row['condition']}: larger mean of Δu and Δv", max(abs(said[m]) for m in means),
-                     max(abs(row[m]["median"]) for m in means), "px", said="")
+                     max(abs(row[m]["median"]) for m in means), "px",
+                     f"of {row['seeds']} heads, each with its own error of calibration", said="")
         )  # fmt: skip
         for key, name in names.items():
             why = f"{row['perfect_calibration_delta_lr']['median']:.2f} px with the head known: noise"
@@ -292,7 +328,26 @@ def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
             for condition, left, right in equal
         ),
         of_limit("fig. 4.9", "mean prediction error, Δ_LR", 1.0, moved["delta_lr"]["median"], "px"),
+        *_compared_pictures(answer),
     ]
+
+
+def _compared_pictures(answer: dict[str, Any]) -> list[Comparison]:
+    """Table 4.1, fig. 4.9 and the tracker of 4.5.1 beside what is had through pictures, the largest of all heads."""
+    rows = answer["rendered"]
+    largest = {
+        condition: max(row["delta_lr"] for row in rows if row["condition"] == condition)
+        for condition in CONDITIONS
+    }
+    step, drift = max(row["tracker_px"] for row in rows), min(row["drift_px"] for row in rows)
+    return [
+        *(of_error("table 4.1", f"rendered, {condition}: Δ_LR", answer["thesis"][condition]["delta_lr"], value, "px")
+          for condition, value in largest.items()),
+        of_limit("fig. 4.9", "rendered, mean prediction error, Δ_LR", 1.0, largest["feed-forward"], "px"),
+        of_error("4.5.1", "rendered, tracker between consecutive images", SIGMA, step, "px"),
+        of_statement("4.5.1", "rendered, drift of the tracked points", "noticeable, errors sum up",
+                     f"{drift:.2g} px rms after {PAN_STEPS} steps, {step:.2g} px a step", drift > 3.0 * step),
+    ]  # fmt: skip
 
 
 def draw_pan_tilt(answer: dict[str, Any], folder: Path) -> list[Path]:
@@ -357,6 +412,7 @@ def show_pan_tilt(answer: dict[str, Any], console: Console) -> None:
                 for key, name in measures.items()
             ],
         )
+    show_table(answer["rendered"], "through rendered pictures", console)
 
 
 def _beside(ours: dict[str, Any], thesis: float | None) -> str:

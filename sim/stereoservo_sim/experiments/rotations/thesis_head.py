@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -125,6 +125,18 @@ class Tracks:
     noise: Noise
 
 
+class SeenHead(NamedTuple):
+    """A head and what it saw: ``tracks`` of both trajectories; tracked ``pixels`` (c, s, m, 2) at ``general`` positions
+    (s, 2), and ``exact`` ones.
+    """
+
+    cell: SyntheticCell
+    tracks: Tracks
+    general: FloatArray
+    pixels: FloatArray
+    exact: FloatArray
+
+
 def tracks_of(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> Tracks:
     """Both trajectories, tracked from their common first image."""
     pan, tilt = trajectories(cell)
@@ -141,8 +153,8 @@ def tracks_of(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> Tr
     )
 
 
-def trial_data(cell: SyntheticCell, tracks: Tracks) -> TrialData:
-    """Trial data for calibration: a subset of steps and of points, with the tracker's expected noise."""
+def trial_data(cell: SyntheticCell, tracks: Tracks, points: int = CALIBRATING_POINTS) -> TrialData:
+    """Trial data for calibration: a subset of steps and the first ``points``, with the tracker's expected noise."""
     own, steps, positions, pixels = [], [], [], []
     for joint, (used, where, images) in enumerate(
         (
@@ -154,14 +166,14 @@ def trial_data(cell: SyntheticCell, tracks: Tracks) -> TrialData:
             own.append(joint)
             steps.append(step)
             positions.append(where[step])
-            pixels.append(images[:, step, :CALIBRATING_POINTS])
+            pixels.append(images[:, step, :points])
     grown = np.sqrt(1.0 + np.array(steps)) if tracks.noise == "drifting" else np.ones(len(steps))
-    shape = (2, len(steps), CALIBRATING_POINTS)
+    shape = (2, len(steps), points)
     return TrialData(
         joint_names=("pan", "tilt"),
         joint_kinds=("revolute", "revolute"),
         cameras=tuple(TrialCamera(name, WIDTH, HEIGHT, "eye_in_hand") for name in ("left", "right")),
-        marker_ids=cell.marker_ids[:CALIBRATING_POINTS],
+        marker_ids=cell.marker_ids[:points],
         positions=np.array(positions),
         trials=np.array(own, dtype=np.int64),
         pixels=np.stack(pixels, axis=1),
