@@ -39,6 +39,9 @@ MAX_SHIFT_CELLS = 1.0
 """A fit that correlates less with the image, or moved a corner further from its start, is not believed."""
 MAX_CELL_ERROR = 0.45
 """A cell whose grey is off by so much of the contrast is not what the code says: it was read wrong, or is covered."""
+SATURATED = 254.5
+"""Grey level from which on a pixel may have been brighter than it tells."""
+TOTALS = 8
 BLOCK = 128
 """Pixels whose derivatives are held at a time."""
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -191,10 +194,10 @@ def accumulate(grey, us, vs, cells, p, huber, A, totals):
     """Normal equations of the fit at parameters ``p`` (13,): the lower triangle of ``A`` (14, 14), whose last row is
     the right side and the sum of squares.
 
-    ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly. ``totals`` (7,)
-    gets Huber's cost, the sums of squares of the clipped residuals, of pixels that are not clipped, of |residual|, and
-    of model, model squared, model times grey (the last three for the correlation). False where the homography does
-    not show the tag.
+    ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly; a pixel at the
+    sensor's limit that the model has brighter tells nothing. ``totals`` (8,) gets Huber's cost, the sums of squares of
+    the clipped residuals, of pixels that are not clipped, of |residual|, of model, model squared, model times grey (the
+    three for the correlation), and of pixels that tell nothing. False where the homography does not show the tag.
     """
     n = cells.shape[0]
     A[:] = 0.0
@@ -210,7 +213,13 @@ def accumulate(grey, us, vs, cells, p, huber, A, totals):
         _darken(cells, work, size, across, down)
         _differentiate(grey[first : first + size], u, v, p, n, work, J)
         for k in range(size):
-            off, value = abs(J[PARAMETERS, k]), work[0, k]
+            value = work[0, k]
+            if grey[first + k] >= SATURATED and value > grey[first + k]:
+                value = grey[first + k]
+                J[:, k] = 0.0
+                totals[2] -= 1.0  # counted below as any other
+                totals[7] += 1.0
+            off = abs(J[PARAMETERS, k])
             totals[3] += off
             totals[4] += value
             totals[5] += value * value
@@ -454,17 +463,51 @@ def _refine(grey, us, vs, cells, p, side, huber, A, totals):
 
 
 @kernel
-def _corners(h, g, A, variance, u0, v0, side, corners, covariances):
-    """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance; False:
-    the normal equations are singular.
+def _clustered(grey, us, vs, cells, p, huber, B):
+    """Covariance ``B`` (13, 13) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
+    shadow's edge for one, leaves residuals that are alike within a cell, and do not average out as noise does.
+    """
+    n = cells.shape[0]
+    across, down = np.zeros((3, n)), np.zeros((3, n))
+    J, work = np.empty((PARAMETERS + 1, BLOCK)), np.empty((11, BLOCK))
+    sums = np.zeros((n + 2, n + 2, PARAMETERS))
+    for first in range(0, grey.size, BLOCK):
+        size = min(BLOCK, grey.size - first)
+        _place(us[first : first + size], vs[first : first + size], p, n, work)
+        _darken(cells, work, size, across, down)
+        i, j = np.floor(work[1, :size]), np.floor(work[2, :size])
+        _differentiate(
+            grey[first : first + size], us[first : first + size], vs[first : first + size], p, n, work, J
+        )
+        for k in range(size):
+            off = J[PARAMETERS, k]
+            if grey[first + k] >= SATURATED and off < 0.0:
+                continue
+            off = min(max(off, -huber), huber)
+            row = sums[min(max(int(j[k]), -1), n) + 1, min(max(int(i[k]), -1), n) + 1]
+            for a in range(PARAMETERS):
+                row[a] += J[a, k] * off
+    B[:] = 0.0
+    for j in range(n + 2):
+        for i in range(n + 2):
+            for a in range(PARAMETERS):
+                for c in range(PARAMETERS):
+                    B[a, c] += sums[j, i, a] * sums[j, i, c]
+
+
+@kernel
+def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
+    """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
+    where the gradient's covariance ``B`` (13, 13) is more than that of such noise; False: the normal equations are
+    singular.
     """
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)
-    N, C = np.empty((PARAMETERS, PARAMETERS)), np.empty((8, 8))
+    N, C = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
     for a in range(PARAMETERS):
         scale[a] = math.sqrt(A[a, a] + 1e-9)
         for c in range(a + 1):
             N[a, c] = A[a, c] / (scale[a] * scale[c])
-    for a in range(8):
+    for a in range(PARAMETERS):
         e[:] = 0.0
         e[a] = 1.0
         if a == 0:
@@ -472,8 +515,18 @@ def _corners(h, g, A, variance, u0, v0, side, corners, covariances):
                 return False
         else:
             factor_solve(N, e, column)
+        for c in range(PARAMETERS):
+            C[c, a] = column[c] / (scale[a] * scale[c])
+    M, half = np.zeros((8, 8)), np.zeros((8, PARAMETERS))
+    for a in range(8):
+        for c in range(PARAMETERS):
+            for k in range(PARAMETERS):
+                half[a, c] += C[a, k] * B[k, c]
+    for a in range(8):
         for c in range(8):
-            C[c, a] = column[c] * variance / (scale[a] * scale[c])
+            for k in range(PARAMETERS):
+                M[a, c] += half[a, k] * C[k, c]
+    seen = 0.0
     back = np.zeros((2, 8))
     for k in range(4):
         x, y = SQUARE[k, 0], SQUARE[k, 1]
@@ -494,11 +547,15 @@ def _corners(h, g, A, variance, u0, v0, side, corners, covariances):
                 back[1, 6 + i] = -(a * y - c * x) * local / determinant
         for i in range(2):
             for j in range(2):
-                total = 0.0
+                total, real = 0.0, 0.0
                 for s in range(8):
                     for t in range(8):
                         total += back[i, s] * C[s, t] * back[j, t]
-                covariances[k, i, j] = total * side * side
+                        real += back[i, s] * M[s, t] * back[j, t]
+                covariances[k, i, j] = total * variance * side * side
+                if i == j:
+                    seen += 0.125 * real / max(total * variance, 1e-30)
+    covariances *= max(seen, 1.0)
     return True
 
 
@@ -533,7 +590,7 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     black, white = _percentiles(grey[:few])
     p[:8] = h[:8]
     p[8], p[9], p[12] = math.log(blur_px / side), white, black / max(white, 1.0)
-    A, totals = np.zeros((PARAMETERS + 1, PARAMETERS + 1)), np.zeros(7)
+    A, totals = np.zeros((PARAMETERS + 1, PARAMETERS + 1)), np.zeros(TOTALS)
     if not _approach(grey[:few], us[:few], vs[:few], cells, p, side, A, totals):
         return False
     huber = max(HUBER * SIGMA_OF_MEAN * totals[3] / few, 1.0)
@@ -551,9 +608,12 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     if not errors.max() <= MAX_CELL_ERROR:
         return False
     # Huber's estimator: E[psi²] / E[psi']², over the matrix of all pixels, whose sum A nearly is
-    variance = max(totals[1] / (m - PARAMETERS) * (m / totals[2]), QUANTISATION)
+    told_by = m - totals[7]
+    variance = max(totals[1] / (told_by - PARAMETERS) * (told_by / totals[2]), QUANTISATION)
+    B = np.empty((PARAMETERS, PARAMETERS))
+    _clustered(grey[:m], us[:m], vs[:m], cells, p, huber, B)
     h[:8] = p[:8]
-    if not _inverse(h, g) or not _corners(h, g, A, variance, u0, v0, side, corners, covariances):
+    if not _inverse(h, g) or not _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
         return False
     shift = 0.0
     for k in range(4):
