@@ -53,8 +53,8 @@ class PybulletJointDriver(SimulatedArm):
 
 
 class PybulletCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of a rendering camera. ``noise``: sigma [grey levels]; ``blur``: sigma of the lens [px]; ``lighting``: how
-    the scene's light and the exposure change."""
+    """Options of a rendering camera. ``noise``: sigma [grey levels]; ``blur``: sigma of the lens [px]; ``lighting``:
+    how the scene's light and the exposure change."""
 
     noise: NonNegative = 2.0
     blur: NonNegative = 0.7

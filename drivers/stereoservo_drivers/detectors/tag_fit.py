@@ -1,8 +1,8 @@
 """Compiled least-squares fit of a tag's printed pattern to grey values: first to few pixels, from wherever the start
 is, then to many.
 
-Parameters (13): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
-slopes, black as a part of white: light that falls off does so on both.
+Parameters (16): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
+slopes, black as a part of white, the light's three bends: light that falls off does so on both.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import numpy as np
 
 from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo.numerics.linear import cholesky_solve, factor_solve
+from stereoservo_drivers.detectors.homographies import inverse_of, square_to_quad
 
-PARAMETERS = 13
+PARAMETERS = 16
 QUIET_CELLS = 0.5
 """Fitted part of the white margin [cells]; a printed tag has one cell at least."""
 FEW_PIXELS, MOST_PIXELS = 250, 1500
@@ -151,17 +152,18 @@ def _darken(cells, work, size, across, down):
 
 @reassociating_kernel
 def _differentiate(grey, us, vs, p, n, work, J):
-    """Residuals of the pixels of `_darken` into the last row of ``J`` (14, ...), derivatives of the model into the
+    """Residuals of the pixels of `_darken` into the last row of ``J`` (17, ...), derivatives of the model into the
     others; the model into the first row of ``work``.
     """
     for k in range(grey.size):
         u, v, inverse = us[k], vs[k], work[0, k]
         x, y, dark = work[1, k] / n, work[2, k] / n, work[7, k]
-        lit = p[9] + p[10] * (x - 0.5) + p[11] * (y - 0.5)
+        s, t = x - 0.5, y - 0.5
+        lit = p[9] + (p[10] + p[13] * s + p[14] * t) * s + (p[11] + p[15] * t) * t
         fall = -lit * (1.0 - p[12])
         shade = 1.0 - dark * (1.0 - p[12])
-        along_x = (p[10] * shade + fall * work[8, k] * n) * inverse
-        along_y = (p[11] * shade + fall * work[9, k] * n) * inverse
+        along_x = ((p[10] + 2.0 * p[13] * s + p[14] * t) * shade + fall * work[8, k] * n) * inverse
+        along_y = ((p[11] + 2.0 * p[15] * t + p[14] * s) * shade + fall * work[9, k] * n) * inverse
         along = -(along_x * x + along_y * y)
         J[0, k] = along_x * u
         J[1, k] = along_x * v
@@ -173,10 +175,13 @@ def _differentiate(grey, us, vs, p, n, work, J):
         J[7, k] = along * v
         J[8, k] = fall * work[10, k]
         J[9, k] = shade
-        J[10, k] = shade * (x - 0.5)
-        J[11, k] = shade * (y - 0.5)
+        J[10, k] = shade * s
+        J[11, k] = shade * t
         J[12, k] = lit * dark
-        J[13, k] = grey[k] - lit * shade
+        J[13, k] = shade * s * s
+        J[14, k] = shade * s * t
+        J[15, k] = shade * t * t
+        J[PARAMETERS, k] = grey[k] - lit * shade
         work[0, k] = lit * shade
 
 
@@ -191,7 +196,7 @@ def _shown(p, us, vs):
 
 @reassociating_kernel
 def accumulate(grey, us, vs, cells, p, huber, A, totals):
-    """Normal equations of the fit at parameters ``p`` (13,): the lower triangle of ``A`` (14, 14), whose last row is
+    """Normal equations of the fit at parameters ``p`` (16,): the lower triangle of ``A`` (17, 17), whose last row is
     the right side and the sum of squares.
 
     ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly; a pixel at the
@@ -263,7 +268,8 @@ def cell_errors(grey, us, vs, cells, p, out):
         for j in range(j_first, j_last):
             for i in range(i_first, i_last):
                 dark += cells[j, i] * wy[j - j_first] * wx[i - i_first]
-        lit = p[9] + p[10] * (work[1, k] / n - 0.5) + p[11] * (work[2, k] / n - 0.5)
+        s, t = work[1, k] / n - 0.5, work[2, k] / n - 0.5
+        lit = p[9] + (p[10] + p[13] * s + p[14] * t) * s + (p[11] + p[15] * t) * t
         residual = grey[k] - lit * (1.0 - dark * (1.0 - p[12]))
         for j in range(j_first, j_last):
             for i in range(i_first, i_last):
@@ -274,47 +280,6 @@ def cell_errors(grey, us, vs, cells, p, out):
         for i in range(n):
             if squares[j, i] > 0.0:
                 out[j, i] = abs(out[j, i]) / squares[j, i]
-
-
-@kernel
-def _inverse(M, out):
-    """Inverse of ``M`` (9,), a 3x3 matrix row by row, with last entry 1, into ``out`` (9,); False: there is none."""
-    out[0] = M[4] * M[8] - M[5] * M[7]
-    out[1] = M[2] * M[7] - M[1] * M[8]
-    out[2] = M[1] * M[5] - M[2] * M[4]
-    out[3] = M[5] * M[6] - M[3] * M[8]
-    out[4] = M[0] * M[8] - M[2] * M[6]
-    out[5] = M[2] * M[3] - M[0] * M[5]
-    out[6] = M[3] * M[7] - M[4] * M[6]
-    out[7] = M[1] * M[6] - M[0] * M[7]
-    last = M[0] * M[4] - M[1] * M[3]
-    if not abs(last) > 1e-12:
-        return False
-    for k in range(8):
-        out[k] /= last
-    out[8] = 1.0
-    return True
-
-
-@kernel
-def _square_to_quad(quad, out):
-    """Homography (9,) from the unit square to ``quad`` (4, 2) with its corners in order, last entry 1; False: none."""
-    d1u, d1v = quad[1, 0] - quad[2, 0], quad[1, 1] - quad[2, 1]
-    d2u, d2v = quad[3, 0] - quad[2, 0], quad[3, 1] - quad[2, 1]
-    su = quad[0, 0] - quad[1, 0] + quad[2, 0] - quad[3, 0]
-    sv = quad[0, 1] - quad[1, 1] + quad[2, 1] - quad[3, 1]
-    determinant = d1u * d2v - d2u * d1v
-    if not abs(determinant) > 1e-12:
-        return False
-    g, h = (su * d2v - d2u * sv) / determinant, (d1u * sv - su * d1v) / determinant
-    out[0] = quad[1, 0] - quad[0, 0] + g * quad[1, 0]
-    out[1] = quad[3, 0] - quad[0, 0] + h * quad[3, 0]
-    out[2] = quad[0, 0]
-    out[3] = quad[1, 1] - quad[0, 1] + g * quad[1, 1]
-    out[4] = quad[3, 1] - quad[0, 1] + h * quad[3, 1]
-    out[5] = quad[0, 1]
-    out[6], out[7], out[8] = g, h, 1.0
-    return True
 
 
 @kernel
@@ -375,7 +340,7 @@ def _percentiles(grey):
 
 @kernel
 def _step(A, damping, step):
-    """Solve the normal equations of `accumulate` with ``damping`` times their diagonal, into ``step`` (13,); False:
+    """Solve the normal equations of `accumulate` with ``damping`` times their diagonal, into ``step`` (16,); False:
     singular.
     """
     N, b, scale = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -464,7 +429,7 @@ def _refine(grey, us, vs, cells, p, side, huber, A, totals):
 
 @kernel
 def _clustered(grey, us, vs, cells, p, huber, B):
-    """Covariance ``B`` (13, 13) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
+    """Covariance ``B`` (16, 16) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
     shadow's edge for one, leaves residuals that are alike within a cell, and do not average out as noise does.
     """
     n = cells.shape[0]
@@ -484,7 +449,7 @@ def _clustered(grey, us, vs, cells, p, huber, B):
             if grey[first + k] >= SATURATED and off < 0.0:
                 continue
             off = min(max(off, -huber), huber)
-            row = sums[min(max(int(j[k]), -1), n) + 1, min(max(int(i[k]), -1), n) + 1]
+            row = sums[(min(max(int(j[k]), -1), n) + 1) // 2, (min(max(int(i[k]), -1), n) + 1) // 2]
             for a in range(PARAMETERS):
                 row[a] += J[a, k] * off
     B[:] = 0.0
@@ -498,7 +463,7 @@ def _clustered(grey, us, vs, cells, p, huber, B):
 @kernel
 def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
     """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
-    where the gradient's covariance ``B`` (13, 13) is more than that of such noise; False: the normal equations are
+    where the gradient's covariance ``B`` (16, 16) is more than that of such noise; False: the normal equations are
     singular.
     """
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)
@@ -581,7 +546,7 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     for k in range(4):
         quad[k, 0], quad[k, 1] = (start[k, 0] - u0) / side, (start[k, 1] - v0) / side
     p, h, g = np.zeros(PARAMETERS), np.empty(9), np.empty(9)
-    if not _square_to_quad(quad, g) or not _inverse(g, h):
+    if not square_to_quad(quad, g) or not inverse_of(g, h):
         return False
     grey, us, vs = np.empty(2 * MOST_PIXELS), np.empty(2 * MOST_PIXELS), np.empty(2 * MOST_PIXELS)
     few = _sample(image, h, g, u0, v0, side, n, FEW_PIXELS, grey, us, vs)
@@ -595,7 +560,7 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
         return False
     huber = max(HUBER * SIGMA_OF_MEAN * totals[3] / few, 1.0)
     h[:8] = p[:8]
-    if not _inverse(h, g):
+    if not inverse_of(h, g):
         return False
     m = _sample(image, h, g, u0, v0, side, n, MOST_PIXELS, grey, us, vs)
     if m < 4 * PARAMETERS or not _refine(grey[:m], us[:m], vs[:m], cells, p, side, huber, A, totals):
@@ -613,7 +578,7 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     B = np.empty((PARAMETERS, PARAMETERS))
     _clustered(grey[:m], us[:m], vs[:m], cells, p, huber, B)
     h[:8] = p[:8]
-    if not _inverse(h, g) or not _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
+    if not inverse_of(h, g) or not _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
         return False
     shift = 0.0
     for k in range(4):

@@ -20,7 +20,7 @@ WRONG_PX = 3.0
 """A chessboard of which a corner is farther than this from where most detectors have it is a false one."""
 CORNERS, APART_PX = 150, 12
 CLOSE_PX, FALSE_PX = 1.0, 1.5
-"""A corner of the table or the wall is found where it is within the first of its place; beyond the second it is false."""
+"""A corner of table or wall is found within the first of its place; beyond the second it is false."""
 PATCH = 10
 """Half the side of a corner's patch and of OpenCV's window [px]."""
 
@@ -51,47 +51,47 @@ def board_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
     boards that all detectors found enter it."""
     images = [read(path) for path in paths]
     timed = {name: over(images, find, repetitions) for name, find in METHODS.items()}
-    found = {name: each for name, (each, _) in timed.items()}
-    middles = [
-        np.median(
-            [_ordered(each[k]) for each in found.values() if each[k] is not None] or [np.zeros((54, 2))],
-            axis=0,
-        )
-        for k in range(len(images))
-    ]
-    good = {
-        name: [
-            board is not None and float(np.abs(_ordered(board) - middles[k]).max()) < WRONG_PX
-            for k, board in enumerate(each)
-        ]
-        for name, each in found.items()
-    }
+    found = {name: [_ordered(board) for board in each] for name, (each, _) in timed.items()}
+    good: dict[str, list[bool]] = {name: [] for name in METHODS}
+    for k in range(len(images)):
+        boards = [each[k] for each in found.values() if each[k] is not None]
+        for name, each in found.items():
+            board = each[k]
+            near = board is not None and np.abs(board - np.median(boards, axis=0)).max() < WRONG_PX
+            good[name].append(bool(near))
     common = np.all(list(good.values()), axis=0)
     shown = int(np.any(list(good.values()), axis=0).sum())
     rows = []
     for name, each in found.items():
         false = sum(board is not None for board in each) - sum(good[name])
-        boards = [(path.stem[:-2], _ordered(each[k])) for k, path in enumerate(paths) if common[k]]
+        views = [(path.stem[:-2], each[k]) for k, path in enumerate(paths) if common[k]]
         rows.append(
             Row("chessboards 9x6", len(images), name, shown, sum(good[name]), false,
-                calibrated_rms(boards, images[0].shape), "camera calibrated with them", timed[name][1])
+                calibrated_rms(views, images[0].shape), "camera calibrated with them", timed[name][1])
         )  # fmt: skip
     return rows
 
 
-def _ordered(board: Board) -> FloatArray:
-    """The board's corners (54, 2), from the end that is further left."""
-    assert board is not None
-    return board if board[0, 0] <= board[-1, 0] else board[::-1]
+def _ordered(board: Board) -> Board:
+    """The board's corners (54, 2), from the end that is further left, or higher where it stands upright."""
+    if board is None:
+        return None
+    along = board[-1] - board[0]
+    first = along[0] if abs(along[0]) > abs(along[1]) else along[1]
+    return board if first >= 0.0 else board[::-1]
 
 
-def calibrated_rms(boards: Sequence[tuple[str, FloatArray]], shape: tuple[int, ...]) -> float:
+def calibrated_rms(boards: Sequence[tuple[str, Board]], shape: tuple[int, ...]) -> float:
     """Rms [px], an axis, that ``cv2.calibrateCamera`` leaves of ``boards``, each of a camera."""
     layout = np.zeros((COLUMNS * ROWS, 3), np.float32)
     layout[:, :2] = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
     squares, count = 0.0, 0
     for camera in sorted({name for name, _ in boards}):
-        pixels = [corners.astype(np.float32)[:, None] for name, corners in boards if name == camera]
+        pixels = [
+            corners.astype(np.float32)[:, None]
+            for name, corners in boards
+            if name == camera and corners is not None
+        ]
         rms = cv2.calibrateCamera(
             [layout] * len(pixels), pixels, (shape[1], shape[0]), None, None, flags=cv2.CALIB_FIX_K3
         )[0]

@@ -114,4 +114,4 @@ def _errors(places: FloatArray, truth: FloatArray, name: str) -> FloatArray:
 def plate_rows(shown: Photographs, repetitions: int, seed: int) -> list[Row]:
     """All rows of dots."""
     paths = shown.others + shown.franka[::2]
-    return dot_rows(paths, repetitions, seed) if paths else []
+    return sorted(dot_rows(paths, repetitions, seed), key=lambda row: row.shown == 0) if paths else []

@@ -1,4 +1,4 @@
-"""``bench detectors``: what detectors find on photographs, how well and how fast, beside OpenCV's and pupil-apriltags."""
+"""``bench detectors``: what detectors find on photographs, how well, how fast, beside OpenCV's and pupil-apriltags."""
 
 from __future__ import annotations
 
