@@ -73,8 +73,8 @@ LIMIT_PX = 0.5
 """Of the error at a goal that counts as reached truly."""
 LIMIT_S, REST_S = 40.0, 1.0
 
-Look = tuple[FloatArray, FloatArray, FloatArray, int]
-"""Errors (n, 2) [px] of what was reported, their covariances (n, 2, 2), bias of none; and how many there are to see."""
+Look = tuple[FloatArray, FloatArray, int]
+"""Errors (n, 2) [px] of what was reported, their covariances (n, 2, 2), and how many markers face the camera."""
 Looks = Callable[[Lighting, int], Iterator[Look]]
 
 
@@ -101,13 +101,12 @@ def _context(folder: Path) -> DriverContext:
 
 def _seen(
     detector: Detector, image: ImageArray, k: int, ids: Any, truth: FloatArray, rng: np.random.Generator
-) -> Look:
-    """What ``detector`` reports of markers ``ids`` (n,) at ``truth`` (n, 2)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (n, 2) and covariances (n, 2, 2) of what ``detector`` reports of markers ``ids`` at ``truth`` (m, 2)."""
     stamp = 1_000_000_000 + round(k * PERIOD_S * 1e9)
     frame = Frame("left", k, stamp, stamp, image)
     found = detector.detect(frame, prior_of(frame, ids, truth, rng))
-    rows = np.searchsorted(ids, found.ids)
-    return found.pixels - truth[rows], found.covariances, found.pixels, len(ids)
+    return found.pixels - truth[np.searchsorted(ids, found.ids)], found.covariances
 
 
 def look_at_body(cell: SimulatedCell, detector: Detector, light: Lighting, seed: int) -> Iterator[Look]:
@@ -118,8 +117,8 @@ def look_at_body(cell: SimulatedCell, detector: Detector, light: Lighting, seed:
     for k in range(PICTURES):
         q = cell.base + rng.uniform(-0.1, 0.1, len(cell.base))
         image = renderer.render(q, rng, t_s=k * PERIOD_S)
-        shown = cell.visible(q, camera)
-        yield _seen(detector, image, k, cell.body.ids[shown], cell.truth_pixels(q)[camera.name][shown], rng)
+        errors = _seen(detector, image, k, cell.body.ids, cell.truth_pixels(q)[camera.name], rng)
+        yield *errors, int(cell.visible(q, camera).sum())
 
 
 def dots(light: Lighting, seed: int) -> Iterator[Look]:
@@ -147,7 +146,8 @@ def aruco(light: Lighting, seed: int) -> Iterator[Look]:
     detector = TagDetector(options, _context(Path(".")))
     for k in range(PICTURES):
         scene, truth = features_tags.scene(rng)
-        yield _seen(detector, exposed(scene, light, k * PERIOD_S, rng), k, np.arange(4 * count), truth, rng)
+        image = exposed(scene, light, k * PERIOD_S, rng)
+        yield *_seen(detector, image, k, np.arange(4 * count), truth, rng), len(truth)
 
 
 def corners(light: Lighting, seed: int) -> Iterator[Look]:
@@ -164,7 +164,7 @@ def corners(light: Lighting, seed: int) -> Iterator[Look]:
         start = places + off + rng.normal(0.0, PRIOR_PX, places.shape)
         found = patches.align(build_pyramid(image, 3), rows, shapes, start, 0)
         good = found.found & (found.correlations > 0.8)
-        yield (found.pixels - places - off)[good], found.covariances[good], found.pixels[good], len(places)
+        yield (found.pixels - places - off)[good], found.covariances[good], len(places)
 
 
 DETECTORS: dict[str, Looks] = {"dots": dots, "aruco": aruco, "corners": corners, "edges": edges}
@@ -173,7 +173,7 @@ DETECTORS: dict[str, Looks] = {"dots": dots, "aruco": aruco, "corners": corners,
 def detector_row(name: str, light_name: str, seed: int) -> dict[str, Any]:
     """One detector in one light: share found, bias, rms, chi-square a freedom, share beyond its 0.999 bound."""
     errors, squares, shown = [], [], 0
-    for error, covariance, _, count in DETECTORS[name](LIGHTS[light_name], seed):
+    for error, covariance, count in DETECTORS[name](LIGHTS[light_name], seed):
         shown += count
         errors.append(error)
         squares.append(np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], axis=1))
