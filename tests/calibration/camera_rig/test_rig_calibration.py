@@ -86,6 +86,7 @@ def test_the_stated_covariance_is_that_of_the_errors(known: bool, seeds: int) ->
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("known", [True, False], ids=["board", "unknown body"])
 def test_good_views_are_never_refused_and_their_covariance_holds(known: bool) -> None:
     count = 100

@@ -91,7 +91,7 @@ def test_a_clock_that_was_set_is_refused_until_it_is_known_again():
 def test_what_is_not_known_is_refused_with_the_reason():
     assert ServerClock(0.005).estimate.told == (False, "no picture has carried a stamp")
     _, clock = seen(2, seconds=3)
-    assert "5 are needed" in clock.estimate.reason
+    assert "5 s are needed" in clock.estimate.reason
     _, clock = seen(2, back=30e-3, seconds=20)
     assert clock.estimate.reason.endswith("the limit 5.00 ms")
     _, clock = seen(2, drift=2e-3, seconds=20)
