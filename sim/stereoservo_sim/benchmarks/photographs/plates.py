@@ -43,7 +43,8 @@ def drawn(
     light = np.maximum(light / light.max(), DARKEST)
     middle = np.array(SIZE) / 2 + rng.uniform(-120.0, 120.0, 2) * (1.0, 0.6)
     tilt = np.radians(rng.uniform(0.0, TILT_DEG))
-    H = scenes.look(tilt, *rng.uniform(0.0, 2.0 * np.pi, 2), rng.uniform(*DISTANCE), middle)
+    azimuth, roll = rng.uniform(0.0, 2.0 * np.pi, 2)
+    H = scenes.look(tilt, azimuth, roll, rng.uniform(*DISTANCE), middle)
     s = FACE.half_side
     corners = scenes.project(H, np.array([[-s, -s], [s, -s], [s, s], [-s, s]]))
     plate = np.zeros_like(image)
@@ -62,7 +63,7 @@ def dot_rows(paths: Sequence[Path], repetitions: int, seed: int) -> list[Row]:
     photographs = [read(path) for path in paths]
     plain = [cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA).astype(np.uint8) for image in photographs]
     detector = DotDetector({}, context())
-    blobs = cv2.SimpleBlobDetector_Params()
+    blobs = cv2.SimpleBlobDetector.Params()
     blobs.filterByColor, blobs.blobColor, blobs.minArea, blobs.maxArea = True, 255, 20.0, 3000.0
     finder = cv2.SimpleBlobDetector.create(blobs)
 

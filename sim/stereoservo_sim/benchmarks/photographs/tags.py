@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
@@ -80,9 +81,8 @@ def _opencv(name: DictionaryName, refinement: int) -> Finder:
 
 
 def _pupil(name: DictionaryName) -> Finder:
-    from pupil_apriltags import Detector  # only where it is installed
-
-    detector = Detector(f"tag{name}", nthreads=1, quad_decimate=1.0)
+    module = import_module("pupil_apriltags")  # only where it is installed
+    detector = module.Detector(f"tag{name}", nthreads=1, quad_decimate=1.0)
 
     def find(image: ImageArray) -> list[Find]:
         return [
