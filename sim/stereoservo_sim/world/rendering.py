@@ -18,12 +18,12 @@ import numpy.typing as npt
 
 from stereoservo.geometry.distortion import distort
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo_sim.world.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
+from stereoservo_sim.world.scenery.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
 from stereoservo_sim.world.body import MarkerBody, SolidBody
 from stereoservo_sim.world.camera_rig import PinholeCamera, project
 from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
-from stereoservo_sim.world.lighting import Lighting
+from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.robots import shape_segments
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
@@ -176,7 +176,7 @@ class Renderer:
 
 def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> Backdrop:
     if background == "pybullet":
-        from stereoservo_sim.world.backdrop import (
+        from stereoservo_sim.world.scenery.backdrop import (
             PybulletBackdrop,  # the engine only where it is asked for
         )
 

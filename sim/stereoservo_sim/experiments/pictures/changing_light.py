@@ -41,7 +41,7 @@ from stereoservo_sim.summaries import wilson
 from stereoservo_sim.world.body import part_text
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.lighting import Lighting
+from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell, solid_cell
 
