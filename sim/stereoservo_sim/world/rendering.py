@@ -18,13 +18,13 @@ import numpy.typing as npt
 
 from stereoservo.geometry.distortion import distort
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo_sim.world.scenery.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
 from stereoservo_sim.world.body import MarkerBody, SolidBody
 from stereoservo_sim.world.camera_rig import PinholeCamera, project
 from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
-from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.robots import shape_segments
+from stereoservo_sim.world.scenery.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
+from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 DOT_LEVEL = 225.0

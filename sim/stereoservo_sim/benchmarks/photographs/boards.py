@@ -51,10 +51,11 @@ def board_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
     boards that all detectors found enter it."""
     images = [read(path) for path in paths]
     timed = {name: over(images, find, repetitions) for name, find in METHODS.items()}
-    found = {name: [_ordered(board) for board in each] for name, (each, _) in timed.items()}
+    by_picture = [_in_order({name: each[k] for name, (each, _) in timed.items()}) for k in range(len(images))]
+    found = {name: [boards[name] for boards in by_picture] for name in METHODS}
     good: dict[str, list[bool]] = {name: [] for name in METHODS}
     for k in range(len(images)):
-        boards = [each[k] for each in found.values() if each[k] is not None]
+        boards = [board for board in by_picture[k].values() if board is not None]
         for name, each in found.items():
             board = each[k]
             near = board is not None and np.abs(board - np.median(boards, axis=0)).max() < WRONG_PX
@@ -72,13 +73,15 @@ def board_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
     return rows
 
 
-def _ordered(board: Board) -> Board:
-    """The board's corners (54, 2), from the end that is further left, or higher where it stands upright."""
-    if board is None:
-        return None
-    along = board[-1] - board[0]
-    first = along[0] if abs(along[0]) > abs(along[1]) else along[1]
-    return board if first >= 0.0 else board[::-1]
+def _in_order(boards: dict[str, Board]) -> dict[str, Board]:
+    """Boards (54, 2) of one picture counted from the same end: that of the first that was found."""
+    first = next((board for board in boards.values() if board is not None), None)
+    return {
+        name: board if board is None or first is None else min(
+            (board, board[::-1]), key=lambda one: float(np.abs(one - first).sum())
+        )
+        for name, board in boards.items()
+    }  # fmt: skip
 
 
 def calibrated_rms(boards: Sequence[tuple[str, Board]], shape: tuple[int, ...]) -> float:

@@ -38,11 +38,12 @@ from stereoservo_sim.experiments.experiment import cell_text, draw_sorted, show_
 from stereoservo_sim.experiments.pictures.textured import texture
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.summaries import wilson
-from stereoservo_sim.world.body import part_text
+from stereoservo_sim.world.body import SolidBody, part_text
+from stereoservo_sim.world.camera_rig import PinholeCamera
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
+from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell, solid_cell
 
 STEPS = ((1.0, 0.45), (2.5, 1.1), (4.0, 0.6), (6.0, 1.0), (8.0, 0.5), (11.0, 1.0), (14.0, 0.6), (17.0, 1.1))
@@ -118,7 +119,19 @@ def look_at_body(cell: SimulatedCell, detector: Detector, light: Lighting, seed:
         q = cell.base + rng.uniform(-0.1, 0.1, len(cell.base))
         image = renderer.render(q, rng, t_s=k * PERIOD_S)
         errors = _seen(detector, image, k, cell.body.ids, cell.truth_pixels(q)[camera.name], rng)
-        yield *errors, int(cell.visible(q, camera).sum())
+        yield *errors, facing(cell, q, camera)
+
+
+def facing(cell: SimulatedCell, q: FloatArray, camera: PinholeCamera) -> int:
+    """How many markers, of a solid vertices of faces that look at the camera, there are to see with the arm at ``q``
+    (n,)."""
+    body, pose, centre = cell.body, cell.body_pose(q), cell.in_world(camera, q).centre
+    if not isinstance(body, SolidBody):
+        return int(cell.visible(q, camera).sum())
+    placed = body.vertices @ pose[:3, :3].T + pose[:3, 3]
+    normals = body.face_normals @ pose[:3, :3].T
+    faces = zip(body.outlines, normals, strict=True)
+    return len({i for face, normal in faces if normal @ (centre - placed[face[0]]) > 0.0 for i in face})
 
 
 def dots(light: Lighting, seed: int) -> Iterator[Look]:
