@@ -17,6 +17,7 @@ from stereoservo.ports.devices import CameraDescription, DriverContext, DriverEr
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm, cell_of_context
 from stereoservo_drivers.simulated_camera import ArmByRow, CameraOptions, SimulatedCamera
+from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.velocity_drives import Plant
 
 if TYPE_CHECKING:
@@ -52,11 +53,13 @@ class PybulletJointDriver(SimulatedArm):
 
 
 class PybulletCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of a rendering camera. ``noise``: sigma [grey levels]; ``blur``: sigma of the lens [px]."""
+    """Options of a rendering camera. ``noise``: sigma [grey levels]; ``blur``: sigma of the lens [px]; ``lighting``:
+    how the scene's light and the exposure change."""
 
     noise: NonNegative = 2.0
     blur: NonNegative = 0.7
     background: Literal["arm", "plain", "pybullet"] = "arm"
+    lighting: Lighting | None = None
 
 
 class PybulletCameraDriver(SimulatedCamera):
@@ -85,9 +88,7 @@ class PybulletCameraDriver(SimulatedCamera):
         from stereoservo_sim.world.rendering import Renderer, RenderSettings
 
         options = self._render
-        settings = RenderSettings(
-            blur_px=options.blur, noise_grey=options.noise, background=options.background
-        )
+        settings = RenderSettings(options.blur, options.noise, options.background, options.lighting)
         try:
             return Renderer(self.cell, self.camera, settings)
         except Exception as error:
@@ -113,6 +114,11 @@ class PybulletCameraDriver(SimulatedCamera):
             t_shutter_ns=t_shutter_ns,
             t_received_ns=t_received_ns,
             image=self._renderer.render(
-                arm.middle, rng, self.workpiece_pose(), focus=self.focus, at_row=arm.at if arm.moves else None
+                arm.middle,
+                rng,
+                self.workpiece_pose(),
+                focus=self.focus,
+                at_row=arm.at if arm.moves else None,
+                t_s=(t_shutter_ns - self._activated_ns) * 1e-9,
             ),
         )

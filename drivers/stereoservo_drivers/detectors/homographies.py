@@ -383,3 +383,44 @@ def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
         used[worst] = False
         count -= 1
     return False
+
+
+@kernel
+def inverse_of(M, out):
+    """Inverse of ``M`` (9,), a 3x3 matrix row by row, with last entry 1, into ``out`` (9,); False: there is none."""
+    out[0] = M[4] * M[8] - M[5] * M[7]
+    out[1] = M[2] * M[7] - M[1] * M[8]
+    out[2] = M[1] * M[5] - M[2] * M[4]
+    out[3] = M[5] * M[6] - M[3] * M[8]
+    out[4] = M[0] * M[8] - M[2] * M[6]
+    out[5] = M[2] * M[3] - M[0] * M[5]
+    out[6] = M[3] * M[7] - M[4] * M[6]
+    out[7] = M[1] * M[6] - M[0] * M[7]
+    last = M[0] * M[4] - M[1] * M[3]
+    if not abs(last) > 1e-12:
+        return False
+    for k in range(8):
+        out[k] /= last
+    out[8] = 1.0
+    return True
+
+
+@kernel
+def square_to_quad(quad, out):
+    """Homography (9,) from the unit square to ``quad`` (4, 2) with its corners in order, last entry 1; False: none."""
+    d1u, d1v = quad[1, 0] - quad[2, 0], quad[1, 1] - quad[2, 1]
+    d2u, d2v = quad[3, 0] - quad[2, 0], quad[3, 1] - quad[2, 1]
+    su = quad[0, 0] - quad[1, 0] + quad[2, 0] - quad[3, 0]
+    sv = quad[0, 1] - quad[1, 1] + quad[2, 1] - quad[3, 1]
+    determinant = d1u * d2v - d2u * d1v
+    if not abs(determinant) > 1e-12:
+        return False
+    g, h = (su * d2v - d2u * sv) / determinant, (d1u * sv - su * d1v) / determinant
+    out[0] = quad[1, 0] - quad[0, 0] + g * quad[1, 0]
+    out[1] = quad[3, 0] - quad[0, 0] + h * quad[3, 0]
+    out[2] = quad[0, 0]
+    out[3] = quad[1, 1] - quad[0, 1] + g * quad[1, 1]
+    out[4] = quad[3, 1] - quad[0, 1] + h * quad[3, 1]
+    out[5] = quad[0, 1]
+    out[6], out[7], out[8] = g, h, 1.0
+    return True

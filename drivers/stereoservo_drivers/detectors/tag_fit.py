@@ -1,8 +1,8 @@
 """Compiled least-squares fit of a tag's printed pattern to grey values: first to few pixels, from wherever the start
 is, then to many.
 
-Parameters (13): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
-slopes, black as a part of white: light that falls off does so on both.
+Parameters (16): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
+slopes, black as a part of white, the light's three bends: light that falls off does so on both.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import numpy as np
 
 from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo.numerics.linear import cholesky_solve, factor_solve
+from stereoservo_drivers.detectors.homographies import inverse_of, square_to_quad
 
-PARAMETERS = 13
+PARAMETERS = 16
 QUIET_CELLS = 0.5
 """Fitted part of the white margin [cells]; a printed tag has one cell at least."""
 FEW_PIXELS, MOST_PIXELS = 250, 1500
@@ -39,6 +40,9 @@ MAX_SHIFT_CELLS = 1.0
 """A fit that correlates less with the image, or moved a corner further from its start, is not believed."""
 MAX_CELL_ERROR = 0.45
 """A cell whose grey is off by so much of the contrast is not what the code says: it was read wrong, or is covered."""
+SATURATED = 254.5
+"""Grey level from which on a pixel may have been brighter than it tells."""
+TOTALS = 8
 BLOCK = 128
 """Pixels whose derivatives are held at a time."""
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -148,17 +152,18 @@ def _darken(cells, work, size, across, down):
 
 @reassociating_kernel
 def _differentiate(grey, us, vs, p, n, work, J):
-    """Residuals of the pixels of `_darken` into the last row of ``J`` (14, ...), derivatives of the model into the
+    """Residuals of the pixels of `_darken` into the last row of ``J`` (17, ...), derivatives of the model into the
     others; the model into the first row of ``work``.
     """
     for k in range(grey.size):
         u, v, inverse = us[k], vs[k], work[0, k]
         x, y, dark = work[1, k] / n, work[2, k] / n, work[7, k]
-        lit = p[9] + p[10] * (x - 0.5) + p[11] * (y - 0.5)
+        s, t = x - 0.5, y - 0.5
+        lit = p[9] + (p[10] + p[13] * s + p[14] * t) * s + (p[11] + p[15] * t) * t
         fall = -lit * (1.0 - p[12])
         shade = 1.0 - dark * (1.0 - p[12])
-        along_x = (p[10] * shade + fall * work[8, k] * n) * inverse
-        along_y = (p[11] * shade + fall * work[9, k] * n) * inverse
+        along_x = ((p[10] + 2.0 * p[13] * s + p[14] * t) * shade + fall * work[8, k] * n) * inverse
+        along_y = ((p[11] + 2.0 * p[15] * t + p[14] * s) * shade + fall * work[9, k] * n) * inverse
         along = -(along_x * x + along_y * y)
         J[0, k] = along_x * u
         J[1, k] = along_x * v
@@ -170,10 +175,13 @@ def _differentiate(grey, us, vs, p, n, work, J):
         J[7, k] = along * v
         J[8, k] = fall * work[10, k]
         J[9, k] = shade
-        J[10, k] = shade * (x - 0.5)
-        J[11, k] = shade * (y - 0.5)
+        J[10, k] = shade * s
+        J[11, k] = shade * t
         J[12, k] = lit * dark
-        J[13, k] = grey[k] - lit * shade
+        J[13, k] = shade * s * s
+        J[14, k] = shade * s * t
+        J[15, k] = shade * t * t
+        J[PARAMETERS, k] = grey[k] - lit * shade
         work[0, k] = lit * shade
 
 
@@ -188,13 +196,13 @@ def _shown(p, us, vs):
 
 @reassociating_kernel
 def accumulate(grey, us, vs, cells, p, huber, A, totals):
-    """Normal equations of the fit at parameters ``p`` (13,): the lower triangle of ``A`` (14, 14), whose last row is
+    """Normal equations of the fit at parameters ``p`` (16,): the lower triangle of ``A`` (17, 17), whose last row is
     the right side and the sum of squares.
 
-    ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly. ``totals`` (7,)
-    gets Huber's cost, the sums of squares of the clipped residuals, of pixels that are not clipped, of |residual|, and
-    of model, model squared, model times grey (the last three for the correlation). False where the homography does
-    not show the tag.
+    ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly; a pixel at the
+    sensor's limit that the model has brighter tells nothing. ``totals`` (8,) gets Huber's cost, the sums of squares of
+    the clipped residuals, of pixels that are not clipped, of |residual|, of model, model squared, model times grey (the
+    three for the correlation), and of pixels that tell nothing. False where the homography does not show the tag.
     """
     n = cells.shape[0]
     A[:] = 0.0
@@ -210,7 +218,13 @@ def accumulate(grey, us, vs, cells, p, huber, A, totals):
         _darken(cells, work, size, across, down)
         _differentiate(grey[first : first + size], u, v, p, n, work, J)
         for k in range(size):
-            off, value = abs(J[PARAMETERS, k]), work[0, k]
+            value = work[0, k]
+            if grey[first + k] >= SATURATED and value > grey[first + k]:
+                value = grey[first + k]
+                J[:, k] = 0.0
+                totals[2] -= 1.0  # counted below as any other
+                totals[7] += 1.0
+            off = abs(J[PARAMETERS, k])
             totals[3] += off
             totals[4] += value
             totals[5] += value * value
@@ -254,7 +268,8 @@ def cell_errors(grey, us, vs, cells, p, out):
         for j in range(j_first, j_last):
             for i in range(i_first, i_last):
                 dark += cells[j, i] * wy[j - j_first] * wx[i - i_first]
-        lit = p[9] + p[10] * (work[1, k] / n - 0.5) + p[11] * (work[2, k] / n - 0.5)
+        s, t = work[1, k] / n - 0.5, work[2, k] / n - 0.5
+        lit = p[9] + (p[10] + p[13] * s + p[14] * t) * s + (p[11] + p[15] * t) * t
         residual = grey[k] - lit * (1.0 - dark * (1.0 - p[12]))
         for j in range(j_first, j_last):
             for i in range(i_first, i_last):
@@ -265,47 +280,6 @@ def cell_errors(grey, us, vs, cells, p, out):
         for i in range(n):
             if squares[j, i] > 0.0:
                 out[j, i] = abs(out[j, i]) / squares[j, i]
-
-
-@kernel
-def _inverse(M, out):
-    """Inverse of ``M`` (9,), a 3x3 matrix row by row, with last entry 1, into ``out`` (9,); False: there is none."""
-    out[0] = M[4] * M[8] - M[5] * M[7]
-    out[1] = M[2] * M[7] - M[1] * M[8]
-    out[2] = M[1] * M[5] - M[2] * M[4]
-    out[3] = M[5] * M[6] - M[3] * M[8]
-    out[4] = M[0] * M[8] - M[2] * M[6]
-    out[5] = M[2] * M[3] - M[0] * M[5]
-    out[6] = M[3] * M[7] - M[4] * M[6]
-    out[7] = M[1] * M[6] - M[0] * M[7]
-    last = M[0] * M[4] - M[1] * M[3]
-    if not abs(last) > 1e-12:
-        return False
-    for k in range(8):
-        out[k] /= last
-    out[8] = 1.0
-    return True
-
-
-@kernel
-def _square_to_quad(quad, out):
-    """Homography (9,) from the unit square to ``quad`` (4, 2) with its corners in order, last entry 1; False: none."""
-    d1u, d1v = quad[1, 0] - quad[2, 0], quad[1, 1] - quad[2, 1]
-    d2u, d2v = quad[3, 0] - quad[2, 0], quad[3, 1] - quad[2, 1]
-    su = quad[0, 0] - quad[1, 0] + quad[2, 0] - quad[3, 0]
-    sv = quad[0, 1] - quad[1, 1] + quad[2, 1] - quad[3, 1]
-    determinant = d1u * d2v - d2u * d1v
-    if not abs(determinant) > 1e-12:
-        return False
-    g, h = (su * d2v - d2u * sv) / determinant, (d1u * sv - su * d1v) / determinant
-    out[0] = quad[1, 0] - quad[0, 0] + g * quad[1, 0]
-    out[1] = quad[3, 0] - quad[0, 0] + h * quad[3, 0]
-    out[2] = quad[0, 0]
-    out[3] = quad[1, 1] - quad[0, 1] + g * quad[1, 1]
-    out[4] = quad[3, 1] - quad[0, 1] + h * quad[3, 1]
-    out[5] = quad[0, 1]
-    out[6], out[7], out[8] = g, h, 1.0
-    return True
 
 
 @kernel
@@ -366,7 +340,7 @@ def _percentiles(grey):
 
 @kernel
 def _step(A, damping, step):
-    """Solve the normal equations of `accumulate` with ``damping`` times their diagonal, into ``step`` (13,); False:
+    """Solve the normal equations of `accumulate` with ``damping`` times their diagonal, into ``step`` (16,); False:
     singular.
     """
     N, b, scale = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -454,17 +428,51 @@ def _refine(grey, us, vs, cells, p, side, huber, A, totals):
 
 
 @kernel
-def _corners(h, g, A, variance, u0, v0, side, corners, covariances):
-    """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance; False:
-    the normal equations are singular.
+def _clustered(grey, us, vs, cells, p, huber, B):
+    """Covariance ``B`` (16, 16) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
+    shadow's edge for one, leaves residuals that are alike within a cell, and do not average out as noise does.
+    """
+    n = cells.shape[0]
+    across, down = np.zeros((3, n)), np.zeros((3, n))
+    J, work = np.empty((PARAMETERS + 1, BLOCK)), np.empty((11, BLOCK))
+    sums = np.zeros((n + 2, n + 2, PARAMETERS))
+    for first in range(0, grey.size, BLOCK):
+        size = min(BLOCK, grey.size - first)
+        _place(us[first : first + size], vs[first : first + size], p, n, work)
+        _darken(cells, work, size, across, down)
+        i, j = np.floor(work[1, :size]), np.floor(work[2, :size])
+        _differentiate(
+            grey[first : first + size], us[first : first + size], vs[first : first + size], p, n, work, J
+        )
+        for k in range(size):
+            off = J[PARAMETERS, k]
+            if grey[first + k] >= SATURATED and off < 0.0:
+                continue
+            off = min(max(off, -huber), huber)
+            row = sums[(min(max(int(j[k]), -1), n) + 1) // 2, (min(max(int(i[k]), -1), n) + 1) // 2]
+            for a in range(PARAMETERS):
+                row[a] += J[a, k] * off
+    B[:] = 0.0
+    for j in range(n + 2):
+        for i in range(n + 2):
+            for a in range(PARAMETERS):
+                for c in range(PARAMETERS):
+                    B[a, c] += sums[j, i, a] * sums[j, i, c]
+
+
+@kernel
+def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
+    """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
+    where the gradient's covariance ``B`` (16, 16) is more than that of such noise; False: the normal equations are
+    singular.
     """
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)
-    N, C = np.empty((PARAMETERS, PARAMETERS)), np.empty((8, 8))
+    N, C = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
     for a in range(PARAMETERS):
         scale[a] = math.sqrt(A[a, a] + 1e-9)
         for c in range(a + 1):
             N[a, c] = A[a, c] / (scale[a] * scale[c])
-    for a in range(8):
+    for a in range(PARAMETERS):
         e[:] = 0.0
         e[a] = 1.0
         if a == 0:
@@ -472,8 +480,18 @@ def _corners(h, g, A, variance, u0, v0, side, corners, covariances):
                 return False
         else:
             factor_solve(N, e, column)
+        for c in range(PARAMETERS):
+            C[c, a] = column[c] / (scale[a] * scale[c])
+    M, half = np.zeros((8, 8)), np.zeros((8, PARAMETERS))
+    for a in range(8):
+        for c in range(PARAMETERS):
+            for k in range(PARAMETERS):
+                half[a, c] += C[a, k] * B[k, c]
+    for a in range(8):
         for c in range(8):
-            C[c, a] = column[c] * variance / (scale[a] * scale[c])
+            for k in range(PARAMETERS):
+                M[a, c] += half[a, k] * C[k, c]
+    seen = 0.0
     back = np.zeros((2, 8))
     for k in range(4):
         x, y = SQUARE[k, 0], SQUARE[k, 1]
@@ -494,11 +512,15 @@ def _corners(h, g, A, variance, u0, v0, side, corners, covariances):
                 back[1, 6 + i] = -(a * y - c * x) * local / determinant
         for i in range(2):
             for j in range(2):
-                total = 0.0
+                total, real = 0.0, 0.0
                 for s in range(8):
                     for t in range(8):
                         total += back[i, s] * C[s, t] * back[j, t]
-                covariances[k, i, j] = total * side * side
+                        real += back[i, s] * M[s, t] * back[j, t]
+                covariances[k, i, j] = total * variance * side * side
+                if i == j:
+                    seen += 0.125 * real / max(total * variance, 1e-30)
+    covariances *= max(seen, 1.0)
     return True
 
 
@@ -524,7 +546,7 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     for k in range(4):
         quad[k, 0], quad[k, 1] = (start[k, 0] - u0) / side, (start[k, 1] - v0) / side
     p, h, g = np.zeros(PARAMETERS), np.empty(9), np.empty(9)
-    if not _square_to_quad(quad, g) or not _inverse(g, h):
+    if not square_to_quad(quad, g) or not inverse_of(g, h):
         return False
     grey, us, vs = np.empty(2 * MOST_PIXELS), np.empty(2 * MOST_PIXELS), np.empty(2 * MOST_PIXELS)
     few = _sample(image, h, g, u0, v0, side, n, FEW_PIXELS, grey, us, vs)
@@ -533,12 +555,12 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     black, white = _percentiles(grey[:few])
     p[:8] = h[:8]
     p[8], p[9], p[12] = math.log(blur_px / side), white, black / max(white, 1.0)
-    A, totals = np.zeros((PARAMETERS + 1, PARAMETERS + 1)), np.zeros(7)
+    A, totals = np.zeros((PARAMETERS + 1, PARAMETERS + 1)), np.zeros(TOTALS)
     if not _approach(grey[:few], us[:few], vs[:few], cells, p, side, A, totals):
         return False
     huber = max(HUBER * SIGMA_OF_MEAN * totals[3] / few, 1.0)
     h[:8] = p[:8]
-    if not _inverse(h, g):
+    if not inverse_of(h, g):
         return False
     m = _sample(image, h, g, u0, v0, side, n, MOST_PIXELS, grey, us, vs)
     if m < 4 * PARAMETERS or not _refine(grey[:m], us[:m], vs[:m], cells, p, side, huber, A, totals):
@@ -551,9 +573,12 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     if not errors.max() <= MAX_CELL_ERROR:
         return False
     # Huber's estimator: E[psi²] / E[psi']², over the matrix of all pixels, whose sum A nearly is
-    variance = max(totals[1] / (m - PARAMETERS) * (m / totals[2]), QUANTISATION)
+    told_by = m - totals[7]
+    variance = max(totals[1] / (told_by - PARAMETERS) * (told_by / totals[2]), QUANTISATION)
+    B = np.empty((PARAMETERS, PARAMETERS))
+    _clustered(grey[:m], us[:m], vs[:m], cells, p, huber, B)
     h[:8] = p[:8]
-    if not _inverse(h, g) or not _corners(h, g, A, variance, u0, v0, side, corners, covariances):
+    if not inverse_of(h, g) or not _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
         return False
     shift = 0.0
     for k in range(4):

@@ -17,6 +17,7 @@ from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.options import DRIVER, decode_video_options
 from stereoservo_drivers.video.playback import Playback
 from stereoservo_drivers.video.reader import Reader, live_source
+from stereoservo_drivers.video.server_clock import ServerClock
 from stereoservo_drivers.video.sources import Settings
 from stereoservo_drivers.video.stream_monitor import Watch
 
@@ -64,6 +65,8 @@ class VideoCameraDriver:
         self._context = context
         self._life = DriverLifecycle(f"camera driver {DRIVER!r} ({context.camera})")
         self._watch = Watch(self._options.rate_hz)
+        limit_s = self._options.server_clock_s
+        self._server_clock = None if limit_s is None else ServerClock(limit_s)
         self._feed: Feed | None = None
         self._over: DriverError | None = None
         self._openings = 0
@@ -121,7 +124,7 @@ class VideoCameraDriver:
         place, options, context = self._place, self._options, self._context
         if not place.live:
             return Playback(place, options, context.camera, self._watch, context.clock)
-        source = live_source(place, options, context.clock)
+        source = live_source(place, options, context.clock, self._server_clock)
         return Reader(source, place, options, context.camera, self._watch)
 
     def activate(self) -> None:
@@ -165,6 +168,7 @@ class VideoCameraDriver:
             frozen=watch.frozen,
             reconnects=max(0, self._openings - 1),
             settings=dict(self._feed.settings if self._feed is not None else self._settings),
+            server_clock=None if self._server_clock is None else self._server_clock.estimate.told,
         )
 
 

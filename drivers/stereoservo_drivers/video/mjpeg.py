@@ -24,6 +24,7 @@ from stereoservo_drivers.video.chunked import ChunkedDecoder
 from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, MultipartPart, number_in
 from stereoservo_drivers.video.options import Place, VideoOptions, place_of
 from stereoservo_drivers.video.pictures import check_size, jpeg_flag, jpeg_size
+from stereoservo_drivers.video.server_clock import ServerClock, seconds_in
 from stereoservo_drivers.video.sources import Settings, SourcePicture
 
 CHUNK = 1 << 18
@@ -35,11 +36,14 @@ REDIRECTIONS = 3
 class MjpegSource:
     """One MJPEG stream over HTTP or HTTPS (:class:`~stereoservo_drivers.video.sources.LiveSource`)."""
 
-    def __init__(self, place: Place, options: VideoOptions, clock: Clock) -> None:
+    def __init__(
+        self, place: Place, options: VideoOptions, clock: Clock, server_clock: ServerClock | None = None
+    ) -> None:
         self.settings: Settings = {}
         self._place = place
         self._options = options
         self._clock = clock
+        self._server_clock = server_clock
         self._socket: socket.socket | None = None
         self._response: http.client.HTTPResponse | None = None
         self._parser: MultipartParser | None = None
@@ -85,7 +89,10 @@ class MjpegSource:
         if url.username:
             headers["Authorization"] = authorization(url, challenge)
         try:
+            begun_ns = self._clock.now_ns()
             connection.connect()
+            if self._server_clock is not None and not secure:  # TCP's handshake: there and back once
+                self._server_clock.round_trip(self._clock.now_ns() - begun_ns)
             self._socket = connection.sock
             if self._interrupted:
                 raise self._place.error("closed", "the driver was closed while it connected", retry=True)
@@ -203,7 +210,11 @@ class MjpegSource:
             return None
         self._spoiled = 0
         number = number_in(part.headers.get("x-sequence"))
-        return SourcePicture(image, part.t_ns, number, skipped)
+        sent_ns = seconds_in(part.headers.get("x-timestamp"))
+        shutter_ns = None
+        if self._server_clock is not None and sent_ns is not None:
+            shutter_ns = self._server_clock.stamp(sent_ns, part.t_ns)
+        return SourcePicture(image, part.t_ns, number, skipped, shutter_ns)
 
     def interrupt(self) -> None:
         """Wake the thread that waits in :meth:`open` or :meth:`read`."""

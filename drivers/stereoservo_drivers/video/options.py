@@ -55,6 +55,10 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     camera is silent. ``frozen_frames``: so many pictures without any change are a frozen camera, each of which is
     withheld, from the first on; 0 looks for none (default: 10, and 0 for files).
 
+    Of an MJPEG stream: ``server_clock_s``: the pictures' own stamps (header ``X-Timestamp``, seconds of the server's
+    clock) count while that clock is known to this standard deviation [s]; else, and where it is left out, the time of
+    reception less ``latency_s`` does.
+
     Of files and pictures: ``start``, number of the first picture used; ``loop``, begin again at the end;
     ``pace``: ``recorded``, each at its time since delivery began (of this camera: several are not aligned), or
     ``every``, the next one at each poll, with the recording's own stamps.
@@ -76,6 +80,7 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     flip: Flip = "none"
     open_timeout_s: Seconds = 5.0
     read_timeout_s: Seconds = 1.0
+    server_clock_s: Annotated[float, Meta(gt=0, le=1)] | None = None
     frozen_frames: Annotated[int, Meta(ge=0, le=100000)] | None = None
     start: Annotated[int, Meta(ge=0)] = 0
     loop: bool = False
@@ -118,6 +123,8 @@ def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[Vi
         for name in ("focus", "white_balance", "power_line_hz", "rate_priority"):
             if getattr(decoded, name) is not None:
                 raise _wrong(name, getattr(decoded, name), f"is for devices; source is {place.shown}")
+    if place.kind != "http" and decoded.server_clock_s is not None:
+        raise _wrong("server_clock_s", decoded.server_clock_s, f"is for http://; source is {place.shown}")
     if place.kind == "genicam" and (decoded.channel != "gray" or decoded.pixel_format):
         name = "pixel_format" if decoded.pixel_format else "channel"
         raise _wrong(name, getattr(decoded, name), "pictures of genicam:// are read as Mono8: leave it out")

@@ -12,6 +12,7 @@ from stereoservo_drivers.video.genicam import GenicamSource
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import Place, VideoOptions, frozen_frames
 from stereoservo_drivers.video.pictures import check_size, one_channel
+from stereoservo_drivers.video.server_clock import ServerClock
 from stereoservo_drivers.video.sources import CaptureSource, LiveSource, Settings, SourcePicture
 from stereoservo_drivers.video.stream_monitor import Watch
 
@@ -21,10 +22,15 @@ daemon, and nothing that it still receives gets out.
 """
 
 
-def live_source(place: Place, options: VideoOptions, clock: Clock) -> LiveSource:
-    """A source for a ``place`` that delivers images by itself; not connected yet."""
+def live_source(
+    place: Place, options: VideoOptions, clock: Clock, server_clock: ServerClock | None = None
+) -> LiveSource:
+    """A source for a ``place`` that delivers images by itself; not connected yet.
+
+    ``server_clock``: what is known of the clock of an MJPEG stream's server; None: its stamps are not used.
+    """
     if place.kind == "http":
-        return MjpegSource(place, options, clock)
+        return MjpegSource(place, options, clock, server_clock)
     if place.kind == "genicam":
         return GenicamSource(place, options, clock)
     return CaptureSource(place, options, clock)
@@ -139,7 +145,8 @@ class Reader:
                 # Two pictures that came with one read have one time; in order all the same.
                 received_ns = max(picture.t_received_ns, self._after_ns)
                 self._after_ns = received_ns + 1
-                shutter_ns = received_ns - self._latency_ns
+                known_ns = picture.t_shutter_ns
+                shutter_ns = received_ns - self._latency_ns if known_ns is None else known_ns
                 self._newest = Frame(self._camera, self._watch.number, shutter_ns, received_ns, image)
             self._heard_s = time.monotonic()
             self._changed.notify_all()

@@ -22,13 +22,14 @@ Settings = dict[str, tuple[float | None, float | None]]
 @dataclass(frozen=True)
 class SourcePicture:
     """An image of a source: ``image`` ``(height, width[, 3])``, when it was received, the source's number of it,
-    and how many images received before it were skipped.
+    how many images received before it were skipped, and the time of its shutter, where the source knows it.
     """
 
     image: ImageArray
     t_received_ns: int
     seq: int | None = None
     skipped: int = 0
+    t_shutter_ns: int | None = None
 
 
 class LiveSource(Protocol):

@@ -50,6 +50,7 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
+from stereoservo.ports.picture_light import LightWatch
 
 if TYPE_CHECKING:
     from stereoservo.daemon.preview import PreviewEncoder
@@ -151,8 +152,11 @@ class CameraPipeline:
         self._detector = detector
         self._links = links
         self._clock = clock
+        self._light = LightWatch()
         self.frames = 0
         self.written = 0
+        self.light: tuple[str, str] | None = None
+        """What the newest frame tells anew of its light: a code and a text."""
 
     def open(self) -> None:
         """Connect and start. Raises DriverError."""
@@ -193,8 +197,10 @@ class CameraPipeline:
         if self._images is not None:
             self._images.take(arrived)
         newest = arrived[-1]
-        if self._preview is not None and isinstance(newest, Frame):
-            self._preview.offer(newest, self._clock.now_ns())
+        if isinstance(newest, Frame):
+            self.light = self._light.see(newest.image, len(observation.ids), newest.t_shutter_ns)
+            if self._preview is not None:
+                self._preview.offer(newest, self._clock.now_ns())
         return True
 
     def _observed(self, newest: Frame | CameraObservation) -> CameraObservation:
@@ -270,6 +276,8 @@ def camera_loop(
                     if down:
                         down = False
                         report("camera_back", f"camera {camera} delivers again")
+                    if pipeline.light is not None:
+                        report(pipeline.light[0], f"camera {camera} {pipeline.light[1]}")
                     yield max(quiet.after_frame() - (heard_ns - polled_ns) * 1e-9, 0.0)
                 elif (now_ns() - heard_ns) * 1e-9 > SILENT_CAMERA_S:
                     raise DriverError("silent", f"no image for {SILENT_CAMERA_S:g} s", retry=True)

@@ -338,6 +338,8 @@ class CameraStatistics(msgspec.Struct, frozen=True):
     of its sequence or its grid), ``frozen`` ones withheld because they repeat the previous one, ``reconnects``.
 
     ``settings``: requested and reported settings of the source by name, e.g. ``{"exposure": (10.0, 12.0)}``.
+    ``server_clock``: whether the clock of a server on another host is known, and what is known of it or why it is not;
+    None where its stamps are not used.
     """
 
     frames: int = 0
@@ -345,6 +347,7 @@ class CameraStatistics(msgspec.Struct, frozen=True):
     frozen: int = 0
     reconnects: int = 0
     settings: dict[str, tuple[float | None, float | None]] = {}
+    server_clock: tuple[bool, str] | None = None
 
 
 @runtime_checkable

@@ -104,7 +104,7 @@ def random_picture(conditions: Conditions, rng: np.random.Generator) -> tuple[Im
     conics += _clutter(conditions.clutter, 8.0 / z, pixels, rng)
     coverage = np.zeros((HEIGHT, WIDTH), np.float32)
     for conic in conics:
-        _add(coverage, conic, conditions.blur)
+        add_ellipse(coverage, conic, conditions.blur)
     image += (WHITE - image) * np.minimum(coverage, 1.0)
     if conditions.cut:
         for f in range(len(DEFAULT_BODY)):
@@ -123,7 +123,7 @@ def _clutter(count: int, radius: float, pixels: FloatArray, rng: np.random.Gener
     return conics
 
 
-def _add(coverage: npt.NDArray[np.float32], conic: FloatArray, blur: float) -> None:
+def add_ellipse(coverage: npt.NDArray[np.float32], conic: FloatArray, blur: float) -> None:
     """Add an ellipse's coverage, blurred before it is sampled."""
     centre = -np.linalg.solve(conic[:2, :2], conic[:2, 2])
     level = -(conic[2, 2] + conic[:2, 2] @ centre)

@@ -40,6 +40,13 @@ def _view(rng: np.random.Generator, at: FloatArray) -> FloatArray:
 
 def picture(rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
     """A picture of 640x480 of tags 0 to 11, and their corners (48, 2) [px]."""
+    image, corners = scene(rng)
+    image = image + rng.normal(0.0, NOISE, image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8), corners
+
+
+def scene(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """The same before the sensor: grey levels (480, 640), and the corners."""
     fine = np.full((480 * FINE, 640 * FINE), WALL, np.float32)
     to_fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])
     corners = []
@@ -61,8 +68,8 @@ def picture(rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
         square = np.array([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]) @ H.T
         corners.append(square[:, :2] / square[:, 2:])
     fine = cv2.GaussianBlur(fine, (0, 0), BLUR_PX * FINE)
-    image = cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA) + rng.normal(0.0, NOISE, (480, 640))
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8), np.concatenate(corners)
+    image = np.asarray(cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA), dtype=np.float64)
+    return image, np.concatenate(corners)
 
 
 def tags(repetitions: int, seed: int) -> dict[str, Any]:

@@ -35,6 +35,12 @@ def _cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any
     return run_cycle(repetitions, seed, progress)
 
 
+def _detectors(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    from stereoservo_sim.benchmarks.photographs.table import run_detectors
+
+    return run_detectors(repetitions, seed, progress)
+
+
 def _faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     from stereoservo_sim.benchmarks.faults.bench import run_faults
 
@@ -123,6 +129,7 @@ BENCHES: dict[str, Bench] = {
     "calibration": _calibration,
     "can": _can,
     "cycle": _cycle,
+    "detectors": _detectors,
     "faults": _faults,
     "features": _features,
     "idle": _idle,
@@ -188,6 +195,11 @@ def _find(what: str) -> Bench:
 
 def _show(answer: dict[str, Any], console: Console) -> None:
     """Print one line a figure, nested names joined by points; tables of faults and of what a start compiles."""
+    if answer["bench"] == "detectors":
+        from stereoservo_sim.benchmarks.photographs.table import show_detectors
+
+        show_detectors(answer, console)
+        answer = {key: value for key, value in answer.items() if key not in ("rows", "left_out")}
     if answer["bench"] == "faults":
         from stereoservo_sim.benchmarks.faults.bench import show_faults
 

@@ -190,6 +190,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             (repetitions(10),),
         ),
         Experiment(
+            "changing-light",
+            "detectors, their covariances and goals while light and exposure change: shadows, lamps, flicker, clipping",
+            "pictures.changing_light",
+            (repetitions(20),),
+        ),
+        Experiment(
             "edge-transfer",
             "goals carried over to a moved workpiece by its edges, beside the same by markers, from rendered pictures",
             "laws.edge_transfer",

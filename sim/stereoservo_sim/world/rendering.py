@@ -18,12 +18,13 @@ import numpy.typing as npt
 
 from stereoservo.geometry.distortion import distort
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo_sim.world.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
 from stereoservo_sim.world.body import MarkerBody, SolidBody
 from stereoservo_sim.world.camera_rig import PinholeCamera, project
 from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
 from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
 from stereoservo_sim.world.robots import shape_segments
+from stereoservo_sim.world.scenery.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
+from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 DOT_LEVEL = 225.0
@@ -43,12 +44,13 @@ class RenderSettings:
     """``blur_px``: sigma of the lens blur; ``noise_grey``: sigma of the sensor noise [grey levels].
 
     ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm anew for
-    every frame; ``plain`` is an even grey.
+    every frame; ``plain`` is an even grey. ``lighting``: how light changes; None: it does not.
     """
 
     blur_px: float = 0.7
     noise_grey: float = 2.0
     background: str = "arm"
+    lighting: Lighting | None = None
 
 
 class Renderer:
@@ -75,22 +77,23 @@ class Renderer:
         *,
         focus: float = 1.0,
         at_row: Callable[[float], FloatArray] | None = None,
+        t_s: float = 0.0,
     ) -> ImageArray:
         """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise.
 
         ``workpiece`` (4, 4): where it stands in the world; default: where it stood at first. Links that are nearer
         than the workpiece are drawn over it where they are nearer than the body, too. ``focus``: focal length of what
         is drawn of the body over the camera's. ``at_row``: where the arm is when a row is exposed, in bands of
-        ``BAND`` rows, in place of ``q``.
+        ``BAND`` rows, in place of ``q``. ``t_s``: since when the light changes.
         """
         camera = self.camera.focused(focus)
         if at_row is None:
-            return self._expose(self._drawn(q, workpiece, camera), rng)
+            return self._expose(self._drawn(q, workpiece, camera), rng, t_s)
         image = np.empty((camera.height, camera.width), dtype=np.float32)
         for top in range(0, camera.height, BAND):
             rows = slice(top, min(top + BAND, camera.height))
             image[rows] = self._drawn(at_row(0.5 * (rows.start + rows.stop - 1)), workpiece, camera)[rows]
-        return self._expose(image, rng)
+        return self._expose(image, rng, t_s)
 
     def _drawn(
         self, q: FloatArray, workpiece: FloatArray | None, camera: PinholeCamera
@@ -160,7 +163,9 @@ class Renderer:
                     cv2.fillConvexPoly(image, fixed, int(level), cv2.LINE_AA, 4)
         return front
 
-    def _expose(self, image: npt.NDArray[np.float32], rng: np.random.Generator) -> ImageArray:
+    def _expose(self, image: npt.NDArray[np.float32], rng: np.random.Generator, t_s: float) -> ImageArray:
+        if self.settings.lighting is not None:
+            image = self.settings.lighting.lit(image, t_s)
         if self.settings.noise_grey <= 0:
             return np.asarray(cv2.add(image, 0.0, dtype=cv2.CV_8U), dtype=np.uint8)
         down, right = rng.integers(0, _NOISE_MARGIN, 2)
@@ -171,7 +176,7 @@ class Renderer:
 
 def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> Backdrop:
     if background == "pybullet":
-        from stereoservo_sim.world.backdrop import (
+        from stereoservo_sim.world.scenery.backdrop import (
             PybulletBackdrop,  # the engine only where it is asked for
         )
 

@@ -20,7 +20,7 @@ from stereoservo.calibration.stratum_upgrade import (
     planes_at_infinity,
     scaled_plane,
 )
-from stereoservo.calibration.trial_data import TrialData
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.alignment import similarity_from_points
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.distortion import lens_from_lines, straight_lens, undistort
@@ -213,7 +213,23 @@ def _starts_of_body(views: RigViews) -> list[RigStart]:
         (), (), views.cameras, views.marker_ids, np.zeros((len(views.names), 0)),
         np.full(len(views.names), -1), views.pixels, views.sigmas,
     )  # fmt: skip
-    lenses = epipolar_lenses(trials)
+    found, failure = [], None
+    for lenses in (
+        epipolar_lenses(trials),
+        np.array([straight_lens(c.width, c.height) for c in views.cameras]),
+    ):
+        try:
+            found += _starts_through(views, trials, lenses)
+        except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+            failure = failure or error
+    if not found and failure is not None:
+        raise failure
+    return found
+
+
+def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> list[RigStart]:
+    """Starts with these ``lenses`` (c, 4): noise of a pixel shows others than there are, and where a bundle from those
+    comes to nothing, one without distortion may."""
     cameras, points, _ = initial_reconstruction(undistorted(trials, lenses))
     there = np.asarray(np.isfinite(points).all(axis=2))
     reference = int(np.argmax((there[:, None] & there[None]).sum(axis=2).clip(0, 8).sum(axis=1)))

@@ -147,7 +147,11 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
         data = _with_poses_settled(rig, data)
     begun = RigProblem(views, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, known)
     if not known:
-        loose = _settled(begun, rig, lenses, PinholeTies(LOOSE, LOOSE, LOOSE))
+        ties = PinholeTies(LOOSE, LOOSE, LOOSE)
+        loose = _settled(begun, rig, lenses, ties)
+        if not loose.solution.converged:  # its first step is too far off where places are
+            begun = replace(begun, data=_with_poses_settled(rig, data))
+            loose = _settled(begun, rig, lenses, ties)
         if not loose.solution.converged:
             return loose
         begun, rig = loose, loose.rig

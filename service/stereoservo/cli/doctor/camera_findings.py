@@ -76,10 +76,29 @@ def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Examinati
         )  # fmt: skip
         return
     yield _rate(record)
+    yield from _server_clock(record)
     yield _latency(record)
     yield _markers(record, min_markers)
     if record.frame is not None:
         yield from _picture_quality(record.name, record.frame.image, record.seen[-1])
+
+
+def _server_clock(record: CameraRecord) -> list[ExaminationFinding]:
+    """What is known of the clock of a camera's server, where its stamps are used."""
+    counted = record.statistics
+    if counted is None or counted.server_clock is None:
+        return []
+    known, told = counted.server_clock
+    name = f"{record.name} server clock"
+    if known:
+        return [ExaminationFinding(name, True, told)]
+    return [
+        ExaminationFinding(
+            name, None, f"its stamps are refused: {told}",
+            "watch for longer (--seconds 20), keep the network free, let the server follow an NTP clock slowly; "
+            "meanwhile the time of reception less latency_s counts",
+        )
+    ]  # fmt: skip
 
 
 def _rate(record: CameraRecord) -> ExaminationFinding:

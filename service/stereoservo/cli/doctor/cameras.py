@@ -89,7 +89,7 @@ class WatchedCamera:
             self.record.statistics = CameraStatistics(
                 frames=now.frames - before.frames, dropped=now.dropped - before.dropped,
                 frozen=now.frozen - before.frozen, reconnects=now.reconnects - before.reconnects,
-                settings=now.settings,
+                settings=now.settings, server_clock=now.server_clock,
             )  # fmt: skip
             self.record.watched_s = time.monotonic() - self._began_s
         frame = self.record.frame
