@@ -223,7 +223,7 @@ def _when(cause: RecordingCause) -> float:
 
 def _residuals_px(problem: ExaminedFrames) -> FloatArray:
     """Residuals (k, 2) [px], predicted less observed, errors of the joints included."""
-    plain = super(ExaminedFrames, problem).residuals_at(start_state(problem)).reshape(-1, 2)
+    plain = problem.plain_residuals_at(start_state(problem)).reshape(-1, 2)
     return np.asarray(plain * problem.data.sigmas[:, None])
 
 

@@ -22,6 +22,7 @@ from stereoservo.calibration.change.model_changes import (
 )
 from stereoservo.calibration.examination.recorded_views import RecordedViews, frames_apart
 from stereoservo.calibration.joint_errors.joint_noise import joint_columns
+from stereoservo.calibration.rig_model import displacements, predicted
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -62,8 +63,21 @@ class ExaminedFrames(LinearisedProblem):
         covariance = np.eye(width) + slopes @ slopes.transpose(0, 2, 1)
         return which * width + place, np.linalg.inv(np.linalg.cholesky(covariance))
 
+    @cached_property
+    def _undrifted(self) -> FloatArray:
+        """Displacements (f, 4, 4) of the body where no joint has drifted."""
+        return displacements(self.rig, self.data.offsets)
+
+    def plain_residuals_at(self, state: State) -> FloatArray:
+        """Weighted residuals (2 k,), errors of the joints included."""
+        rig, drift = state
+        if rig.generators is not self.rig.generators or drift.any():
+            return super().residuals_at(state)
+        apart = predicted(rig, self.data, self._undrifted) - self.data.pixels
+        return np.asarray((apart / self.data.sigmas[:, None]).ravel())
+
     def residuals_at(self, state: State) -> FloatArray:
-        return self.without_joint_errors(super().residuals_at(state)[:, None])[:, 0]
+        return self.without_joint_errors(self.plain_residuals_at(state)[:, None])[:, 0]
 
     def without_joint_errors(self, rows: FloatArray) -> FloatArray:
         """Rows (2 k, q) whitened frame by frame."""

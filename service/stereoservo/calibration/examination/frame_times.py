@@ -18,8 +18,6 @@ REGULAR, NEAR = 0.8, 0.25
 
 STOPS_AROUND, NEAR_STOPS = 3, 6
 """Stops to either side that a step is told from, and in which it is looked for."""
-CLEAR = 100.0
-"""Chi-square from which a step is one."""
 LASTING = 3
 """Frames beside the terms of a course from which a step can be told from it."""
 CREDIBLE = 9.2
@@ -107,20 +105,15 @@ def step_between(
 
 
 def step_near(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
-    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,); where there is none, the
-    clearest before another stop near it.
-    """
+    """The clearest step of a camera's pixels before one of the stops near ``stop``, which begin at ``frames`` (s,)."""
     last = len(frames) - 1
 
     def before(k: int) -> Step:
         around = int(frames[max(0, k - STOPS_AROUND)]), int(frames[min(k + STOPS_AROUND, last)])
         return step_between(views, camera, around, (int(frames[max(0, k - 1)]), int(frames[k])))
 
-    stated = before(stop)
-    if stated.gain >= CLEAR:
-        return stated
     near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, last) + 1)
-    return max([stated, *map(before, near)], key=lambda one: one.gain)
+    return max(map(before, near), key=lambda one: one.gain, default=before(stop))
 
 
 def _misfit(design: FloatArray, views: RecordedViews, frames: IntArray, marker: int) -> float:
