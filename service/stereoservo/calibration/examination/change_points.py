@@ -34,7 +34,7 @@ from stereoservo.calibration.examination.examined_frames import (
     Hypothesis,
     frames_concerned,
 )
-from stereoservo.calibration.examination.frame_times import CREDIBLE
+from stereoservo.calibration.examination.frame_times import probable_onset
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -265,11 +265,8 @@ def _onset(
     allowed = slice(LASTING, len(concerned) - LASTING + 1)
     if not len(total[allowed]):
         return last, (last, last)
-    inside = total[allowed]
-    best = int(np.argmax(inside))
-    near = np.flatnonzero(inside >= inside[best] - CREDIBLE)
-    first = LASTING
-    return int(concerned[first + best]), (int(concerned[first + near[0]]), int(concerned[first + near[-1]]))
+    best, first, end = (int(concerned[LASTING + k]) for k in probable_onset(total[allowed]))
+    return best, (first, end)
 
 
 def _correlation(problem: ExaminedFrames, views: RecordedViews, found: ChangePoint) -> float:

@@ -165,11 +165,11 @@ def corrected_views(
     if one.kind != "joint" or not frames.any():
         return None
     shown = views.times[frames]
-    readings = (views.joint_times >= shown[0]) & (views.joint_times <= shown[-1])
-    if frames[0]:
-        readings |= views.joint_times < shown[0]
-    if frames[-1]:
-        readings |= views.joint_times > shown[-1]
+    # Those included between which the joints of the first and the last of the frames are interpolated.
+    begin = int(np.searchsorted(views.joint_times, shown[0], side="right")) - 1
+    end = int(np.searchsorted(views.joint_times, shown[-1]))
+    index = np.arange(len(views.joint_times))
+    readings = (frames[0] | (index >= begin)) & (frames[-1] | (index <= end))
     positions = views.positions.copy()
     positions[readings, views.joint_names.index(one.subject)] += x
     return replace(views, positions=positions)

@@ -41,6 +41,15 @@ class Step(NamedTuple):
     gain: float
 
 
+def probable_onset(gains: FloatArray) -> tuple[int, int, int]:
+    """Median onset, and the first and last that are not excluded, of those (b,) that explain ``gains`` of chi-square:
+    all are equally likely beforehand.
+    """
+    likely = np.cumsum(np.exp(0.5 * (gains - gains.max())))
+    near = np.flatnonzero(gains >= gains.max() - CREDIBLE)
+    return int(np.searchsorted(likely, 0.5 * likely[-1])), int(near[0]), int(near[-1])
+
+
 def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
     """Gaps in a camera's frames; None where these have neither numbers nor a period."""
     mine = np.flatnonzero(views.camera == camera)

@@ -20,7 +20,7 @@ from stereoservo.calibration.examination.examined_frames import (
     frames_concerned,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import CREDIBLE
+from stereoservo.calibration.examination.frame_times import probable_onset
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
     AS_GOOD,
@@ -122,14 +122,13 @@ def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset:
     information = whole - (shared**2).sum(axis=1)
     known = information > 1e-9 * np.maximum(whole, 1e-300)
     gain = np.where(known, moment**2 / np.where(known, information, 1.0), 0.0)
-    best = int(np.argmax(gain))
     chi2 = float(here @ problem.whitened(here))
-    level = max(1.0, (chi2 - float(gain[best])) / len(here))
-    near = onsets[gain >= gain[best] - CREDIBLE * level]
+    level = max(1.0, (chi2 - float(gain.max())) / len(here))
+    best, first, last = probable_onset(gain / level)
     if not known[best]:
         return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
     return _Step(
-        one, int(onsets[best]), (int(near[0]), int(near[-1])), float(-moment[best] / information[best]),
+        one, int(onsets[best]), (int(onsets[first]), int(onsets[last])), float(-moment[best] / information[best]),
         float(np.sqrt(level / information[best])), float(gain[best]) / max(chi2, 1e-300),
     )  # fmt: skip
 
