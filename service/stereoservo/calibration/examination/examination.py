@@ -36,7 +36,7 @@ from stereoservo.calibration.examination.reference_model import (
 )
 from stereoservo.calibration.shutter_offset import LEAST_DEVIATION_S
 from stereoservo.kinematics.model import CellModel
-from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 MOST_CHANGES = 8
 SAME_ONSET = 4
@@ -47,6 +47,8 @@ AWAY = 0.2
 """Share of its largest distance from its median from which a joint is away from it."""
 MOST_GAPS = 20
 """Gaps of a camera's frames that are listed."""
+UNLIKELY = 18.4
+"""Chi-square of a pixel that noise exceeds once in 10 000."""
 UNKNOWN_S = 0.05
 """Deviation [s] from which the offset of a camera's stamps is not known."""
 
@@ -65,7 +67,7 @@ _Gaps = dict[str, list[Gap] | None]
 class Onset(msgspec.Struct, frozen=True):
     """First frame of what has happened: ``frame`` counts those of ``camera`` from 0, ``earliest`` and ``latest``
     (likewise) are those that the data do not exclude. ``after_s``: stamp of the camera's last frame before it; both
-    [s] as stamped.
+    [s] as stamped. ``in_episode``: the frame counted from the first of its ``episode``.
     """
 
     camera: str
@@ -75,12 +77,14 @@ class Onset(msgspec.Struct, frozen=True):
     earliest: int
     latest: int
     episode: int
+    in_episode: int
 
 
 class RecordingCause(msgspec.Struct, frozen=True):
-    """What has happened. ``onset``: None where it is there throughout. ``until``: the recording is different *before*
-    the onset from what the model was learnt from. ``value`` with ``deviation`` [``unit``]; ``effect_px``: rms change of
-    the pixels. ``or_else``: what explains the data nearly as well, and ``tells_apart`` what would decide.
+    """What has happened. ``onset``: None where it is there throughout. ``episodes``: those in which frames differ by it
+    from what the model was learnt from, before the onset where that was learnt after it. ``value`` with ``deviation``
+    [``unit``]; ``effect_px``: rms change of the pixels. ``or_else``: what explains the data nearly as well, and
+    ``tells_apart`` what would decide.
     """
 
     kind: RecordingCauseKind
@@ -93,6 +97,7 @@ class RecordingCause(msgspec.Struct, frozen=True):
     unit: str = ""
     or_else: str = ""
     tells_apart: str = ""
+    episodes: tuple[int, ...] = ()
     gaps: tuple[tuple[int, int], ...] = ()
 
 
@@ -254,12 +259,19 @@ def _onset(views: RecordedViews, frame: int, span: tuple[int, int], camera: int)
     k, first, last = (min(int(np.searchsorted(mine, one)), len(mine) - 1) for one in (frame, *span))
     before = float(views.stamped[mine[k - 1]]) if k > 0 else None
     return Onset(
-        views.cameras[camera].name, k, float(views.stamped[mine[k]]), before, first, last, int(views.episodes[mine[k]])
+        views.cameras[camera].name, k, float(views.stamped[mine[k]]), before, first, last, int(views.episodes[mine[k]]),
+        k - int(np.flatnonzero(views.episodes[mine] == views.episodes[mine[k]])[0]),
     )  # fmt: skip
 
 
 def _stamp(views: RecordedViews, onset: Onset) -> str:
-    return f"{onset.time_s:.3f} s" if views.timed else f"index {onset.time_s:g}"
+    stamp = f"{onset.time_s:.3f} s" if views.timed else f"index {onset.time_s:g}"
+    several = len(np.unique(views.episodes)) > 1
+    return f"{stamp}; frame {onset.in_episode} of episode {onset.episode}" if several else stamp
+
+
+def _episodes(views: RecordedViews, frames: BoolArray | IntArray) -> tuple[int, ...]:
+    return tuple(np.unique(views.episodes[frames]).tolist())
 
 
 def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float | None, str]:
@@ -305,7 +317,7 @@ def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> Recor
         text += f"; or {or_else}: the recording does not tell. What would: {tells}"
     return RecordingCause(
         _KINDS[one.kind], one.subject, f"{text}; {change.effect_px:.3g} px rms", onset, change.effect_px,
-        value, deviation, unit, or_else, tells,
+        value, deviation, unit, or_else, tells, _episodes(views, change.frames),
     )  # fmt: skip
 
 
@@ -344,6 +356,7 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
                 value=float(total),
                 deviation=0.0,
                 unit="frames",
+                episodes=_episodes(views, np.array([hole.frame for hole in holes])),
                 gaps=tuple((int(ranks[hole.frame]), hole.missing) for hole in holes[:MOST_GAPS]),
             )
         )
@@ -395,6 +408,7 @@ def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames
             "stands still, and frames at rest, would tell pictures from joints",
             onset,
             _rms(_residuals_px(problem)),
+            episodes=_episodes(views, problem.data.stop[(here**2).reshape(-1, 2).sum(axis=1) > UNLIKELY]),
         )
     ]
 

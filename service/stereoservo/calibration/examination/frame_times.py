@@ -61,7 +61,7 @@ def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
         every = max(1, int(np.median(counted[same]))) if same.any() else 1
         missing = np.round(counted / every).astype(np.int64) - 1
     else:
-        by_stamps = _missing(np.diff(views.times[mine]), same) if views.timed else None
+        by_stamps = _missing(np.diff(views.times[mine]), same) if views.timed and not views.counted else None
         if by_stamps is None:
             return None
         missing = by_stamps
