@@ -27,7 +27,7 @@ from stereoservo.calibration.examination.examined_frames import (
     examined_frames,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import Gap, gaps, step_near
+from stereoservo.calibration.examination.frame_times import Gap, Step, gaps, step_near, step_of_one_camera
 from stereoservo.calibration.examination.learning_changes import learnt_and_put_right
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
@@ -60,6 +60,12 @@ _KINDS: dict[str, RecordingCauseKind] = {
     "camera": "camera_moved", "cameras": "cameras_moved", "body": "body_moved", "marker": "marker_slipped",
     "joint": "joint_zero", "stamps": "late_stamps",
 }  # fmt: skip
+
+_REFUSALS: dict[str, RecordingCauseKind] = {
+    "camera_moved": "camera_moved",
+    "marker_slipped": "marker_slipped",
+}
+"""Refusals of a fit that are causes by themselves."""
 
 _Gaps = dict[str, list[Gap] | None]
 
@@ -417,28 +423,31 @@ def _not_learnt(
     views: RecordedViews, failed: LearningError, lost: list[RecordingCause], dropped: _Gaps
 ) -> RecordingReport:
     """The report where no model can be learnt: the refusal of the fit is the cause, with the frame of its stop."""
-    error = failed.error
-    onset: Onset | None = None
+    error, frames = failed.error, failed.stops.frames
     names = [camera.name for camera in views.cameras]
     stop, camera = error.data.get("stop"), error.data.get("camera")
-    if isinstance(stop, int) and 0 <= stop < len(failed.stops.frames):
-        frames = failed.stops.frames
+    kind = _REFUSALS.get(error.code, "not_learnt")
+    found: tuple[int, Step] | None = None
+    message = error.message
+    if isinstance(stop, int) and 0 <= stop < len(frames):
         c = names.index(camera) if camera in names else int(views.camera[frames[stop]])
-        step = step_near(views, c, frames, stop)
-        onset = _onset(views, step.onset, step.span, c)
-    kind: RecordingCauseKind = "not_learnt"
-    if error.code == "camera_moved":
-        kind = "camera_moved"
-    elif error.code == "marker_slipped":
-        kind = "marker_slipped"
-    cause = RecordingCause(kind, str(camera or error.data.get("joint", "")), error.message, onset)
+        found = c, step_near(views, c, frames, stop)
+    elif views.generators is None and (found := step_of_one_camera(views, frames)) is not None:
+        kind, camera = "camera_moved", names[found[0]]
+    if kind == "camera_moved":
+        # The stops that the refusal names may be some beside the step.
+        message = f"camera {camera} moved: all markers jump in its pictures and stay off, in no other camera"
+    onset = None if found is None else _onset(views, found[1].onset, found[1].span, found[0])
+    if onset is not None:
+        message += f"; from frame {onset.frame} of camera {onset.camera} on ({_stamp(views, onset)})"
+    cause = RecordingCause(kind, str(camera or error.data.get("joint", "")), message, onset)
     cameras = {
         name: CameraResiduals(int((views.camera == c).sum()), None, _count(dropped[name]))
         for c, name in enumerate(names)
     }
     return RecordingReport(
         None, None, None, "", cameras, {}, {}, (cause, *lost),
-        ("no model could be learnt, so that nothing else was examined",), None, 0,
+        (f"no model could be learnt, so that nothing else was examined: {error.message}",), None, 0,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.calibration.examination.recorded_views import ALONE, RecordedViews
+from stereoservo.calibration.examination.recorded_views import ALONE, AT_REST, RecordedViews
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 GAP, JITTERS = 1.5, 6.0
@@ -18,6 +18,8 @@ REGULAR, NEAR = 0.8, 0.25
 
 STOPS_AROUND, NEAR_STOPS = 3, 6
 """Stops to either side that a step is told from, and in which it is looked for."""
+CLEAR, ALONE_BY = 100.0, 4.0
+"""Chi-square from which a step is one, and how many times that of any other a step that stands out has."""
 LASTING = 3
 """Frames beside the terms of a course from which a step can be told from it."""
 CREDIBLE = 9.2
@@ -115,14 +117,36 @@ def step_between(
 
 def step_near(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
     """The clearest step of a camera's pixels before one of the stops near ``stop``, which begin at ``frames`` (s,)."""
+    near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, len(frames) - 1) + 1)
+    steps = [_step_before(views, camera, frames, k) for k in near]
+    return max(steps, key=lambda one: one.gain, default=_step_before(views, camera, frames, stop))
+
+
+def step_of_one_camera(views: RecordedViews, frames: IntArray) -> tuple[int, Step] | None:
+    """The camera whose pixels alone step before one of the stops that begin at ``frames`` (s,), and the step; None
+    where there is none that stands out, among all stops and cameras, and with the arm at rest too.
+    """
+    stops = range(1, len(frames))
+    cameras = range(len(views.cameras))
+    found = {(c, k): _step_before(views, c, frames, k) for c in cameras for k in stops}
+    if not found:
+        return None
+    camera, stop = max(found, key=lambda one: found[one].gain)
+    best = found[camera, stop]
+    others = [one.gain for (c, k), one in found.items() if c != camera or abs(k - stop) > 1]
+    resting = views.select(views.speeds(views.times) <= AT_REST)
+    begin = np.searchsorted(resting.times, views.times[frames])
+    still = _step_before(resting, camera, begin, stop)
+    if best.gain < max(CLEAR, ALONE_BY * max(others, default=0.0)) or still.gain < CLEAR:
+        return None
+    return camera, best
+
+
+def _step_before(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
+    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,)."""
     last = len(frames) - 1
-
-    def before(k: int) -> Step:
-        around = int(frames[max(0, k - STOPS_AROUND)]), int(frames[min(k + STOPS_AROUND, last)])
-        return step_between(views, camera, around, (int(frames[max(0, k - 1)]), int(frames[k])))
-
-    near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, last) + 1)
-    return max(map(before, near), key=lambda one: one.gain, default=before(stop))
+    around = int(frames[max(0, stop - STOPS_AROUND)]), int(frames[min(stop + STOPS_AROUND, last)])
+    return step_between(views, camera, around, (int(frames[max(0, stop - 1)]), int(frames[stop])))
 
 
 def _misfit(design: FloatArray, views: RecordedViews, frames: IntArray, marker: int) -> float:
