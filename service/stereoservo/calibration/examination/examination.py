@@ -375,8 +375,9 @@ def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
     errors = {one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture])) for one in joints}
     if reference.fits or not errors:
         return []
-    listed = ", ".join(f"{name} {error:.2g}" for name, error in errors.items())
-    worst = max(errors, key=lambda name: errors[name])
+    pixels = {one.name: one.pixels for one in joints}
+    listed = ", ".join(f"{name} {error:.2g} ({pixels[name]:.2g} px)" for name, error in errors.items())
+    worst = max(pixels, key=lambda name: pixels[name])
     return [
         RecordingCause(
             "joint_errors",
