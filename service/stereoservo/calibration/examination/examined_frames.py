@@ -4,7 +4,7 @@ uncertainty, and what may have happened to them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Literal
 
@@ -105,6 +105,26 @@ class ExaminedFrames(LinearisedProblem):
         pixels[rows] -= effect
         root = np.hstack([self.root, LOOSE * slopes])
         return replace(self, data=replace(self.data, pixels=pixels), root=root, uncertainty=bounded(root))
+
+
+@dataclass(frozen=True)
+class PartlyChanged(ExaminedFrames):
+    """All frames, of which a changed state is that of some alone: those of the rows ``changed`` (k,)."""
+
+    changed: BoolArray
+
+    @cached_property
+    def _unchanged(self) -> FloatArray:
+        return super().residuals_at((self.rig, np.zeros(len(self.order))))
+
+    def residuals_at(self, state: State) -> FloatArray:
+        return np.where(np.repeat(self.changed, 2), super().residuals_at(state), self._unchanged)
+
+
+def partly_changed(problem: ExaminedFrames, changed: BoolArray) -> PartlyChanged:
+    """The problem in which a change is one of some rows (k,), whole frames."""
+    parts = {field.name: getattr(problem, field.name) for field in fields(problem)}
+    return PartlyChanged(**parts, changed=changed)
 
 
 def examined_frames(model: CellModel, views: RecordedViews, noise_factor: float) -> ExaminedFrames:
