@@ -116,10 +116,14 @@ def step_between(
 
 
 def step_near(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
-    """The clearest step of a camera's pixels before one of the stops near ``stop``, which begin at ``frames`` (s,)."""
+    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,), or before one near it
+    where that stands out.
+    """
+    stated = _step_before(views, camera, frames, stop)
     near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, len(frames) - 1) + 1)
     steps = [_step_before(views, camera, frames, k) for k in near]
-    return max(steps, key=lambda one: one.gain, default=_step_before(views, camera, frames, stop))
+    clearest = max(steps, key=lambda one: one.gain, default=stated)
+    return clearest if clearest.gain >= ALONE_BY * stated.gain else stated
 
 
 def step_of_one_camera(views: RecordedViews, frames: IntArray) -> tuple[int, Step] | None:

@@ -149,4 +149,9 @@ def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> Cha
     one = named[step.hypothesis.kind, step.hypothesis.subject]
     left = _step(free, views, one, step.onset)
     deviation = float(np.hypot(left.deviation, left.x)) if np.isfinite(left.deviation) else step.deviation
+    report = reference.report
+    for joint in () if report is None else report.joints:
+        if (one.kind, one.subject) == ("joint", joint.name):
+            # What its readings err by where it stands is not averaged out.
+            deviation = float(np.hypot(deviation, np.hypot(joint.random, joint.repeatable)))
     return change_of(problem, views, one, step.onset, step.span, step.x, deviation)
