@@ -296,6 +296,8 @@ def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float 
 
 
 def _sentence(model: CellModel, one: Hypothesis, value: float | None, deviation: float | None) -> str:
+    if one.kind == "joint" and value is None:
+        return f"zero of joint {one.subject} drifted"
     if one.kind != "stamps":
         return SENTENCES[one.kind](model, one.subject, value, deviation)
     if value is None or deviation is None:

@@ -36,12 +36,16 @@ MENDS, TRIED = 2, 2
 """Times that something is taken back, and changes that are tried for each."""
 FREE = 30.0
 """Deviations of the model that count as one: what a change of the model explains says nothing."""
+ALIKE = 0.98
+"""Share of what a change explains from which another one, from the same frames on, is not told apart from it."""
 EXPLAINS = 0.05
 """Share of chi-square that a change must explain beside the model to be tried."""
 
 
 class _Step(NamedTuple):
-    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; ``share`` of chi-square it explains."""
+    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; ``share`` of chi-square it explains,
+    ``beside`` another hypothesis that explains nearly as much.
+    """
 
     hypothesis: Hypothesis
     onset: int
@@ -49,6 +53,7 @@ class _Step(NamedTuple):
     x: float
     deviation: float
     share: float
+    beside: Hypothesis | None = None
 
 
 def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
@@ -85,6 +90,12 @@ def _better(
         again = None if mended is None else _learnt(mended)
         if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
             offsets = reference.offsets + again.offsets
+            alike = [
+                other.hypothesis for other in steps
+                if other is not step and other.share >= ALIKE * step.share
+                and max(step.span[0], other.span[0]) <= min(step.span[1], other.span[1])
+            ]  # fmt: skip
+            step = step._replace(beside=alike[0] if alike else None)
             return again.put_right(mended), replace(again, offsets=offsets), step
     return None
 
@@ -154,4 +165,5 @@ def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> Cha
         if (one.kind, one.subject) == ("joint", joint.name):
             # What its readings err by where it stands is not averaged out.
             deviation = float(np.hypot(deviation, np.hypot(joint.random, joint.repeatable)))
-    return change_of(problem, views, one, step.onset, step.span, step.x, deviation)
+    found = change_of(problem, views, one, step.onset, step.span, step.x, deviation)
+    return replace(found, runner_up=step.beside)
