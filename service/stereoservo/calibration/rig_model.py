@@ -321,9 +321,11 @@ def displacements(rig: RigModel, offsets: FloatArray) -> FloatArray:
     return product
 
 
-def predicted(rig: RigModel, data: Measurements) -> FloatArray:
-    """Raw pixels (k, 2) of the rig for each measurement (5.56)."""
-    world = rig.points @ displacements(rig, data.offsets).transpose(0, 2, 1)
+def predicted(rig: RigModel, data: Measurements, moved: FloatArray | None = None) -> FloatArray:
+    """Raw pixels (k, 2) of the rig for each measurement (5.56); ``moved`` (s, 4, 4): displacements where known."""
+    if moved is None:
+        moved = displacements(rig, data.offsets)
+    world = rig.points @ moved.transpose(0, 2, 1)
     pixels = np.empty((len(data.camera), 2))
     for c, (matrix, lens) in enumerate(zip(rig.cameras, rig.lenses, strict=True)):
         mine = np.flatnonzero(data.camera == c)

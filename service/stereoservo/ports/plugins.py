@@ -35,6 +35,7 @@ EXTRAS = {
     "sim": ("pybullet", "pybullet_data"),
     "web": ("websockets",),
     "watch": ("rerun",),
+    "lerobot": ("pyarrow", "av"),
 }
 """Top-level modules that each extra of the distribution installs, as in pyproject.toml."""
 BESIDE = {

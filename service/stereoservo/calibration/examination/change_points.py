@@ -33,8 +33,9 @@ from stereoservo.calibration.examination.examined_frames import (
     ExaminedFrames,
     Hypothesis,
     frames_concerned,
+    partly_changed,
 )
-from stereoservo.calibration.examination.frame_times import CREDIBLE
+from stereoservo.calibration.examination.frame_times import probable_onset
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -235,9 +236,10 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     frames = _frames_of(one, views, onset)
     rows = frames[problem.data.stop]
     part = problem.select(rows)
-    estimate = estimate_changes(part, (change,), x)
-    before = part.residuals_at(start_state(part))
-    ratio = float(before @ part.whitened(before)) - estimate.chi2
+    # Beside what all frames tell of the model: those that are changed leave more of it open.
+    whole = partly_changed(problem, rows)
+    estimate = estimate_changes(whole, (change,), x)
+    ratio = float(here @ problem.whitened(here)) - estimate.chi2
     covariance: FloatArray = np.linalg.pinv(estimate.information).astype(np.float64)
     return ChangePoint(
         one.hypothesis, frames, one.after, onset, span, estimate.x, covariance, rows,
@@ -265,11 +267,8 @@ def _onset(
     allowed = slice(LASTING, len(concerned) - LASTING + 1)
     if not len(total[allowed]):
         return last, (last, last)
-    inside = total[allowed]
-    best = int(np.argmax(inside))
-    near = np.flatnonzero(inside >= inside[best] - CREDIBLE)
-    first = LASTING
-    return int(concerned[first + best]), (int(concerned[first + near[0]]), int(concerned[first + near[-1]]))
+    best, first, end = (int(concerned[LASTING + k]) for k in probable_onset(total[allowed]))
+    return best, (first, end)
 
 
 def _correlation(problem: ExaminedFrames, views: RecordedViews, found: ChangePoint) -> float:

@@ -27,7 +27,7 @@ from stereoservo.calibration.examination.examined_frames import (
     examined_frames,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import Gap, gaps, step_near
+from stereoservo.calibration.examination.frame_times import Gap, Step, gaps, step_near, step_of_one_camera
 from stereoservo.calibration.examination.learning_changes import learnt_and_put_right
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
@@ -36,7 +36,7 @@ from stereoservo.calibration.examination.reference_model import (
 )
 from stereoservo.calibration.shutter_offset import LEAST_DEVIATION_S
 from stereoservo.kinematics.model import CellModel
-from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 MOST_CHANGES = 8
 SAME_ONSET = 4
@@ -47,6 +47,8 @@ AWAY = 0.2
 """Share of its largest distance from its median from which a joint is away from it."""
 MOST_GAPS = 20
 """Gaps of a camera's frames that are listed."""
+UNLIKELY = 18.4
+"""Chi-square of a pixel that noise exceeds once in 10 000."""
 UNKNOWN_S = 0.05
 """Deviation [s] from which the offset of a camera's stamps is not known."""
 
@@ -59,13 +61,19 @@ _KINDS: dict[str, RecordingCauseKind] = {
     "joint": "joint_zero", "stamps": "late_stamps",
 }  # fmt: skip
 
+_REFUSALS: dict[str, RecordingCauseKind] = {
+    "camera_moved": "camera_moved",
+    "marker_slipped": "marker_slipped",
+}
+"""Refusals of a fit that are causes by themselves."""
+
 _Gaps = dict[str, list[Gap] | None]
 
 
 class Onset(msgspec.Struct, frozen=True):
     """First frame of what has happened: ``frame`` counts those of ``camera`` from 0, ``earliest`` and ``latest``
     (likewise) are those that the data do not exclude. ``after_s``: stamp of the camera's last frame before it; both
-    [s] as stamped.
+    [s] as stamped. ``in_episode``: the frame counted from the first of its ``episode``.
     """
 
     camera: str
@@ -75,12 +83,14 @@ class Onset(msgspec.Struct, frozen=True):
     earliest: int
     latest: int
     episode: int
+    in_episode: int
 
 
 class RecordingCause(msgspec.Struct, frozen=True):
-    """What has happened. ``onset``: None where it is there throughout. ``until``: the recording is different *before*
-    the onset from what the model was learnt from. ``value`` with ``deviation`` [``unit``]; ``effect_px``: rms change of
-    the pixels. ``or_else``: what explains the data nearly as well, and ``tells_apart`` what would decide.
+    """What has happened. ``onset``: None where it is there throughout. ``episodes``: those in which frames differ by it
+    from what the model was learnt from, before the onset where that was learnt after it. ``value`` with ``deviation``
+    [``unit``]; ``effect_px``: rms change of the pixels. ``or_else``: what explains the data nearly as well, and
+    ``tells_apart`` what would decide.
     """
 
     kind: RecordingCauseKind
@@ -93,6 +103,7 @@ class RecordingCause(msgspec.Struct, frozen=True):
     unit: str = ""
     or_else: str = ""
     tells_apart: str = ""
+    episodes: tuple[int, ...] = ()
     gaps: tuple[tuple[int, int], ...] = ()
 
 
@@ -223,7 +234,7 @@ def _when(cause: RecordingCause) -> float:
 
 def _residuals_px(problem: ExaminedFrames) -> FloatArray:
     """Residuals (k, 2) [px], predicted less observed, errors of the joints included."""
-    plain = super(ExaminedFrames, problem).residuals_at(start_state(problem)).reshape(-1, 2)
+    plain = problem.plain_residuals_at(start_state(problem)).reshape(-1, 2)
     return np.asarray(plain * problem.data.sigmas[:, None])
 
 
@@ -254,12 +265,19 @@ def _onset(views: RecordedViews, frame: int, span: tuple[int, int], camera: int)
     k, first, last = (min(int(np.searchsorted(mine, one)), len(mine) - 1) for one in (frame, *span))
     before = float(views.stamped[mine[k - 1]]) if k > 0 else None
     return Onset(
-        views.cameras[camera].name, k, float(views.stamped[mine[k]]), before, first, last, int(views.episodes[mine[k]])
+        views.cameras[camera].name, k, float(views.stamped[mine[k]]), before, first, last, int(views.episodes[mine[k]]),
+        k - int(np.flatnonzero(views.episodes[mine] == views.episodes[mine[k]])[0]),
     )  # fmt: skip
 
 
 def _stamp(views: RecordedViews, onset: Onset) -> str:
-    return f"{onset.time_s:.3f} s" if views.timed else f"index {onset.time_s:g}"
+    stamp = f"{onset.time_s:.3f} s" if views.timed else f"index {onset.time_s:g}"
+    several = len(np.unique(views.episodes)) > 1
+    return f"{stamp}; frame {onset.in_episode} of episode {onset.episode}" if several else stamp
+
+
+def _episodes(views: RecordedViews, frames: BoolArray | IntArray) -> tuple[int, ...]:
+    return tuple(np.unique(views.episodes[frames]).tolist())
 
 
 def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float | None, str]:
@@ -278,6 +296,8 @@ def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float 
 
 
 def _sentence(model: CellModel, one: Hypothesis, value: float | None, deviation: float | None) -> str:
+    if one.kind == "joint" and value is None:
+        return f"zero of joint {one.subject} drifted"
     if one.kind != "stamps":
         return SENTENCES[one.kind](model, one.subject, value, deviation)
     if value is None or deviation is None:
@@ -305,7 +325,7 @@ def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> Recor
         text += f"; or {or_else}: the recording does not tell. What would: {tells}"
     return RecordingCause(
         _KINDS[one.kind], one.subject, f"{text}; {change.effect_px:.3g} px rms", onset, change.effect_px,
-        value, deviation, unit, or_else, tells,
+        value, deviation, unit, or_else, tells, _episodes(views, change.frames),
     )  # fmt: skip
 
 
@@ -344,6 +364,7 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
                 value=float(total),
                 deviation=0.0,
                 unit="frames",
+                episodes=_episodes(views, np.array([hole.frame for hole in holes])),
                 gaps=tuple((int(ranks[hole.frame]), hole.missing) for hole in holes[:MOST_GAPS]),
             )
         )
@@ -356,8 +377,9 @@ def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
     errors = {one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture])) for one in joints}
     if reference.fits or not errors:
         return []
-    listed = ", ".join(f"{name} {error:.2g}" for name, error in errors.items())
-    worst = max(errors, key=lambda name: errors[name])
+    pixels = {one.name: one.pixels for one in joints}
+    listed = ", ".join(f"{name} {error:.2g} ({pixels[name]:.2g} px)" for name, error in errors.items())
+    worst = max(pixels, key=lambda name: pixels[name])
     return [
         RecordingCause(
             "joint_errors",
@@ -395,6 +417,7 @@ def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames
             "stands still, and frames at rest, would tell pictures from joints",
             onset,
             _rms(_residuals_px(problem)),
+            episodes=_episodes(views, problem.data.stop[(here**2).reshape(-1, 2).sum(axis=1) > UNLIKELY]),
         )
     ]
 
@@ -403,28 +426,31 @@ def _not_learnt(
     views: RecordedViews, failed: LearningError, lost: list[RecordingCause], dropped: _Gaps
 ) -> RecordingReport:
     """The report where no model can be learnt: the refusal of the fit is the cause, with the frame of its stop."""
-    error = failed.error
-    onset: Onset | None = None
+    error, frames = failed.error, failed.stops.frames
     names = [camera.name for camera in views.cameras]
     stop, camera = error.data.get("stop"), error.data.get("camera")
-    if isinstance(stop, int) and 0 <= stop < len(failed.stops.frames):
-        frames = failed.stops.frames
+    kind = _REFUSALS.get(error.code, "not_learnt")
+    found: tuple[int, Step] | None = None
+    message = error.message
+    if isinstance(stop, int) and 0 <= stop < len(frames):
         c = names.index(camera) if camera in names else int(views.camera[frames[stop]])
-        step = step_near(views, c, frames, stop)
-        onset = _onset(views, step.onset, step.span, c)
-    kind: RecordingCauseKind = "not_learnt"
-    if error.code == "camera_moved":
-        kind = "camera_moved"
-    elif error.code == "marker_slipped":
-        kind = "marker_slipped"
-    cause = RecordingCause(kind, str(camera or error.data.get("joint", "")), error.message, onset)
+        found = c, step_near(views, c, frames, stop)
+    elif views.generators is None and (found := step_of_one_camera(views, frames)) is not None:
+        kind, camera = "camera_moved", names[found[0]]
+    if kind == "camera_moved":
+        # The stops that the refusal names may be some beside the step.
+        message = f"camera {camera} moved: all markers jump in its pictures and stay off, in no other camera"
+    onset = None if found is None else _onset(views, found[1].onset, found[1].span, found[0])
+    if onset is not None:
+        message += f"; from frame {onset.frame} of camera {onset.camera} on ({_stamp(views, onset)})"
+    cause = RecordingCause(kind, str(camera or error.data.get("joint", "")), message, onset)
     cameras = {
         name: CameraResiduals(int((views.camera == c).sum()), None, _count(dropped[name]))
         for c, name in enumerate(names)
     }
     return RecordingReport(
         None, None, None, "", cameras, {}, {}, (cause, *lost),
-        ("no model could be learnt, so that nothing else was examined",), None, 0,
+        (f"no model could be learnt, so that nothing else was examined: {error.message}",), None, 0,
     )  # fmt: skip
 
 

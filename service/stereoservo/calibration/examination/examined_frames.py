@@ -4,7 +4,7 @@ uncertainty, and what may have happened to them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Literal
 
@@ -22,6 +22,7 @@ from stereoservo.calibration.change.model_changes import (
 )
 from stereoservo.calibration.examination.recorded_views import RecordedViews, frames_apart
 from stereoservo.calibration.joint_errors.joint_noise import joint_columns
+from stereoservo.calibration.rig_model import displacements, predicted
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
@@ -62,8 +63,21 @@ class ExaminedFrames(LinearisedProblem):
         covariance = np.eye(width) + slopes @ slopes.transpose(0, 2, 1)
         return which * width + place, np.linalg.inv(np.linalg.cholesky(covariance))
 
+    @cached_property
+    def _undrifted(self) -> FloatArray:
+        """Displacements (f, 4, 4) of the body where no joint has drifted."""
+        return displacements(self.rig, self.data.offsets)
+
+    def plain_residuals_at(self, state: State) -> FloatArray:
+        """Weighted residuals (2 k,), errors of the joints included."""
+        rig, drift = state
+        if rig.generators is not self.rig.generators or drift.any():
+            return super().residuals_at(state)
+        apart = predicted(rig, self.data, self._undrifted) - self.data.pixels
+        return np.asarray((apart / self.data.sigmas[:, None]).ravel())
+
     def residuals_at(self, state: State) -> FloatArray:
-        return self.without_joint_errors(super().residuals_at(state)[:, None])[:, 0]
+        return self.without_joint_errors(self.plain_residuals_at(state)[:, None])[:, 0]
 
     def without_joint_errors(self, rows: FloatArray) -> FloatArray:
         """Rows (2 k, q) whitened frame by frame."""
@@ -91,6 +105,26 @@ class ExaminedFrames(LinearisedProblem):
         pixels[rows] -= effect
         root = np.hstack([self.root, LOOSE * slopes])
         return replace(self, data=replace(self.data, pixels=pixels), root=root, uncertainty=bounded(root))
+
+
+@dataclass(frozen=True)
+class PartlyChanged(ExaminedFrames):
+    """All frames, of which a changed state is that of some alone: those of the rows ``changed`` (k,)."""
+
+    changed: BoolArray
+
+    @cached_property
+    def _unchanged(self) -> FloatArray:
+        return super().residuals_at((self.rig, np.zeros(len(self.order))))
+
+    def residuals_at(self, state: State) -> FloatArray:
+        return np.where(np.repeat(self.changed, 2), super().residuals_at(state), self._unchanged)
+
+
+def partly_changed(problem: ExaminedFrames, changed: BoolArray) -> PartlyChanged:
+    """The problem in which a change is one of some rows (k,), whole frames."""
+    parts = {field.name: getattr(problem, field.name) for field in fields(problem)}
+    return PartlyChanged(**parts, changed=changed)
 
 
 def examined_frames(model: CellModel, views: RecordedViews, noise_factor: float) -> ExaminedFrames:
@@ -151,11 +185,11 @@ def corrected_views(
     if one.kind != "joint" or not frames.any():
         return None
     shown = views.times[frames]
-    readings = (views.joint_times >= shown[0]) & (views.joint_times <= shown[-1])
-    if frames[0]:
-        readings |= views.joint_times < shown[0]
-    if frames[-1]:
-        readings |= views.joint_times > shown[-1]
+    # Those included between which the joints of the first and the last of the frames are interpolated.
+    begin = int(np.searchsorted(views.joint_times, shown[0], side="right")) - 1
+    end = int(np.searchsorted(views.joint_times, shown[-1]))
+    index = np.arange(len(views.joint_times))
+    readings = (frames[0] | (index >= begin)) & (frames[-1] | (index <= end))
     positions = views.positions.copy()
     positions[readings, views.joint_names.index(one.subject)] += x
     return replace(views, positions=positions)

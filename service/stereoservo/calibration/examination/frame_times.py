@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.calibration.examination.recorded_views import ALONE, RecordedViews
+from stereoservo.calibration.examination.recorded_views import ALONE, AT_REST, RecordedViews
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 GAP, JITTERS = 1.5, 6.0
@@ -18,8 +18,8 @@ REGULAR, NEAR = 0.8, 0.25
 
 STOPS_AROUND, NEAR_STOPS = 3, 6
 """Stops to either side that a step is told from, and in which it is looked for."""
-CLEAR = 100.0
-"""Chi-square from which a step is one."""
+CLEAR, ALONE_BY = 100.0, 4.0
+"""Chi-square from which a step is one, and how many times that of any other a step that stands out has."""
 LASTING = 3
 """Frames beside the terms of a course from which a step can be told from it."""
 CREDIBLE = 9.2
@@ -43,6 +43,15 @@ class Step(NamedTuple):
     gain: float
 
 
+def probable_onset(gains: FloatArray) -> tuple[int, int, int]:
+    """Median onset, and the first and last that are not excluded, of those (b,) that explain ``gains`` of chi-square:
+    all are equally likely beforehand.
+    """
+    likely = np.cumsum(np.exp(0.5 * (gains - gains.max())))
+    near = np.flatnonzero(gains >= gains.max() - CREDIBLE)
+    return int(np.searchsorted(likely, 0.5 * likely[-1])), int(near[0]), int(near[-1])
+
+
 def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
     """Gaps in a camera's frames; None where these have neither numbers nor a period."""
     mine = np.flatnonzero(views.camera == camera)
@@ -54,7 +63,7 @@ def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
         every = max(1, int(np.median(counted[same]))) if same.any() else 1
         missing = np.round(counted / every).astype(np.int64) - 1
     else:
-        by_stamps = _missing(np.diff(views.times[mine]), same) if views.timed else None
+        by_stamps = _missing(np.diff(views.times[mine]), same) if views.timed and not views.counted else None
         if by_stamps is None:
             return None
         missing = by_stamps
@@ -107,20 +116,41 @@ def step_between(
 
 
 def step_near(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
-    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,); where there is none, the
-    clearest before another stop near it.
+    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,), or before one near it
+    where that stands out.
     """
+    stated = _step_before(views, camera, frames, stop)
+    near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, len(frames) - 1) + 1)
+    steps = [_step_before(views, camera, frames, k) for k in near]
+    clearest = max(steps, key=lambda one: one.gain, default=stated)
+    return clearest if clearest.gain >= ALONE_BY * stated.gain else stated
+
+
+def step_of_one_camera(views: RecordedViews, frames: IntArray) -> tuple[int, Step] | None:
+    """The camera whose pixels alone step before one of the stops that begin at ``frames`` (s,), and the step; None
+    where there is none that stands out, among all stops and cameras, and with the arm at rest too.
+    """
+    stops = range(1, len(frames))
+    cameras = range(len(views.cameras))
+    found = {(c, k): _step_before(views, c, frames, k) for c in cameras for k in stops}
+    if not found:
+        return None
+    camera, stop = max(found, key=lambda one: found[one].gain)
+    best = found[camera, stop]
+    others = [one.gain for (c, k), one in found.items() if c != camera or abs(k - stop) > 1]
+    resting = views.select(views.speeds(views.times) <= AT_REST)
+    begin = np.searchsorted(resting.times, views.times[frames])
+    still = _step_before(resting, camera, begin, stop)
+    if best.gain < max(CLEAR, ALONE_BY * max(others, default=0.0)) or still.gain < CLEAR:
+        return None
+    return camera, best
+
+
+def _step_before(views: RecordedViews, camera: int, frames: IntArray, stop: int) -> Step:
+    """The step of a camera's pixels before a ``stop`` of those that begin at ``frames`` (s,)."""
     last = len(frames) - 1
-
-    def before(k: int) -> Step:
-        around = int(frames[max(0, k - STOPS_AROUND)]), int(frames[min(k + STOPS_AROUND, last)])
-        return step_between(views, camera, around, (int(frames[max(0, k - 1)]), int(frames[k])))
-
-    stated = before(stop)
-    if stated.gain >= CLEAR:
-        return stated
-    near = range(max(1, stop - NEAR_STOPS), min(stop + NEAR_STOPS, last) + 1)
-    return max([stated, *map(before, near)], key=lambda one: one.gain)
+    around = int(frames[max(0, stop - STOPS_AROUND)]), int(frames[min(stop + STOPS_AROUND, last)])
+    return step_between(views, camera, around, (int(frames[max(0, stop - 1)]), int(frames[stop])))
 
 
 def _misfit(design: FloatArray, views: RecordedViews, frames: IntArray, marker: int) -> float:

@@ -20,7 +20,7 @@ from stereoservo.calibration.examination.examined_frames import (
     frames_concerned,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import CREDIBLE
+from stereoservo.calibration.examination.frame_times import probable_onset
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
     AS_GOOD,
@@ -36,12 +36,16 @@ MENDS, TRIED = 2, 2
 """Times that something is taken back, and changes that are tried for each."""
 FREE = 30.0
 """Deviations of the model that count as one: what a change of the model explains says nothing."""
+ALIKE = 0.98
+"""Share of what a change explains from which another one, from the same frames on, is not told apart from it."""
 EXPLAINS = 0.05
 """Share of chi-square that a change must explain beside the model to be tried."""
 
 
 class _Step(NamedTuple):
-    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; ``share`` of chi-square it explains."""
+    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; ``share`` of chi-square it explains,
+    ``beside`` another hypothesis that explains nearly as much.
+    """
 
     hypothesis: Hypothesis
     onset: int
@@ -49,6 +53,7 @@ class _Step(NamedTuple):
     x: float
     deviation: float
     share: float
+    beside: Hypothesis | None = None
 
 
 def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
@@ -85,6 +90,12 @@ def _better(
         again = None if mended is None else _learnt(mended)
         if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
             offsets = reference.offsets + again.offsets
+            alike = [
+                other.hypothesis for other in steps
+                if other is not step and other.share >= ALIKE * step.share
+                and max(step.span[0], other.span[0]) <= min(step.span[1], other.span[1])
+            ]  # fmt: skip
+            step = step._replace(beside=alike[0] if alike else None)
             return again.put_right(mended), replace(again, offsets=offsets), step
     return None
 
@@ -122,14 +133,13 @@ def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset:
     information = whole - (shared**2).sum(axis=1)
     known = information > 1e-9 * np.maximum(whole, 1e-300)
     gain = np.where(known, moment**2 / np.where(known, information, 1.0), 0.0)
-    best = int(np.argmax(gain))
     chi2 = float(here @ problem.whitened(here))
-    level = max(1.0, (chi2 - float(gain[best])) / len(here))
-    near = onsets[gain >= gain[best] - CREDIBLE * level]
+    level = max(1.0, (chi2 - float(gain.max())) / len(here))
+    best, first, last = probable_onset(gain / level)
     if not known[best]:
         return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
     return _Step(
-        one, int(onsets[best]), (int(near[0]), int(near[-1])), float(-moment[best] / information[best]),
+        one, int(onsets[best]), (int(onsets[first]), int(onsets[last])), float(-moment[best] / information[best]),
         float(np.sqrt(level / information[best])), float(gain[best]) / max(chi2, 1e-300),
     )  # fmt: skip
 
@@ -150,4 +160,10 @@ def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> Cha
     one = named[step.hypothesis.kind, step.hypothesis.subject]
     left = _step(free, views, one, step.onset)
     deviation = float(np.hypot(left.deviation, left.x)) if np.isfinite(left.deviation) else step.deviation
-    return change_of(problem, views, one, step.onset, step.span, step.x, deviation)
+    report = reference.report
+    for joint in () if report is None else report.joints:
+        if (one.kind, one.subject) == ("joint", joint.name):
+            # What its readings err by where it stands is not averaged out.
+            deviation = float(np.hypot(deviation, np.hypot(joint.random, joint.repeatable)))
+    found = change_of(problem, views, one, step.onset, step.span, step.x, deviation)
+    return replace(found, runner_up=step.beside)

@@ -38,6 +38,7 @@ class RecordedViews:
     ``times`` (f,) [s], ``numbers`` (f,) as counted by the camera, -1 where nothing counts, ``episodes`` (f,),
     ``pixels`` (f, m, 2) raw [px], NaN where a marker was not seen, ``sigmas`` (f, m) [px]. ``generators`` (n, 4, 4):
     of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
+    ``counted``: whether stamps are a count of frames over their rate, which tells of no drops.
     ``model``: one that the recording holds, for where none can be learnt. ``added`` (f,) [s]: to the stamps, where
     these were found wrong.
     """
@@ -58,6 +59,7 @@ class RecordedViews:
     timed: bool = True
     model: CellModel | None = None
     added: FloatArray | None = None
+    counted: bool = False
 
     @property
     def stamped(self) -> FloatArray:

@@ -29,7 +29,12 @@ from stereoservo.calibration.joint_errors.variance_components import (
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.lens_estimation import prior_of_lenses, starting_lenses, straight_lenses
+from stereoservo.calibration.lens_estimation import (
+    prior_of_lenses,
+    starting_lenses,
+    straight_lenses,
+    straightened,
+)
 from stereoservo.calibration.lens_significance import lens_wanted
 from stereoservo.calibration.rig_model import Measurements, RigModel, displacements, residuals
 from stereoservo.calibration.single_joint_fit import measurements
@@ -58,6 +63,8 @@ MISJUDGED = 1.1
 """Factor on the stated sigmas above which a note says so."""
 ROUGHLY = 1e-6
 """Relative decrease of the cost at which bundles before the last one end."""
+AS_GOOD = 1.1
+"""Variance up to which a bundle of simpler lenses is as good as one whose lenses stay open."""
 ROUNDS = 5
 """Times that the errors of the displacements, and with them the lens model, are estimated again."""
 
@@ -191,7 +198,25 @@ def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _Erro
         elif components is None or (before is not None and components.like(before)):
             break
     solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, solution.lenses)
+    if options.lens == "auto" and every.lens_priors is None and not solution.converged:
+        solution, inliers = _simpler_lenses(solution, every, inliers, options)
     return _ErrorsSeen(solution, every, inliers, components)
+
+
+def _simpler_lenses(
+    open_one: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
+) -> tuple[Solution, BoolArray]:
+    """A bundle of fewer lens terms where those of ``open_one`` stay open and explain next to nothing: the first that
+    converges; ``open_one`` with its ``inliers`` (k,) where there is none.
+    """
+    most = AS_GOOD * variance_factor(open_one)
+    simpler: tuple[LensModel, ...] = ("radial_centre", "radial", "none")
+    for lenses in simpler[simpler.index(open_one.lenses) + 1 if open_one.lenses in simpler else 0 :]:
+        rig = straightened(open_one.rig, every)
+        found, kept = refine_to_convergence(rig, every, "metric", options, lenses)
+        if found.converged and variance_factor(found) <= most:
+            return found, kept
+    return open_one, inliers
 
 
 def in_first_camera(solution: Solution) -> Solution:

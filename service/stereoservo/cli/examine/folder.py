@@ -73,11 +73,13 @@ def read_folder(folder: Path) -> RecordedViews:
     if _time_column(folder / seen[0], table) != key:
         raise CommandError("dataset", f"{folder / seen[0]} has no column {key!r}, which {given[0]} has")
     frames = _marker_frames(folder, table, key) if seen[0] == MARKERS else _pictures(folder, table, key)
-    return _views(frames, stamps[order], names, kinds, positions, generators, key == TIME)
+    return gathered_views(frames, stamps[order], names, kinds, positions, generators, key == TIME)
 
 
-class _Frames:
-    """Frames gathered: by (camera, stamp) its number, episode, and pixels with their deviations by marker."""
+class GatheredFrames:
+    """Frames gathered: by (camera, stamp) its number, episode, and pixels with their deviations by marker; ``sizes``
+    (width, height) of the cameras' pictures.
+    """
 
     def __init__(self, sizes: dict[str, tuple[int, int]]) -> None:
         self.sizes = sizes
@@ -96,10 +98,11 @@ class _Frames:
         return self.seen.setdefault((camera, stamp), (number, episode, {}))[2]
 
 
-def _views(
-    frames: _Frames, stamps: FloatArray, names: tuple[str, ...], kinds: tuple[Kind, ...], positions: FloatArray,
-    generators: FloatArray | None, timed: bool,
+def gathered_views(
+    frames: GatheredFrames, stamps: FloatArray, names: tuple[str, ...], kinds: tuple[Kind, ...], positions: FloatArray,
+    generators: FloatArray | None, timed: bool, counted: bool = False,
 ) -> RecordedViews:  # fmt: skip
+    """The recording of joints ``positions`` (j, n) at ``stamps`` (j,) in their order, and of the frames within."""
     cameras = list(frames.sizes)
     keys = sorted(frames.seen, key=lambda one: (one[1], cameras.index(one[0])))
     inside = [k for k in keys if stamps[0] <= k[1] <= stamps[-1] and (timed or k[1] in stamps)]
@@ -118,6 +121,7 @@ def _views(
         np.array([cameras.index(key[0]) for key in inside], dtype=np.int64), np.array([key[1] for key in inside]),
         np.array([frames.seen[key][0] for key in inside], dtype=np.int64),
         np.array([frames.seen[key][1] for key in inside], dtype=np.int64), pixels, sigmas, generators, timed,
+        counted=counted,
     )  # fmt: skip
 
 
@@ -174,14 +178,14 @@ def _poses(
 # -- pictures and pixels --------------------------------------------------------------------------------------
 
 
-def _marker_frames(folder: Path, rows: Rows, key: str) -> _Frames:
+def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
     path, listed = folder / MARKERS, folder / CAMERAS
     sizes = {
         row["camera"]: (_whole(listed, k, row, "width", 1), _whole(listed, k, row, "height", 1))
         for k, row in enumerate(_table(listed, ("camera", "width", "height")), 2)
     }  # fmt: skip
     _require(path, rows, ("camera", "marker", "u", "v"))
-    frames = _Frames(sizes)
+    frames = GatheredFrames(sizes)
     for line, row in enumerate(rows, 2):
         seen = frames.of(path, line, row, key)
         if not row["marker"]:
@@ -197,12 +201,12 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> _Frames:
     return frames
 
 
-def _pictures(folder: Path, rows: Rows, key: str) -> _Frames:
+def _pictures(folder: Path, rows: Rows, key: str) -> GatheredFrames:
     path = folder / FRAMES
     _require(path, rows, ("camera", "file"))
     cameras = list(dict.fromkeys(row["camera"] for row in rows))
-    detectors = {camera: _detector(folder / DETECTOR, camera) for camera in cameras}
-    frames = _Frames({})
+    detectors = {camera: stated_detector(folder / DETECTOR, camera) for camera in cameras}
+    frames = GatheredFrames({})
     found = dict.fromkeys(cameras, 0)
     for line, row in enumerate(rows, 2):
         image = cv2.imread(str(folder / row["file"]), cv2.IMREAD_GRAYSCALE)
@@ -212,13 +216,8 @@ def _pictures(folder: Path, rows: Rows, key: str) -> _Frames:
         if frames.sizes.setdefault(camera, size) != size:
             raise _wrong(path, line, "file", row["file"], f"a picture of {frames.sizes[camera]}, not {size}")
         seen = frames.of(path, line, row, key)
-        shown = detectors[camera].detect(Frame(camera, line, 0, 0, image), None)
-        spread = np.sqrt(0.5 * np.trace(shown.covariances, axis1=1, axis2=2))
-        for marker, (u, v), sigma in zip(
-            shown.ids.tolist(), shown.pixels.tolist(), spread.tolist(), strict=True
-        ):
-            seen[int(marker)] = u, v, sigma
-        found[camera] += bool(len(shown.ids))
+        seen.update(detected(detectors[camera], camera, line, image))
+        found[camera] += bool(seen)
     for camera in cameras:
         note(
             f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for row in rows)} pictures"
@@ -226,7 +225,22 @@ def _pictures(folder: Path, rows: Rows, key: str) -> _Frames:
     return frames
 
 
-def _detector(path: Path, camera: str) -> Detector:
+def detected(
+    detector: Detector, camera: str, number: int, image: np.ndarray[Any, Any]
+) -> dict[int, tuple[float, float, float]]:
+    """Pixels and their deviation [px] of each marker that a detector finds in a picture (h, w)."""
+    shown = detector.detect(Frame(camera, number, 0, 0, image), None)
+    spread = np.sqrt(0.5 * np.trace(shown.covariances, axis1=1, axis2=2))
+    return {
+        int(marker): (u, v, sigma)
+        for marker, (u, v), sigma in zip(
+            shown.ids.tolist(), shown.pixels.tolist(), spread.tolist(), strict=True
+        )
+    }
+
+
+def stated_detector(path: Path, camera: str) -> Detector:
+    """The detector of a camera that a file names. Raises CommandError."""
     try:
         stated = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -261,6 +261,7 @@ def _with_drops(views: RecordedViews, truth: _Truth, rng: np.random.Generator) -
 class ExaminedVerdict(msgspec.Struct, frozen=True):
     """Of a case: ``true`` faults, those ``found``, with the ``late_by`` frames of their onsets, those ``missed``,
     causes that are ``falsely`` told, and those that are named beside another, as not told apart (``unsure``).
+    ``not_told``: that nothing but dropped frames was examined, since no model could be learnt.
     """
 
     seed: int
@@ -276,6 +277,7 @@ class ExaminedVerdict(msgspec.Struct, frozen=True):
     sigma_px: float
     size: float
     seconds: float
+    not_told: bool = False
     rms_px: float | None = None
     sizes_in_deviations: tuple[float, ...] = ()
 
@@ -335,10 +337,11 @@ def _judged(case: ExaminedCase, report: RecordingReport, plain: ExaminedVerdict)
     # Of joints that do err it is true, and all that can be told of a drift that the model was learnt with.
     drifted = any(fault.kind == "joint_zero" for fault in case.faults)
     left = [cause for cause in left if cause.kind != "joint_errors" or not (case.imperfect or drifted)]
-    falsely = tuple(f"{cause.kind} {cause.subject}".strip() for cause in left)
+    falsely = tuple(f"{cause.kind} {cause.subject}".strip() for cause in left if cause.kind != "not_learnt")
     return msgspec.structs.replace(
         plain, found=tuple(found), late_by=tuple(late_by), missed=tuple(missed), falsely=falsely, unsure=tuple(unsure),
-        rms_px=report.rms_px, sizes_in_deviations=tuple(round(one, 2) for one in sizes),
+        not_told=any(cause.kind == "not_learnt" for cause in left), rms_px=report.rms_px,
+        sizes_in_deviations=tuple(round(one, 2) for one in sizes),
     )  # fmt: skip
 
 
@@ -381,6 +384,7 @@ def run_examined_recordings(
     rows.append(
         count_row("of those to which nothing was done", sum(bool(c.falsely) for c in quiet), len(quiet))
     )
+    rows.append(count_row("not told, with the reason", sum(c.not_told for c in cases), len(cases)))
     rows.append(count_row("named beside another cause", sum(bool(c.unsure) for c in cases), len(cases)))
     return {
         "experiment": "examined-recordings",
@@ -394,7 +398,7 @@ def run_examined_recordings(
         "beyond": [
             msgspec.to_builtins(c)
             for c in cases
-            if c.missed or c.falsely or any(abs(k) > WITHIN for k in c.late_by)
+            if c.missed or c.falsely or c.not_told or any(abs(k) > WITHIN for k in c.late_by)
         ],
         "cpu_s": round(sum(case.seconds for case in cases), 1),
         "thesis": {"note": "none: the thesis has no recordings"},

@@ -1,0 +1,309 @@
+"""``examine`` of LeRobot data sets: pictures rendered of tags that an arm carries, written as formats 2.1 and 3.0 lay
+them out, read back and judged.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from stereoservo.cli.examine.lerobot import read_data_set
+from stereoservo.cli.main import invoke
+from stereoservo_sim.world.random_cells import random_case
+from stereoservo_sim.world.synthetic import rotation
+
+SEED, FPS, CELLS_PX = 5, 10, 24
+TAGS = (1, 2, 3)
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+CAMERAS = ("up", "side")
+UNITS = "deg,gripper.pos=none"
+BUMPED_FROM = 20
+"""Frame of the second episode from which the camera ``side`` is turned."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Joints (f, n) [rad] of an episode and its pictures (c, f, h, w), with the tags' true corners (c, f, m, 2)."""
+
+    joints: np.ndarray
+    pictures: np.ndarray
+    corners: np.ndarray
+
+
+def tagged_cell():
+    """A random cell whose body is three tags on tilted planes that face the cameras."""
+    cell = random_case(SEED).cell
+    flange = cell.frames(cell.home)[-1]
+    centres = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in cell.poses])
+    middle = flange[:3, :3].T @ (centres.mean(axis=0) - flange[:3, 3])
+    z = middle / np.linalg.norm(middle)
+    x = np.cross([0.3, 0.9, 0.2], z)
+    x /= np.linalg.norm(x)
+    facing = np.column_stack([x, np.cross(z, x), z])
+    side = 70.0 * np.linalg.norm(middle) / float(cell.intrinsics[0, 0, 0])
+    square = 0.5 * side * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+    body = []
+    for k, turn in enumerate((rotation("x", 12.0), rotation("y", 12.0), rotation("y", -12.0))):
+        at = 1.2 * side * np.array([np.cos(2.1 * k), np.sin(2.1 * k), 0.3 * k])
+        body.append((square @ turn[:3, :3].T + at) @ facing.T)
+    return cell.with_body(np.vstack(body))
+
+
+def picture(corners: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A picture (h, w) of tags at their corners (m, 2), drawn at twice the size."""
+    width, height = size
+    image = np.full((2 * height, 2 * width), 170, dtype=np.uint8)
+    for k, tag in enumerate(TAGS):
+        drawn = cv2.aruco.generateImageMarker(DICTIONARY, tag, 6 * CELLS_PX)
+        paper = cv2.copyMakeBorder(drawn, *(4 * [CELLS_PX]), cv2.BORDER_CONSTANT, value=255)
+        begin, end = CELLS_PX - 0.5, 7 * CELLS_PX - 0.5
+        source = np.array([[begin, begin], [end, begin], [end, end], [begin, end]], dtype=np.float32)
+        target = (2.0 * corners[4 * k : 4 * k + 4] + 0.5).astype(np.float32)
+        H = cv2.getPerspectiveTransform(source, target)
+        cv2.warpPerspective(paper, H, image.shape[::-1], image, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT)
+    return cv2.resize(cv2.GaussianBlur(image, (3, 3), 0.6), size, interpolation=cv2.INTER_AREA)
+
+
+def episode(cell, joints: np.ndarray, bumped_from: int | None = None) -> Episode:
+    corners = cell.pixels(joints)
+    if bumped_from is not None:
+        poses = cell.poses.copy()
+        poses[1] = rotation("y", 0.5) @ rotation("x", 0.3) @ poses[1]
+        corners[1, bumped_from:] = replace(cell, poses=poses).pixels(joints[bumped_from:])[1]
+    size = cell.width, cell.height
+    return Episode(joints, np.array([[picture(one, size) for one in camera] for camera in corners]), corners)
+
+
+@cache
+def short() -> list[Episode]:
+    cell = tagged_cell()
+    rng = np.random.default_rng(7)
+    return [episode(cell, cell.held_out(rng, count, 0.3)) for count in (4, 3)]
+
+
+def whole() -> list[Episode]:
+    """Motions of single joints, then work, in which a camera is moved."""
+    cell = tagged_cell()
+    t = np.arange(60)[:, None] / FPS
+    work = cell.home + 0.5 * cell.ranges * np.sin(
+        t * np.linspace(0.6, 1.5, len(cell.home)) + np.arange(len(cell.home))
+    )
+    return [episode(cell, cell.stops(9)[0]), episode(cell, work, BUMPED_FROM)]
+
+
+def info(version: str, episodes: list[Episode], kind: str) -> dict[str, Any]:
+    """``meta/info.json`` as lerobot writes it, without what is not read."""
+    names = [f"joint{k}.pos" for k in range(episodes[0].joints.shape[1])] + ["gripper.pos"]
+    _, _, height, width = episodes[0].pictures.shape
+    features: dict[str, Any] = {
+        "action": {"dtype": "float32", "shape": [len(names)], "names": names},
+        "observation.state": {"dtype": "float32", "shape": [len(names)], "names": names},
+    }
+    for camera in CAMERAS:
+        features[f"observation.images.{camera}"] = {
+            "dtype": kind,
+            "shape": [height, width, 3],
+            "names": ["height", "width", "channels"],
+        }
+    for name, dtype in (("timestamp", "float32"), ("frame_index", "int64"), ("episode_index", "int64")):
+        features[name] = {"dtype": dtype, "shape": [1], "names": None}
+    v2 = version.startswith("v2")
+    return {
+        "codebase_version": version,
+        "robot_type": "so101_follower",
+        "total_episodes": len(episodes),
+        "chunks_size": 1000,
+        "fps": FPS,
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+        if v2
+        else "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+        if v2
+        else "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+        "features": features,
+    }
+
+
+def rows(number: int, one: Episode, kind: str) -> dict[str, pa.Array]:
+    count = len(one.joints)
+    state = np.hstack([np.degrees(one.joints), np.full((count, 1), 37.5)])
+    table = {
+        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32())),
+        "timestamp": pa.array(np.arange(count) / FPS, pa.float32()),
+        "frame_index": pa.array(np.arange(count)),
+        "episode_index": pa.array(np.full(count, number)),
+    }
+    for c, camera in enumerate(CAMERAS if kind == "image" else ()):
+        table[f"observation.images.{camera}"] = pa.array(
+            [{"bytes": cv2.imencode(".png", image)[1].tobytes(), "path": None} for image in one.pictures[c]]
+        )
+    return table
+
+
+def write_video(path: Path, pictures: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    video = cv2.VideoWriter(
+        str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (pictures.shape[2], pictures.shape[1])
+    )
+    for image in pictures:
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
+
+
+def write_table(path: Path, table: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(pa.table(table), path)
+
+
+def write(folder: Path, version: str, episodes: list[Episode], kind: str = "video") -> Path:
+    """A data set as lerobot of that format lays it out: a file an episode, or files that hold several."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info(version, episodes, kind)))
+    tables = [rows(number, one, kind) for number, one in enumerate(episodes)]
+    if version == "v3.0":
+        together = {name: pa.concat_arrays([table[name] for table in tables]) for name in tables[0]}
+        write_table(folder / "data/chunk-000/file-000.parquet", together)
+        begins = np.cumsum([0, *(len(one.joints) for one in episodes)])[:-1] / FPS
+        about: dict[str, Any] = {"episode_index": np.arange(len(episodes))}
+        for c, camera in enumerate(CAMERAS):
+            key = f"observation.images.{camera}"
+            about |= {
+                f"videos/{key}/{part}_index": np.zeros(len(episodes), int) for part in ("chunk", "file")
+            }
+            about[f"videos/{key}/from_timestamp"] = begins
+            pictures = np.concatenate([one.pictures[c] for one in episodes])
+            if kind == "video":
+                write_video(folder / f"videos/{key}/chunk-000/file-000.mp4", pictures)
+        write_table(folder / "meta/episodes/chunk-000/file-000.parquet", about)
+    else:
+        for number, (one, table) in enumerate(zip(episodes, tables, strict=True)):
+            write_table(folder / f"data/chunk-000/episode_{number:06d}.parquet", table)
+            for c, camera in enumerate(CAMERAS if kind == "video" else ()):
+                path = f"videos/chunk-000/observation.images.{camera}/episode_{number:06d}.mp4"
+                write_video(folder / path, one.pictures[c])
+    (folder / "detector.toml").write_text(
+        'detector = "aruco"\n[options]\ntags = [1, 2, 3]\ndictionary = "4x4_50"\n'
+    )
+    return folder
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
+    code = invoke(["examine", *arguments, "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(("version", "kind"), [("v2.1", "video"), ("v3.0", "video"), ("v3.0", "image")])
+def test_joints_and_pictures_of_every_episode_are_read(version: str, kind: str, tmp_path: Path) -> None:
+    episodes = short()
+    views = read_data_set(write(tmp_path / "set", version, episodes, kind), UNITS)
+    assert views.joint_names == tuple(f"joint{k}.pos" for k in range(views.positions.shape[1]))
+    assert [camera.name for camera in views.cameras] == list(CAMERAS)
+    assert views.counted
+    for number, one in enumerate(episodes):
+        for c in range(2):
+            mine = (views.episodes == number) & (views.camera == c)
+            assert np.abs(views.at(views.times[mine]) - one.joints).max() < 1e-6
+            assert views.seen[mine].mean() > 0.7  # tags that are aslant are not found
+            assert np.nanmax(np.abs(views.pixels[mine] - one.corners[c])) < 0.3
+    # Between two episodes the arm is where one ends, then where the next one begins.
+    last = views.times[views.episodes == 0].max()
+    assert np.abs(views.at(np.array([last + 0.1])) - episodes[0].joints[-1]).max() < 1e-6
+
+
+def test_a_data_set_is_judged_by_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write(tmp_path / "set", "v3.0", whole())
+    code, report = told(capsys, str(folder), "--units", UNITS)
+    assert code == 0
+    (cause,) = report["causes"]
+    assert (cause["kind"], cause["subject"], cause["episodes"]) == ("camera_moved", "side", [1])
+    assert cause["onset"]["episode"] == 1
+    assert abs(cause["onset"]["in_episode"] - BUMPED_FROM) <= 2
+    assert report["cameras"]["up"]["dropped"] is None  # stamps that are counted tell of no drops
+    assert report["rms_px"] < 0.3
+    assert invoke(["examine", str(folder), "--units", UNITS]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("  episode 0: ") and "nothing has happened" in line for line in lines)
+    assert any(line.startswith("  episode 1: ") and "camera_moved side" in line for line in lines)
+
+
+def test_pictures_in_lerobots_own_codec_are_read(tmp_path: Path) -> None:
+    """AV1, as lerobot encodes by default."""
+    av = pytest.importorskip("av")
+    folder = write(tmp_path / "set", "v3.0", short())
+    for c, camera in enumerate(CAMERAS):
+        path = folder / f"videos/observation.images.{camera}/chunk-000/file-000.mp4"
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libsvtav1", rate=FPS, options={"crf": "30", "g": "2"})
+            stream.height, stream.width = short()[0].pictures.shape[2:]
+            stream.pix_fmt = "yuv420p"
+            for image in np.concatenate([one.pictures[c] for one in short()]):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
+            container.mux(stream.encode(None))
+    views = read_data_set(folder, UNITS)
+    for c in range(2):
+        truth = np.concatenate([one.corners[c] for one in short()])
+        assert np.nanmax(np.abs(views.pixels[views.camera == c] - truth)) < 0.5
+
+
+def rewritten(folder: Path, **changes: Any) -> None:
+    path = folder / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "damage", "named"),
+    [
+        ([], None, "does not say in what its states are (joint0.pos,"),
+        (["--units", "turns"], None, "joint0.pos is in 'turns'; valid are rad, deg, m, mm"),
+        (["--units", "deg*zero"], None, "joint0.pos is in 'deg*zero'"),
+        (["--units", "deg,hand=none"], None, "'hand=none': the states are joint0.pos"),
+        (["--units", "none"], None, "no state is left"),
+        (["--units", UNITS, "--cameras", "wrist"], None, "the cameras are up, side"),
+        (["--units", UNITS], lambda f: rewritten(f, codebase_version="v1.6"), "v2.0, v2.1, v3.0 are read"),
+        (["--units", UNITS], lambda f: rewritten(f, fps=0), "fps = 0"),
+        (["--units", UNITS], lambda f: rewritten(f, features={}), "no feature 'observation.state'"),
+        (["--units", UNITS], lambda f: (f / "meta/info.json").write_text("{"), "info.json"),
+        (
+            ["--units", UNITS],
+            lambda f: (f / "data/chunk-000/episode_000001.parquet").write_bytes(b"no table"),
+            "episode_000001.parquet",
+        ),
+        (
+            ["--units", UNITS],
+            lambda f: (f / "videos/chunk-000/observation.images.up/episode_000001.mp4").unlink(),
+            "no such video",
+        ),
+        (
+            ["--units", UNITS],
+            lambda f: (f / "videos/chunk-000/observation.images.up/episode_000000.mp4").write_bytes(b"no video"),
+            "no picture 0 (episode 0); 0 could be decoded",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_refused_with_what_would_be_right(
+    arguments: list[str], damage: Any, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write(tmp_path / "set", "v2.1", short())
+    if damage is not None:
+        damage(folder)
+    code, answer = told(capsys, str(folder), *arguments)
+    assert code == 1
+    assert answer["error"]["code"] in ("dataset", "units")
+    assert named in answer["error"]["message"]
+
+
+def test_units_of_a_data_set_are_refused_for_other_recordings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, answer = told(capsys, str(tmp_path), "--units", "deg")
+    assert code == 1
+    assert "are for LeRobot data sets" in answer["error"]["message"]
