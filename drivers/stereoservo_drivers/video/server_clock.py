@@ -23,6 +23,8 @@ RECENT, OF_RECENT, OF_ONE = 10, 3.0, 20.0
 """How many mean delays the fastest of the recent, and one alone, may come after: that one's stamp is not believed."""
 LATE_S = 3.0
 """All pictures of so many seconds are later: the clock was set back, or the way has become longer."""
+LATEST_NS = 1 << 62
+"""Of a stamp: the year 2116."""
 HELD_NS = 15_000_000_000
 """After that neither is known; so long the stamps are refused, until the way has been as it is."""
 
@@ -193,11 +195,12 @@ def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
 
 
 def seconds_in(text: str | None) -> int | None:
-    """Nanoseconds of a header such as ``1700000000.123456``; None where it is none."""
+    """Nanoseconds of a header such as ``1700000000.123456``; None where it is none, or of no century of ours."""
     if text is None or len(text) > 40:
         return None
     whole, _, part = text.strip().partition(".")
     digits = (part + "000000000")[:9]
     if not (whole.isascii() and whole.isdigit() and digits.isascii() and digits.isdigit()):
         return None
-    return int(whole) * 1_000_000_000 + int(digits)
+    found_ns = int(whole) * 1_000_000_000 + int(digits)
+    return found_ns if found_ns < LATEST_NS else None

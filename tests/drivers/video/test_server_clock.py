@@ -125,6 +125,8 @@ def test_the_envelope_is_the_highest_line_below_on_average():
         ("5", 5 * 10**9),
         ("5.1e3", None),
         ("-1", None),
+        ("9223372036", None),
+        ("99999999999999999999", None),
         (None, None),
     ],
 )
