@@ -270,6 +270,8 @@ def rewritten(folder: Path, **changes: Any) -> None:
         (["--units", UNITS, "--cameras", "wrist"], None, "the cameras are up, side"),
         (["--units", UNITS], lambda f: rewritten(f, codebase_version="v1.6"), "v2.0, v2.1, v3.0 are read"),
         (["--units", UNITS], lambda f: rewritten(f, fps=0), "fps = 0"),
+        (["--units", UNITS], lambda f: rewritten(f, chunks_size=0), "chunks_size = 0"),
+        (["--units", UNITS], lambda f: rewritten(f, video_path="{where}.mp4"), "its parts may be video_key, episode_"),
         (["--units", UNITS], lambda f: rewritten(f, features={}), "no feature 'observation.state'"),
         (["--units", UNITS], lambda f: (f / "meta/info.json").write_text("{"), "info.json"),
         (

@@ -139,8 +139,10 @@ def _info(folder: Path) -> Info:
             folder,
             f"format {info.codebase_version!r}; {', '.join(VERSIONS)} are read: lerobot has converters",
         )
-    if not (math.isfinite(info.fps) and info.fps > 0.0):
-        raise _wrong(folder, f"fps = {info.fps}; a positive number is needed")
+    if not (math.isfinite(info.fps) and info.fps > 0.0 and info.chunks_size > 0):
+        raise _wrong(
+            folder, f"fps = {info.fps}, chunks_size = {info.chunks_size}; positive numbers are needed"
+        )
     return info
 
 
@@ -243,16 +245,17 @@ def _tables(folder: Path, part: str, columns: Callable[[list[str]], list[str]]) 
     return found
 
 
+def _required(folder: Path, part: str, needed: list[str], there: list[str]) -> list[str]:
+    """The ``needed`` columns. Raises CommandError where some are not ``there``."""
+    lacking = [name for name in needed if name not in there]
+    if lacking:
+        raise _wrong(folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}")
+    return needed
+
+
 def _rows(folder: Path, info: Info) -> _Rows:
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
-
-    def columns(there: list[str]) -> list[str]:
-        lacking = [name for name in needed if name not in there]
-        if lacking:
-            raise _wrong(folder, f"tables lack {', '.join(lacking)}; they have {', '.join(there)}")
-        return needed
-
-    tables = _tables(folder, "data", columns)
+    tables = _tables(folder, "data", partial(_required, folder, "data", needed))
     try:
         state, stamp, frame, episode = (
             np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
@@ -311,27 +314,28 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
     if info.video_path is None:
         raise _wrong(folder, "info.json has no video_path")
     template = info.video_path
+
+    def file_of(**numbers: int) -> Path:
+        try:
+            return folder / template.format(video_key=key, **numbers)
+        except (KeyError, IndexError, ValueError) as error:
+            names = ", ".join(("video_key", *numbers))
+            raise _wrong(folder, f"video_path = {template!r}; its parts may be {names}") from error
+
     if info.codebase_version != VERSIONS[-1]:
 
         def own_file(episode: int) -> tuple[Path, int]:
-            chunk = episode // info.chunks_size
-            return folder / template.format(episode_chunk=chunk, video_key=key, episode_index=episode), 0
+            return file_of(episode_chunk=episode // info.chunks_size, episode_index=episode), 0
 
         return own_file
     needed = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
-
-    def columns(there: list[str]) -> list[str]:
-        if not set(needed) <= set(there):
-            raise _wrong(folder, f"meta/episodes lacks {', '.join(needed)}")
-        return ["episode_index", *needed]
-
+    columns = partial(_required, folder, "meta/episodes", ["episode_index", *needed])
     places = {}
     for table in _tables(folder, "meta/episodes", columns):
         for episode, chunk, file, begin in zip(
             *(table[name] for name in ("episode_index", *needed)), strict=True
         ):
-            path = folder / template.format(video_key=key, chunk_index=chunk, file_index=file)
-            places[int(episode)] = path, round(begin * info.fps)
+            places[int(episode)] = file_of(chunk_index=chunk, file_index=file), round(begin * info.fps)
 
     def shared_file(episode: int) -> tuple[Path, int]:
         if episode not in places:
@@ -390,7 +394,7 @@ def _stored_pictures(folder: Path, key: str, rows: _Rows, kept: set[int]) -> Ite
         one: row for row, one in enumerate(zip(rows.episode.tolist(), rows.frame.tolist(), strict=True))
     }
     names = [key, "episode_index", "frame_index"]
-    for table in _tables(folder, "data", lambda there: names):
+    for table in _tables(folder, "data", partial(_required, folder, "data", names)):
         for picture, episode, frame in zip(*(table[name] for name in names), strict=True):
             row = row_of[int(episode), int(frame)]
             if row not in kept:
