@@ -1,8 +1,8 @@
 """Compiled least-squares fit of a tag's printed pattern to grey values: first to few pixels, from wherever the start
 is, then to many.
 
-Parameters (16): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
-slopes, black as a part of white, the light's three bends: light that falls off does so on both.
+Parameters (13): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
+slopes, black as a part of white: light that falls off does so on both.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo.numerics.linear import cholesky_solve, factor_solve
 from stereoservo_drivers.detectors.homographies import inverse_of, square_to_quad
 
-PARAMETERS = 16
+PARAMETERS = 13
 QUIET_CELLS = 0.5
 """Fitted part of the white margin [cells]; a printed tag has one cell at least."""
 FEW_PIXELS, MOST_PIXELS = 250, 1500
@@ -152,18 +152,17 @@ def _darken(cells, work, size, across, down):
 
 @reassociating_kernel
 def _differentiate(grey, us, vs, p, n, work, J):
-    """Residuals of the pixels of `_darken` into the last row of ``J`` (17, ...), derivatives of the model into the
+    """Residuals of the pixels of `_darken` into the last row of ``J`` (14, ...), derivatives of the model into the
     others; the model into the first row of ``work``.
     """
     for k in range(grey.size):
         u, v, inverse = us[k], vs[k], work[0, k]
         x, y, dark = work[1, k] / n, work[2, k] / n, work[7, k]
-        s, t = x - 0.5, y - 0.5
-        lit = p[9] + (p[10] + p[13] * s + p[14] * t) * s + (p[11] + p[15] * t) * t
+        lit = p[9] + p[10] * (x - 0.5) + p[11] * (y - 0.5)
         fall = -lit * (1.0 - p[12])
         shade = 1.0 - dark * (1.0 - p[12])
-        along_x = ((p[10] + 2.0 * p[13] * s + p[14] * t) * shade + fall * work[8, k] * n) * inverse
-        along_y = ((p[11] + 2.0 * p[15] * t + p[14] * s) * shade + fall * work[9, k] * n) * inverse
+        along_x = (p[10] * shade + fall * work[8, k] * n) * inverse
+        along_y = (p[11] * shade + fall * work[9, k] * n) * inverse
         along = -(along_x * x + along_y * y)
         J[0, k] = along_x * u
         J[1, k] = along_x * v
@@ -175,13 +174,10 @@ def _differentiate(grey, us, vs, p, n, work, J):
         J[7, k] = along * v
         J[8, k] = fall * work[10, k]
         J[9, k] = shade
-        J[10, k] = shade * s
-        J[11, k] = shade * t
+        J[10, k] = shade * (x - 0.5)
+        J[11, k] = shade * (y - 0.5)
         J[12, k] = lit * dark
-        J[13, k] = shade * s * s
-        J[14, k] = shade * s * t
-        J[15, k] = shade * t * t
-        J[PARAMETERS, k] = grey[k] - lit * shade
+        J[13, k] = grey[k] - lit * shade
         work[0, k] = lit * shade
 
 
@@ -196,7 +192,7 @@ def _shown(p, us, vs):
 
 @reassociating_kernel
 def accumulate(grey, us, vs, cells, p, huber, A, totals):
-    """Normal equations of the fit at parameters ``p`` (16,): the lower triangle of ``A`` (17, 17), whose last row is
+    """Normal equations of the fit at parameters ``p`` (13,): the lower triangle of ``A`` (14, 14), whose last row is
     the right side and the sum of squares.
 
     ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly; a pixel at the
@@ -268,8 +264,7 @@ def cell_errors(grey, us, vs, cells, p, out):
         for j in range(j_first, j_last):
             for i in range(i_first, i_last):
                 dark += cells[j, i] * wy[j - j_first] * wx[i - i_first]
-        s, t = work[1, k] / n - 0.5, work[2, k] / n - 0.5
-        lit = p[9] + (p[10] + p[13] * s + p[14] * t) * s + (p[11] + p[15] * t) * t
+        lit = p[9] + p[10] * (work[1, k] / n - 0.5) + p[11] * (work[2, k] / n - 0.5)
         residual = grey[k] - lit * (1.0 - dark * (1.0 - p[12]))
         for j in range(j_first, j_last):
             for i in range(i_first, i_last):
@@ -340,7 +335,7 @@ def _percentiles(grey):
 
 @kernel
 def _step(A, damping, step):
-    """Solve the normal equations of `accumulate` with ``damping`` times their diagonal, into ``step`` (16,); False:
+    """Solve the normal equations of `accumulate` with ``damping`` times their diagonal, into ``step`` (13,); False:
     singular.
     """
     N, b, scale = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -429,7 +424,7 @@ def _refine(grey, us, vs, cells, p, side, huber, A, totals):
 
 @kernel
 def _clustered(grey, us, vs, cells, p, huber, B):
-    """Covariance ``B`` (16, 16) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
+    """Covariance ``B`` (13, 13) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
     shadow's edge for one, leaves residuals that are alike within a cell, and do not average out as noise does.
     """
     n = cells.shape[0]
@@ -449,7 +444,7 @@ def _clustered(grey, us, vs, cells, p, huber, B):
             if grey[first + k] >= SATURATED and off < 0.0:
                 continue
             off = min(max(off, -huber), huber)
-            row = sums[(min(max(int(j[k]), -1), n) + 1) // 2, (min(max(int(i[k]), -1), n) + 1) // 2]
+            row = sums[min(max(int(j[k]), -1), n) + 1, min(max(int(i[k]), -1), n) + 1]
             for a in range(PARAMETERS):
                 row[a] += J[a, k] * off
     B[:] = 0.0
@@ -463,7 +458,7 @@ def _clustered(grey, us, vs, cells, p, huber, B):
 @kernel
 def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
     """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
-    where the gradient's covariance ``B`` (16, 16) is more than that of such noise; False: the normal equations are
+    where the gradient's covariance ``B`` (13, 13) is more than that of such noise; False: the normal equations are
     singular.
     """
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)

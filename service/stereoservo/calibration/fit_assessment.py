@@ -51,6 +51,10 @@ REMEDIES = {
     "bad_data": "the data are damaged or not of this cell: look at the text, record anew",
     "bad_file": "the file holds no cameras, or what the wished format cannot hold: look at the text",
     "length": "state the distance of two markers that were seen, in metres",
+    "model_does_not_fit": "the model was not refined on-line: `calibrate --check` tells what changed",
+    "step_too_large": "the model was not refined on-line: `calibrate --check` tells what changed; else calibrate anew",
+    "not_better": "the model in use stays: nothing is to be done",
+    "no_covariance": "calibrate anew: a refinement starts from the covariance of a calibration",
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
     "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
     "another calibration.base",

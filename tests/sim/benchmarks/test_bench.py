@@ -119,6 +119,7 @@ def test_unknown_names_are_refused_with_the_list(capfd):
         "calibration",
         "can",
         "cycle",
+        "detectors",
         "faults",
         "features",
         "idle",
