@@ -299,7 +299,8 @@ def test_held_out_poses_of_the_real_arm_are_predicted_better_than_the_reference(
     few = answer["few_poses"]
     assert (few["poses"], few["sets"]) == (12, 10)
     assert few["refused"] <= 2
-    assert few["beyond_4_sigmas"] == 0
+    assert few["corners"] > 600
+    assert few["beyond_4_sigmas"] <= 2  # of so many corners, exp(-8) each: more by chance in 1 of 490 cases
     assert all("not_identifiable" in row["refused"] for row in few["rows"] if "refused" in row)
     assert [len(one["cameras"]) for one in answer["triangulation"]] == [2, 2, 2, 3]
     assert all(one["rms_mm"] <= 0.8 for one in answer["triangulation"])
