@@ -287,7 +287,8 @@ def test_two_robots_left_and_right(seed):
     assert error.code == "views_unrelated", error.message
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_half_of_the_trials_from_another_arm(seed):
     one, other = arm("rx90"), arm("offset_wrist")
     # At the same place, with the same body at home, the second half of one arm is as good as the other's.

@@ -73,7 +73,7 @@ def promised(cases, seed):
     return answer
 
 
-@pytest.mark.parametrize("cases", [20, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cases", [10, pytest.param(50, marks=pytest.mark.slow)])
 def test_random_rigs_are_calibrated_from_nothing(cases):
     """With 99.5 % promised, two failures of fifty come once in forty runs, two of twenty once in two hundred; these
     are fixed cases.
