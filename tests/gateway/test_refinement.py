@@ -129,7 +129,6 @@ class Job:
     """A child process that has refined a model."""
 
     made: ClassVar[list[tuple[str, ...]]] = []
-    ended = True
 
     def __init__(self, module: str, *arguments: str) -> None:
         self.made.append(arguments)
@@ -142,8 +141,8 @@ class Job:
         )  # fmt: skip
         save_model(better, Path(arguments[3]))
 
-    def poll(self) -> tuple[()]:
-        return ()
+    def finished(self) -> bool:
+        return True
 
     def require(self, key: str) -> Any:
         return msgspec.to_builtins(REPORT)

@@ -367,7 +367,16 @@ def acting_order(model: CellModel) -> tuple[int, ...]:
 
 def acting_rig(model: CellModel) -> RigModel:
     """`stratum_rig` with joints in `acting_order`."""
-    rig, order = stratum_rig(model), list(acting_order(model))
+    return _in_acting_order(stratum_rig(model), model)
+
+
+def own_acting_rig(model: CellModel) -> RigModel:
+    """`projective_rig` with joints in `acting_order`."""
+    return _in_acting_order(projective_rig(model), model)
+
+
+def _in_acting_order(rig: RigModel, model: CellModel) -> RigModel:
+    order = list(acting_order(model))
     return RigModel(
         tuple(rig.kinds[j] for j in order), rig.generators[order], rig.cameras, rig.points, rig.lenses
     )

@@ -197,10 +197,7 @@ class CalibrationJobs:
         self.model, self._handed = model, (goal_id, what)
 
     def _poll_check(self, check: CheckJob) -> None:
-        ended = check.ended
-        for _ in check.poll():
-            pass
-        if not ended:
+        if not check.finished():
             return
         try:
             report = check.report()

@@ -86,6 +86,13 @@ class ChildJob:
             self.cancel()
         return self._process.poll() is not None
 
+    def finished(self) -> bool:
+        """Whether it has ended, with all that it said taken in; of its progress nothing is told."""
+        ended = self.ended  # asked first, so that the output before the end is taken in, too
+        for _ in self.poll():
+            pass
+        return ended
+
     def require(self, key: str) -> Any:
         """The value printed under ``key``. Raises FitFailedError with the child's own error, or with how it ended."""
         if key in self.said:

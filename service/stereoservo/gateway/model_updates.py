@@ -120,12 +120,7 @@ class RelocalizationJobs:
     def poll(self) -> None:
         """Once the process has ended, send its model to the core, or report why there is none."""
         fit = self._fit
-        if fit is None:
-            return
-        ended = fit.ended  # read first, so that the output before the end is processed, too
-        for _ in fit.poll():
-            pass
-        if not ended:
+        if fit is None or not fit.finished():
             return
         self._fit = None
         try:
@@ -278,10 +273,7 @@ class RefinementJobs:
             self._refuse(str(error), getattr(error, "code", ""))
 
     def _poll_job(self, job: ChildJob) -> None:
-        ended = job.ended  # read first, so that the output before the end is processed, too
-        for _ in job.poll():
-            pass
-        if not ended:
+        if not job.finished():
             return
         self._job = None
         try:

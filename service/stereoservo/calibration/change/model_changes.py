@@ -26,6 +26,7 @@ from stereoservo.calibration.rig_model import (
     acting_order,
     acting_rig,
     full_charts,
+    own_acting_rig,
     residuals,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
@@ -36,7 +37,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 STEP = 1e-6
 """Step of the finite differences, relative to the size of the scene."""
-ROUNDS = 10
+ROUNDS, HALVINGS = 10, 6
 SETTLED = 1e-3
 """Last step [sigmas] at which an estimate has converged."""
 
@@ -167,7 +168,7 @@ def _stated_uncertainty(
     """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` by the model's stated covariance, and by the
     errors of its joints' readings.
     """
-    slopes, columns = covariance_jacobian(model, stated, data, order)
+    slopes, columns = covariance_jacobian(model, stated, data)
     values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
     root: FloatArray = slopes @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     return np.hstack([root, joint_uncertainty(model, data, order)])
@@ -188,32 +189,26 @@ def joint_uncertainty(model: CellModel, data: Measurements, order: tuple[int, ..
 
 
 def covariance_charts(
-    model: CellModel, stated: ModelCovariance, order: tuple[int, ...]
+    model: CellModel, stated: ModelCovariance
 ) -> tuple[RigModel, Charts, npt.NDArray[np.int64]]:
-    """The model as a rig in its own frame, joints in ``order``, the charts of its covariance there, and which of the
-    covariance's parameters (p,) each parameter of the charts is.
+    """The model as a rig in its own frame, joints in `acting_order`, the charts of its covariance there, and which of
+    the covariance's parameters (p,) each parameter of the charts is.
     """
-    rig = RigModel(
-        tuple(model.joint_kinds[j] for j in order),
-        model.generators[list(order)],
-        np.array([camera.matrix for camera in model.cameras]),
-        model.marker_points,
-        np.array([camera.lens for camera in model.cameras]),
-    )
+    order = acting_order(model)
     charts = Charts(tuple(stated.generators[j] for j in order), stated.cameras, stated.lenses, stated.markers)
     sizes = [len(basis) for basis in stated.generators]
     starts = np.cumsum([0, *sizes])
     columns = np.concatenate([np.arange(starts[j], starts[j + 1]) for j in order])
-    return rig, charts, np.append(columns, np.arange(starts[-1], charts.size))
+    return own_acting_rig(model), charts, np.append(columns, np.arange(starts[-1], charts.size))
 
 
 def covariance_jacobian(
-    model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
+    model: CellModel, stated: ModelCovariance, data: Measurements
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and which of them (p,) each
     column belongs to.
     """
-    rig, charts, columns = covariance_charts(model, stated, order)
+    rig, charts, columns = covariance_charts(model, stated)
     return jacobian(rig, charts, np.zeros(charts.size), data), columns
 
 
@@ -371,29 +366,43 @@ def first_order_gain(problem: LinearisedProblem, cause: ModelChange, here: Float
     return float(moment @ np.linalg.lstsq(information, moment, rcond=None)[0])
 
 
+def lowering_step(
+    x: FloatArray, step: FloatArray, cost: float, seen: Callable[[FloatArray], tuple[FloatArray, float]]
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """The ``step`` from ``x`` (q,), halved until the cost is no more than ``cost``, with the residuals and the cost
+    that are ``seen`` there; None where `HALVINGS` do not lower it.
+    """
+    for _ in range(HALVINGS):
+        here, less = seen(x + step)
+        if less <= cost:
+            return step, here, less
+        step = 0.5 * step
+    return None
+
+
 def estimate_changes(
     problem: LinearisedProblem, found: tuple[ModelChange, ...], start: FloatArray | None = None
 ) -> ChangeEstimate:
     """Least-squares estimate of changes from ``start`` (q,) on, default nothing changed, with the model's
     own uncertainty in the weights.
     """
+
+    def seen(x: FloatArray) -> tuple[FloatArray, float]:
+        here = problem.residuals_at(changed_state(problem, found, x))
+        return here, float(here @ problem.whitened(here))
+
     x = np.zeros(sum(cause.size for cause in found)) if start is None else start
-    here = problem.residuals_at(changed_state(problem, found, x))
-    chi2 = float(here @ problem.whitened(here))
+    here, chi2 = seen(x)
     slopes = change_jacobian(problem, found, x, here)
     for _ in range(ROUNDS):
         whitened = problem.whitened(slopes)
         information = slopes.T @ whitened
-        step = -np.linalg.lstsq(information, whitened.T @ here, rcond=None)[0]
-        for _ in range(6):
-            trial = problem.residuals_at(changed_state(problem, found, x + step))
-            cost = float(trial @ problem.whitened(trial))
-            if cost <= chi2:
-                break
-            step = 0.5 * step
-        else:
+        step = np.asarray(-np.linalg.lstsq(information, whitened.T @ here, rcond=None)[0], dtype=np.float64)
+        lower = lowering_step(x, step, chi2, seen)
+        if lower is None:
             break
-        x, here, chi2 = x + step, trial, cost
+        step, here, chi2 = lower
+        x = x + step
         slopes = change_jacobian(problem, found, x, here)
         if float(step @ information @ step) < SETTLED**2:
             break

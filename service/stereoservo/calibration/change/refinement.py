@@ -21,9 +21,18 @@ from stereoservo.calibration.change.model_changes import (
     bounded,
     covariance_charts,
     joint_uncertainty,
+    lowering_step,
 )
 from stereoservo.calibration.change.model_check import examine_model, make_check_report
-from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, acting_order, residuals, rig_at
+from stereoservo.calibration.rig_model import (
+    Charts,
+    Measurements,
+    RigModel,
+    acting_order,
+    own_acting_rig,
+    residuals,
+    rig_at,
+)
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.trial_data import CalibrationError, StaticObservations, TrialData
 from stereoservo.geometry.distortion import distort
@@ -161,26 +170,26 @@ def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     if stated is None:
         raise NoCovarianceError("the model carries no covariance")
     order = acting_order(base)
-    rig, charts, columns = covariance_charts(base, stated, order)
+    rig, charts, columns = covariance_charts(base, stated)
     axes = covariance_axes(base)
     L = axes[columns]
     B = bounded(joint_uncertainty(base, data, order))
+
+    def seen(z: FloatArray) -> tuple[FloatArray, float]:
+        error = residuals(rig_at(rig, charts, L @ z), data)
+        return error, float(z @ z) + _squares(error, B)
+
     z = np.zeros(L.shape[1])
-    error = residuals(rig, data)
-    cost = _squares(error, B)
+    error, cost = seen(z)
     for _ in range(ROUNDS):
         slopes, J = _slopes(rig, charts, L, z, data, B)
         M = J.T @ slopes
-        step = np.linalg.solve(np.eye(len(z)) + M, -(slopes.T @ error) - z)
-        for _ in range(8):
-            there = residuals(rig_at(rig, charts, L @ (z + step)), data)
-            least = float((z + step) @ (z + step)) + _squares(there, B)
-            if least <= cost:
-                break
-            step = 0.5 * step
-        else:
+        step = np.asarray(np.linalg.solve(np.eye(len(z)) + M, -(slopes.T @ error) - z), dtype=np.float64)
+        lower = lowering_step(z, step, cost, seen)
+        if lower is None:
             break
-        z, error, cost = z + step, there, least
+        step, error, cost = lower
+        z = z + step
         if float(step @ step) < SETTLED**2:
             break
     slopes, J = _slopes(rig, charts, L, z, data, B)
@@ -243,15 +252,8 @@ def _pixels(error: FloatArray, data: Measurements) -> FloatArray:
 
 def _seen(model: CellModel, held: Measurements, samples: TrialData) -> FloatArray:
     """Residuals (2 k,) of a model at measurements of its poses."""
-    order = list(acting_order(model))
-    rig = RigModel(
-        tuple(model.joint_kinds[j] for j in order),
-        model.generators[order],
-        np.array([camera.matrix for camera in model.cameras]),
-        model.marker_points,
-        np.array([camera.lens for camera in model.cameras]),
-    )
-    return residuals(rig, replace(held, offsets=(samples.positions - model.zero)[:, order]))
+    offsets = (samples.positions - model.zero)[:, list(acting_order(model))]
+    return residuals(own_acting_rig(model), replace(held, offsets=offsets))
 
 
 def _refined(base: CellModel, step: RefinementStep, created: str) -> CellModel:

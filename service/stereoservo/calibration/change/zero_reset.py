@@ -140,7 +140,7 @@ def _with_zeros(
     order = list(problem.order)
     here = problem.residuals_at(changed_state(problem, found.changes, found.x))
     weighted = problem.whitened(change_jacobian(problem, found.changes, found.x, here))
-    slopes, columns = covariance_jacobian(model, stated, problem.data, problem.order)
+    slopes, columns = covariance_jacobian(model, stated, problem.data)
     sway = np.empty((len(at), len(stated.covariance)))
     sway[:, columns] = -own @ (weighted.T @ slopes)
     across = sway @ stated.covariance

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from stereoservo.calibration.bundle_adjustment import jacobian
 from stereoservo.calibration.relocalization.camera_resection import Correspondences, entry_jacobian
-from stereoservo.calibration.rig_model import Charts, Measurements, RigModel, acting_order
+from stereoservo.calibration.rig_model import Charts, Measurements, acting_order, own_acting_rig
 from stereoservo.geometry.distortion import lens_jacobian, terms_jacobian
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -116,13 +116,7 @@ def _by_arm(
 ) -> tuple[FloatArray, IntArray]:
     """Derivative (a, 2, q) of the arm's markers by generators and points, and which parameters (q,) these are."""
     order = list(acting_order(model))
-    rig = RigModel(
-        tuple(model.joint_kinds[j] for j in order),
-        model.generators[order],
-        matrices,
-        model.marker_points,
-        lenses,
-    )
+    rig = replace(own_acting_rig(model), cameras=matrices, lenses=lenses)
     charts = Charts(
         tuple(stated.generators[j] for j in order),
         tuple(np.zeros((0, 3, 4)) for _ in matrices),

@@ -29,7 +29,7 @@ from stereoservo.calibration.relocalization.relocalization_words import (
     describe_moved_camera,
     too_uncertain,
 )
-from stereoservo.calibration.rig_model import RigModel, acting_order, displacements
+from stereoservo.calibration.rig_model import acting_order, displacements, own_acting_rig
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -227,16 +227,8 @@ def _averaged(rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray
 
 def _arm_points(model: CellModel, joints: FloatArray) -> FloatArray:
     """The markers (s, m, 4) at joints (s, n)."""
-    order = list(acting_order(model))
-    rig = RigModel(
-        tuple(model.joint_kinds[j] for j in order),
-        model.generators[order],
-        np.array([camera.matrix for camera in model.cameras]),
-        model.marker_points,
-    )
-    found: FloatArray = model.marker_points @ displacements(rig, (joints - model.zero)[:, order]).transpose(
-        0, 2, 1
-    )
+    offsets = (joints - model.zero)[:, list(acting_order(model))]
+    found: FloatArray = model.marker_points @ displacements(own_acting_rig(model), offsets).transpose(0, 2, 1)
     return found
 
 

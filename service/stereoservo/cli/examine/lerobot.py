@@ -229,33 +229,30 @@ def _of_depth(feature: Feature) -> bool:
 # -- tables ---------------------------------------------------------------------------------------------------
 
 
-def _tables(folder: Path, part: str, columns: Callable[[list[str]], list[str]]) -> list[Mapping[str, Any]]:
-    """Columns of all parquet files of a part of a data set, as lists by name."""
+def _tables(folder: Path, part: str, columns: list[str]) -> list[Mapping[str, Any]]:
+    """Columns of all parquet files of a part of a data set, as lists by name. Raises CommandError."""
     from pyarrow import ArrowException, parquet  # an extra of its own: see missing_extra
 
     found = []
     for path in sorted((folder / part).glob("chunk-*/*.parquet")):
         try:
             file = parquet.ParquetFile(path)
-            found.append(file.read(columns=columns(file.schema_arrow.names)).to_pydict())
+            there = file.schema_arrow.names
+            lacking = [name for name in columns if name not in there]
+            if not lacking:
+                found.append(file.read(columns=columns).to_pydict())
         except (OSError, ArrowException) as error:
             raise CommandError("dataset", f"{path}: {error}") from error
+        if lacking:
+            raise _wrong(folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}")
     if not found:
         raise _wrong(folder, f"no {part}/chunk-*/*.parquet")
     return found
 
 
-def _required(folder: Path, part: str, needed: list[str], there: list[str]) -> list[str]:
-    """The ``needed`` columns. Raises CommandError where some are not ``there``."""
-    lacking = [name for name in needed if name not in there]
-    if lacking:
-        raise _wrong(folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}")
-    return needed
-
-
 def _rows(folder: Path, info: Info) -> _Rows:
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
-    tables = _tables(folder, "data", partial(_required, folder, "data", needed))
+    tables = _tables(folder, "data", needed)
     try:
         state, stamp, frame, episode = (
             np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
@@ -329,9 +326,8 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
 
         return own_file
     needed = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
-    columns = partial(_required, folder, "meta/episodes", ["episode_index", *needed])
     places = {}
-    for table in _tables(folder, "meta/episodes", columns):
+    for table in _tables(folder, "meta/episodes", ["episode_index", *needed]):
         for episode, chunk, file, begin in zip(
             *(table[name] for name in ("episode_index", *needed)), strict=True
         ):
@@ -394,7 +390,7 @@ def _stored_pictures(folder: Path, key: str, rows: _Rows, kept: set[int]) -> Ite
         one: row for row, one in enumerate(zip(rows.episode.tolist(), rows.frame.tolist(), strict=True))
     }
     names = [key, "episode_index", "frame_index"]
-    for table in _tables(folder, "data", partial(_required, folder, "data", names)):
+    for table in _tables(folder, "data", names):
         for picture, episode, frame in zip(*(table[name] for name in names), strict=True):
             row = row_of[int(episode), int(frame)]
             if row not in kept:

@@ -20,7 +20,7 @@ from stereoservo.calibration.change.check_trend import find_trend
 from stereoservo.calibration.change.model_check import ModelExamination, examine_model, make_check_report
 from stereoservo.calibration.change.zero_reset import reset_zeros
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
-from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line, trials_file
+from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line, trials_file
 from stereoservo.kinematics.model import ModelFileError, load_model, save_model
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.decoding import RecordBoundary
@@ -76,11 +76,9 @@ def main() -> int:
     parser.add_argument("history", type=Path)
     parser.add_argument("--limit-px", type=float, required=True)
     parser.add_argument("--body-moves", action="store_true", help="the marker body may stand elsewhere")
-    parser.add_argument("--parent", type=int, default=0, help="end with this process")
     parser.add_argument("--reset-to", type=Path, help="model file for the joint zeros reset")
     parser.add_argument("--epoch", type=int, default=0)
-    arguments = parser.parse_args()
-    become_child(arguments.parent)
+    arguments = child_arguments(parser)
     try:
         examined, report = check_and_remember(
             load_trials(arguments.check), arguments.model, arguments.history, arguments.limit_px,

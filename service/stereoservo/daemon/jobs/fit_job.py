@@ -46,12 +46,17 @@ def error_line(error: Exception) -> dict[str, Any]:
     return {"error": {"code": type(error).__name__, "message": str(error), "data": {}}}
 
 
-def become_child(parent: int) -> None:
-    """Lower this process's priority, and let it die with ``parent``, where there is one."""
-    if parent:
-        die_with_parent(parent, signal.SIGKILL)
+def child_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The arguments of this process, whose priority is low from here on, and which dies with its ``--parent``, where
+    there is one.
+    """
+    parser.add_argument("--parent", type=int, default=0, help="end with this process")
+    arguments = parser.parse_args()
+    if arguments.parent:
+        die_with_parent(arguments.parent, signal.SIGKILL)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICENESS)
+    return arguments
 
 
 def _plain(value: object) -> object:
@@ -111,9 +116,7 @@ def main() -> int:
     parser.add_argument("model", type=Path)
     parser.add_argument("--epoch", type=int, required=True)
     parser.add_argument("--known-length", default="", help="WHAT:OF=METRES, for the report")
-    parser.add_argument("--parent", type=int, default=0, help="end with this process")
-    arguments = parser.parse_args()
-    become_child(arguments.parent)
+    arguments = child_arguments(parser)
     result: CalibrationFit | None = None
     try:
         trials = load_trials(arguments.trials)

@@ -21,7 +21,7 @@ from stereoservo.core.cycle import Event, Status
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
-from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line
+from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.kinematics.model import ModelFileError, load_model, save_model
 from stereoservo.numerics.arrays import FloatArray
@@ -140,9 +140,7 @@ def main() -> int:
     parser.add_argument("base", type=Path)
     parser.add_argument("used", type=Path)
     parser.add_argument("new", type=Path)
-    parser.add_argument("--parent", type=int, default=0, help="end with this process")
-    arguments = parser.parse_args()
-    become_child(arguments.parent)
+    arguments = child_arguments(parser)
     try:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         model, report = refine_model(

@@ -23,7 +23,7 @@ from stereoservo.calibration.relocalization.relocalized_model import (
 )
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.core.cycle import Event, decode_array, encode
-from stereoservo.daemon.jobs.fit_job import become_child, error_line, print_line
+from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.files import read_bounded, write_atomically
@@ -60,9 +60,7 @@ def main() -> int:
     parser.add_argument("model", type=Path)
     parser.add_argument("new", type=Path)
     parser.add_argument("--epoch", type=int, required=True)
-    parser.add_argument("--parent", type=int, default=0, help="end with this process")
-    arguments = parser.parse_args()
-    become_child(arguments.parent)
+    arguments = child_arguments(parser)
     try:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         events = load_events(arguments.sights)

@@ -107,7 +107,7 @@ def inverse_kinematics(
     known = recognise(mechanism) if recognition is None else recognition
     problem = replace(problem, displacement=_displacement(problem, known))
     branches = _closed_form(problem, known)
-    if len(problem.points) > len(np.eye(4)):
+    if len(problem.points) > problem.points.shape[1]:
         at_zero, at_goal = equivalent_points(problem.points, problem.targets)
         problem = replace(problem, points=at_zero, targets=at_goal)
     if branches is None:
