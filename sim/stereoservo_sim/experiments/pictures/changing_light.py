@@ -34,7 +34,7 @@ from stereoservo_sim.benchmarks import features_tags
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator, LockstepRefusalError
 from stereoservo_sim.demonstration.truth import true_cell
-from stereoservo_sim.experiments.experiment import cell_text, draw_sorted, show_rows, whole_table
+from stereoservo_sim.experiments.experiment import draw_sorted, show_rows, show_table
 from stereoservo_sim.experiments.pictures.textured import texture
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.summaries import wilson
@@ -332,14 +332,7 @@ def run_changing_light(*, seeds: int, seed: int, progress: ProgressCall) -> dict
 
 def show_changing_light(answer: dict[str, Any], console: Console) -> None:
     """Print both tables."""
-    looked = answer["detectors"]
-    columns = {name: "left" if isinstance(looked[0][name], str) else "right" for name in looked[0]}
-    whole_table(
-        console,
-        "detectors",
-        columns,
-        [[cell_text(row[name]) for name in columns] for row in looked],  # type: ignore[arg-type]
-    )
+    show_table(answer["detectors"], "detectors", console)
     show_rows(answer, console)
 
 
