@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 import machine_stalls
 
@@ -81,12 +83,31 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.config.getoption("--hil") is None:
             processes = item.get_closest_marker("process") is not None
             condition = True if processes else partial(machine_stalled, item)
-            item.add_marker(pytest.mark.flaky(reruns=RERUNS, condition=condition))
+            delay_s = REST_S if processes else 0.0
+            item.add_marker(pytest.mark.flaky(reruns=RERUNS, reruns_delay=delay_s, condition=condition))
+
+
+class LiveFilesInTurn(LoadFileScheduling):
+    """Files with tests of real processes run one after another on one worker: two live cells at once are more than
+    two cores carry, and then either is stopped for the other's sake.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = super()._split_scope(nodeid)
+        return "live" if "pytest.mark.process" in (self.config.rootpath / file).read_text("utf-8") else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveFilesInTurn:
+    """Which worker runs which test."""
+    return LiveFilesInTurn(config, log)
 
 
 STALLS = "STEREOSERVO_TESTS_STALLS"
 """Environment variable of the file of this machine's stalls, for the workers of pytest-xdist."""
 RERUNS = 3
+REST_S = 5.0
+"""[s] Before a test of real processes runs again."""
 STARTED_NS = pytest.StashKey[int]()
 
 
@@ -105,6 +126,14 @@ def pytest_configure(config: pytest.Config) -> None:
         folder.cleanup()
 
     config.add_cleanup(end)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """What the machine did to the tests."""
+    number, longest_s, sum_s = machine_stalls.summary(Path(os.environ[STALLS]))
+    terminalreporter.write_line(
+        f"the machine stood still {number} times, {longest_s:.2f} s at most, {sum_s:.1f} s in all"
+    )
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -34,10 +34,21 @@ def watch(path: Path) -> None:
 
 def longest_stall(path: Path, since_ns: int) -> float:
     """The longest stall that ended after a time [s]; 0 without one."""
+    return max((gap for end, gap in stalls(path) if end > since_ns), default=0) * 1e-9
+
+
+def summary(path: Path) -> tuple[int, float, float]:
+    """How many stalls there were, the longest [s] and their sum [s]."""
+    gaps = [gap * 1e-9 for _, gap in stalls(path)]
+    return len(gaps), max(gaps, default=0.0), sum(gaps)
+
+
+def stalls(path: Path) -> list[tuple[int, int]]:
+    """End [ns, CLOCK_MONOTONIC] and length [ns] of each stall that was noted."""
     if not path.exists():
-        return 0.0
-    stalls = [tuple(map(int, line.split())) for line in path.read_text(encoding="ascii").splitlines()]
-    return max((gap for end, gap in stalls if end > since_ns), default=0) * 1e-9
+        return []
+    lines = (line.split() for line in path.read_text(encoding="ascii").splitlines())
+    return [(int(end), int(gap)) for end, gap in lines]
 
 
 if __name__ == "__main__":

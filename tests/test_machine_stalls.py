@@ -1,4 +1,6 @@
-"""The suite's rule for machines that stall: a failed test runs again only where the machine itself stood meanwhile."""
+"""The suite's rules for shared machines: a failed test runs again only where the machine itself stood meanwhile, and
+files with tests of real processes run one after another.
+"""
 
 import shutil
 import time
@@ -30,13 +32,38 @@ def test_it():
 def test_a_failed_test_runs_again_where_the_machine_stalled(
     stalls: bool, passed: int, pytester: pytest.Pytester
 ) -> None:
-    for name in ("conftest.py", "machine_stalls.py"):
-        shutil.copy(Path(__file__).with_name(name), pytester.path)
-    pytester.makeini("[pytest]\npythonpath = .")
+    settings_of_the_suite(pytester)
     pytester.makepyfile(FAILS_ONCE.format(stalls=stalls))
     result = pytester.runpytest_subprocess("-p", "no:xdist")
     result.assert_outcomes(passed=passed, failed=1 - passed)
     assert ("1 rerun" in result.stdout.str()) == stalls
+    assert f"the machine stood still {2 * stalls} times" in result.stdout.str()
+
+
+LIVE = """
+import os, time, pytest
+
+@pytest.mark.process
+@pytest.mark.parametrize("k", range(4))
+def test_it(k):
+    time.sleep(0.2)
+    with open("workers", "a") as file:
+        file.write(os.environ["PYTEST_XDIST_WORKER"] + "\\n")
+"""
+
+
+def test_files_with_processes_run_on_one_worker(pytester: pytest.Pytester) -> None:
+    settings_of_the_suite(pytester)
+    pytester.makepyfile(test_one=LIVE, test_two=LIVE, test_three=LIVE)
+    pytester.runpytest_subprocess("-n", "2").assert_outcomes(passed=12)
+    assert len(set((pytester.path / "workers").read_text().split())) == 1
+
+
+def settings_of_the_suite(pytester: pytest.Pytester) -> None:
+    """Let a suite in pytester's folder run as this one does."""
+    for name in ("conftest.py", "machine_stalls.py"):
+        shutil.copy(Path(__file__).with_name(name), pytester.path)
+    pytester.makeini("[pytest]\npythonpath = .\nmarkers = process")
 
 
 def test_the_longest_stall_that_ended_later(tmp_path: Path) -> None:
