@@ -29,9 +29,9 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 FREEDOMS = 6
-ACCELERATION_PX = 15.0
+ACCELERATION_PX = 60.0
 """[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
-TURNS = 0.025
+TURNS = 0.00625
 """Share of it by which turns of a target about its own middle move its markers."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0

@@ -30,6 +30,7 @@ from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.experiments.laws.driven_tasks import labelled, picture, saved
 from stereoservo_sim.progress import ProgressCall
+from stereoservo_sim.world.arms.arm_goals import joints_nearby
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell
@@ -62,6 +63,10 @@ MOTIONS = {
 }  # fmt: skip
 RADIUS_M, TILT = 0.1, 0.1
 """Of a target on a turntable from its axis, and of the axis from the line of sight, at most [rad]."""
+SPEED_SHARE, STEP_S, DRAWS = 0.8, 0.05, 100
+"""Of its joints' speed limits, what an arm may need for a motion that is asked of it, looked at in such steps; and how
+many are drawn for one.
+"""
 REST_S, SETTLE_S, JUDGED_S = 1.0, 2.0, 2.0
 """The target stands; then it moves: until the error is judged, and for so long."""
 STEADY_PX = 1.0
@@ -111,7 +116,8 @@ def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict
             f"exact model, {NOISE_PX:g} px noise a marker, cameras at {RATE_HZ:g} Hz, loop at 250 Hz, gain {GAIN:g}/s",
             f"errors are judged from {SETTLE_S:g} s after the target sets out, for {JUDGED_S:g} s, over all markers in "
             "both cameras, by the truth",
-            f"turntables: {RADIUS_M:g} m from the axis, which leaves the line of sight by {TILT:g} rad at most",
+            f"turntables: {RADIUS_M:g} m from the axis, which leaves the line of sight by {TILT:g} rad at most; drawn "
+            f"anew where the arm would need more than {SPEED_SHARE:g} of a joint's speed limit",
             "on a pan-tilt head: one marker in the first camera, by its image alone",
             "followed: with follow_markers; else as a goal that stands",
         ],
@@ -142,11 +148,15 @@ def cell_of(place: str) -> CellFile:
     )  # fmt: skip
 
 
-def motion_of(cell: SimulatedCell, name: str, seed: int, since_ns: int) -> Motion:
-    """One of `MOTIONS` in a cell, along, or about, what the seed says."""
-    way = MOTIONS[name]
+def motion_of(place: str, name: str, seed: int, since_ns: int) -> Motion:
+    """One of `MOTIONS` in a cell, along, or about, what the seed says; of turntables the first that the arm can follow:
+    where it comes near a singularity of its wrist, another.
+    """
+    cell, way = world_of(place), MOTIONS[name]
     if way.turn:
-        return turntable_of(cell, way.turn, seed, since_ns)
+        rng = np.random.default_rng([seed, 29])
+        drawn = (turntable_of(cell, way.turn, rng, since_ns) for _ in range(DRAWS))
+        return next(motion for motion in drawn if share_of_speed(place, motion) <= SPEED_SHARE)
     direction = direction_of(cell, seed)
     return Motion(
         velocity_m_s=_three(way.speed * direction), swing_m=_three(way.amplitude * direction), swing_hz=way.hz,
@@ -161,12 +171,11 @@ def direction_of(cell: SimulatedCell, seed: int) -> FloatArray:
     return found
 
 
-def turntable_of(cell: SimulatedCell, turn: float, seed: int, since_ns: int) -> Motion:
+def turntable_of(cell: SimulatedCell, turn: float, rng: np.random.Generator, since_ns: int) -> Motion:
     """A turntable that turns at ``turn`` [rad/s], either way, its axis `RADIUS_M` beside the target and nearly along
     the line of sight: anywhere round a target before cameras on the arm; beside a workpiece on the body's side, so that
     the arm reaches the body's place all the way.
     """
-    rng = np.random.default_rng([seed, 29])
     to_world = _camera_to_world(cell)
     axis = to_world @ np.array([*rng.uniform(-TILT, TILT, 2), 1.0])
     axis *= rng.choice((-1.0, 1.0)) / np.linalg.norm(axis)
@@ -180,6 +189,23 @@ def turntable_of(cell: SimulatedCell, turn: float, seed: int, since_ns: int) -> 
         turn_rate_deg_s=_three(np.rad2deg(turn) * axis), about_m=_three(RADIUS_M * beside / np.linalg.norm(beside)),
         since_ns=since_ns,
     )  # fmt: skip
+
+
+def share_of_speed(place: str, motion: Motion) -> float:
+    """The largest share of a joint's speed limit that an arm needs to go with the target; 0 of a head, which cannot."""
+    if place == ON_A_HEAD:
+        return 0.0
+    world = world_of(place)
+    limits = np.array([limit.velocity for limit in cell_of(place).safety.limit])
+    stand = world.workpiece.stand if world.workpiece is not None else world.stand
+    assert stand is not None
+    carried = np.linalg.inv(stand) @ world.flange(world.base)
+    start_ns, q, largest = motion.since_ns or 0, world.base, 0.0
+    for elapsed_s in np.arange(0.0, SETTLE_S + JUDGED_S, STEP_S) + STEP_S:
+        wanted = moved_pose(stand, motion.at(start_ns + round(elapsed_s * 1e9))) @ carried
+        before, (q, _) = q, joints_nearby(world.robot, wanted, q)
+        largest = max(largest, float((np.abs(q - before) / (STEP_S * limits)).max()))
+    return largest
 
 
 def _camera_to_world(cell: SimulatedCell) -> FloatArray:
@@ -241,7 +267,7 @@ def under_way(
         goal = _goal(world, law, follows, _judged_by(place, world))
         cell.submit(RunGoal(goal))
         cell.run_for(REST_S)
-        motion = motion_of(world, name, seed, cell.clock.now_ns())
+        motion = motion_of(place, name, seed, cell.clock.now_ns())
         MovedFile(Path(scratch)).write(motion)
         yield cell, goal, motion
 

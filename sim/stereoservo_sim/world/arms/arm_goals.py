@@ -157,17 +157,20 @@ def straight_way(cell: SimulatedCell, q: FloatArray) -> FloatArray | None:
         seen = np.eye(4)
         seen[:3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ start[:3, :3]
         seen[:3, 3] = a + share * (b - a) - seen[:3, :3] @ middle[:3]
-        wanted = _flange_for(cell, seen)
-        for _ in range(3):
-            pose = flange_pose(cell.robot, at)
-            error = np.concatenate(
-                [
-                    wanted[:3, 3] - pose[:3, 3],
-                    LEVER * Rotation.from_matrix(wanted[:3, :3] @ pose[:3, :3].T).as_rotvec(),
-                ]
-            )
-            at = at + np.linalg.pinv(body_jacobian(cell.robot, at, pose[:3, 3]), rcond=1e-4) @ error
-        if float(np.abs(error).max()) > 1e-3 or (at < low).any() or (at > high).any():
+        at, left = joints_nearby(cell.robot, _flange_for(cell, seen), at)
+        if left > 1e-3 or (at < low).any() or (at > high).any():
             return None
         way.append(at)
     return np.array(way)
+
+
+def joints_nearby(robot: Robot, wanted: FloatArray, q: FloatArray) -> tuple[FloatArray, float]:
+    """Joints (n,) near ``q`` (n,) that bring the flange to the pose ``wanted`` (4, 4), by Newton's steps, and what the
+    last of these found left [m, or as much by a turn].
+    """
+    for _ in range(3):
+        pose = flange_pose(robot, q)
+        turn = Rotation.from_matrix(wanted[:3, :3] @ pose[:3, :3].T).as_rotvec()
+        error = np.concatenate([wanted[:3, 3] - pose[:3, 3], LEVER * turn])
+        q = q + np.linalg.pinv(body_jacobian(robot, q, pose[:3, 3]), rcond=1e-4) @ error
+    return q, float(np.abs(error).max())
