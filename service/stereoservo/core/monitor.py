@@ -459,7 +459,7 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
         return None
     verdict = NOISE
     if odd and not _all_late(_cameras(odd), watching, context.settings):
-        bench = bench_now(watching, _cameras(looked_at), arrays, context.settings)
+        bench = bench_now(state, _cameras(looked_at), arrays, context.settings)
         found = diagnosed_beside_joint_errors(bench, proven=state.reanchoring is not None)
         verdict = beside_target(found, state)
     watching.last = [*watching.last[1 - OF :], verdict]

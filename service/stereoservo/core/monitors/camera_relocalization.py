@@ -326,7 +326,7 @@ def _unproven(run: Relocalization, context: StepContext) -> bool:
     moved = _moved(run, context)
     usable = [c for c in looked if (mobile := state.mobile[c]) is None or not mobile.moving]
     run.doubt = (
-        doubt(bench_now(state.watching, usable, context.arrays, settings), moved, run.moved_px)
+        doubt(bench_now(state, usable, context.arrays, settings), moved, run.moved_px)
         if usable
         else f"no camera has shown anything at rest, so {named(run.cameras)} may have moved, or the arm"
     )

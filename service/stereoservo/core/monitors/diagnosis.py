@@ -123,7 +123,7 @@ def unmask_returned(watching: ModelMonitor, known: list[int], context: StepConte
     masked = np.flatnonzero(watching.masked > 0.0)
     if not masked.size:
         return
-    bench = bench_now(watching, known, arrays, context.settings)
+    bench = bench_now(context.state, known, arrays, context.settings)
     found = without_joint_errors(bench, bench.weights)
     innovation = bench.innovation if found is None else found[0]
     for i in masked:

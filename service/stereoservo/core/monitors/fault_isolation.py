@@ -20,9 +20,11 @@ import numpy as np
 from stereoservo.calibration.change.change_detection import ChangeDiagnosis, IsolatedChange, diagnose
 from stereoservo.calibration.change.hypothesis_test import Thresholds, alarm_thresholds
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.monitor_state import ModelDiagnosis, ModelMonitor, VerdictKind
+from stereoservo.core.monitor_state import ModelDiagnosis, VerdictKind
 from stereoservo.core.prediction import MODEL_SIGMA_PX, chain_at, gate_threshold, improbable, used_rows
 from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import CoreState
+from stereoservo.core.target.motion import variance_of_carried
 from stereoservo.kinematics.kernels import image_jacobian, transform_points
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
@@ -344,13 +346,14 @@ def _likely_errors(found: FloatArray) -> bool:
     return float((found * found).sum()) <= improbable(float(found.size))
 
 
-def bench_now(watching: ModelMonitor, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
-    """The newest frames of the cameras ``known``."""
+def bench_now(state: CoreState, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
+    """The newest frames of the cameras ``known``; what is uncertain of a body that moves by itself is noise in them."""
+    watching, beside_px2 = state.watching, MODEL_SIGMA_PX**2 + variance_of_carried(state.target)
     weights = np.zeros((len(known), len(arrays.row_ids)))
     innovation = np.zeros((len(known), len(arrays.row_ids), 2))
     for row, c in enumerate(known):
         sighting = watching.sightings[c]
-        variance = 0.5 * (sighting.spread[:, 0, 0] + sighting.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
+        variance = 0.5 * (sighting.spread[:, 0, 0] + sighting.spread[:, 1, 1]) + beside_px2
         weights[row] = used_rows(watching, sighting) / np.sqrt(variance)
         innovation[row] = sighting.innovation
     newest = max(known, key=lambda c: watching.sightings[c].t_ns)

@@ -29,9 +29,9 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 FREEDOMS = 6
-ACCELERATION_PX = 60.0
+ACCELERATION_PX = 30.0
 """[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
-TURNS = 0.00625
+TURNS = 0.0125
 """Share of it by which turns of a target about its own middle move its markers."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0
@@ -124,6 +124,15 @@ def widen(body: TargetBody, pose_px: float) -> None:
         (pose_px**2 * np.eye(FREEDOMS), SPEED_PX**2 * body.drift, ACCELERATION_PX**2 * body.drift)
     ):
         body.covariance[FREEDOMS * k : FREEDOMS * (k + 1), FREEDOMS * k : FREEDOMS * (k + 1)] = block
+
+
+def variance_of_carried(body: TargetBody | None) -> float:
+    """How uncertain the markers of a body that is the target are in the images, for its motion since it was last seen
+    and followed [px²], of a coordinate; 0 where it is not the target.
+    """
+    return (
+        float(np.trace(body.covariance[:FREEDOMS, :FREEDOMS])) if body is not None and body.carried else 0.0
+    )
 
 
 @kernel
