@@ -51,7 +51,7 @@ def cell_text(name: str, *, joints: str = "", drives: str = "") -> str:
     head, _, tail = text.partition("# Trial motions")
     base = tail[tail.index("base = {") :].partition("\n")[0]
     ranges = ", ".join(f"j{k} = {RANGE}" for k in range(1, 7))
-    speed = "stops = 4\nframes = 2\nsettle_s = 0.05\nspeed_scale = 0.8\n"
+    speed = "stops = 4\nframes = 2\nsettle_s = 0.05\n"
     calibration = f"[calibration]\n{base}\nrange = {{ {ranges} }}\n{speed}"
     head = head.replace('name = "hil-video"', f'name = "{name}"', 1)
     head = re.sub(r'(?m)^background = "pybullet"', 'background = "plain"', head)

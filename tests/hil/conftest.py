@@ -31,6 +31,8 @@ AUXILIARY = (
     '{ name = "light", kind = "digital" }]'
 )
 CELL = "hil"
+ROOM = 1 << 29
+"""Of a file system in memory, to be used [bytes]."""
 QUICK_CALIBRATION = """
 [calibration]
 stops = 5
@@ -57,12 +59,16 @@ def processes(directories: CellDirectories) -> dict[str, int]:
 def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
     """Short directories of their own (a socket's path is limited) for everything that these tests start.
 
-    On hardware (``--hil``) the runtime directory is the user's: its locks keep two daemons off one arm.
+    On hardware (``--hil``) the runtime directory is the user's: its locks keep two daemons off one arm. Else it is in
+    memory, as that of a service is, where there is room: processes that share pages of it do not wait for a disk.
     """
     root = Path(tempfile.mkdtemp(prefix="sshil", dir="/tmp"))
+    memory = Path("/dev/shm")
+    roomy = os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > ROOM
+    runtime = Path(tempfile.mkdtemp(prefix="sshil", dir=memory if roomy else root))
     before = {key: os.environ.get(key) for key in ("STEREOSERVO_RUNTIME_DIR", "STEREOSERVO_STATE_DIR")}
     if request.config.getoption("--hil") is None:
-        os.environ["STEREOSERVO_RUNTIME_DIR"] = str(root / "r")
+        os.environ["STEREOSERVO_RUNTIME_DIR"] = str(runtime)
     os.environ["STEREOSERVO_STATE_DIR"] = str(root / "s")
     yield root
     for key, value in before.items():
@@ -70,6 +76,7 @@ def roots(request: pytest.FixtureRequest) -> Iterator[Path]:
             os.environ.pop(key, None)
         else:
             os.environ[key] = value
+    shutil.rmtree(runtime)
     shutil.rmtree(root)
 
 
