@@ -67,6 +67,8 @@ SPEED_SHARE, STEP_S, DRAWS = 0.8, 0.05, 100
 """Of its joints' speed limits, what an arm may need for a motion that is asked of it, looked at in such steps; and how
 many are drawn for one.
 """
+RANGE_LEFT = 0.1
+"""That such a motion leaves of the joints' ranges [rad]."""
 REST_S, SETTLE_S, JUDGED_S = 1.0, 2.0, 2.0
 """The target stands; then it moves: until the error is judged, and for so long."""
 STEADY_PX = 1.0
@@ -117,7 +119,8 @@ def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict
             f"errors are judged from {SETTLE_S:g} s after the target sets out, for {JUDGED_S:g} s, over all markers in "
             "both cameras, by the truth",
             f"turntables: {RADIUS_M:g} m from the axis, which leaves the line of sight by {TILT:g} rad at most; drawn "
-            f"anew where the arm would need more than {SPEED_SHARE:g} of a joint's speed limit",
+            f"anew where the arm would need more than {SPEED_SHARE:g} of a joint's speed limit, or come within "
+            f"{RANGE_LEFT:g} rad of a joint's range",
             "on a pan-tilt head: one marker in the first camera, by its image alone",
             "followed: with follow_markers; else as a goal that stands",
         ],
@@ -150,7 +153,7 @@ def cell_of(place: str) -> CellFile:
 
 def motion_of(place: str, name: str, seed: int, since_ns: int) -> Motion:
     """One of `MOTIONS` in a cell, along, or about, what the seed says; of turntables the first that the arm can follow:
-    where it comes near a singularity of its wrist, another.
+    where it comes near a singularity of its wrist, or to the end of a joint's range, another.
     """
     cell, way = world_of(place), MOTIONS[name]
     if way.turn:
@@ -192,11 +195,15 @@ def turntable_of(cell: SimulatedCell, turn: float, rng: np.random.Generator, sin
 
 
 def share_of_speed(place: str, motion: Motion) -> float:
-    """The largest share of a joint's speed limit that an arm needs to go with the target; 0 of a head, which cannot."""
+    """The largest share of a joint's speed limit that an arm needs to go with the target, without bound where a joint
+    would leave its range; 0 of a head, which cannot go with it.
+    """
     if place == ON_A_HEAD:
         return 0.0
     world = world_of(place)
-    limits = np.array([limit.velocity for limit in cell_of(place).safety.limit])
+    safety = cell_of(place).safety
+    limits = np.array([limit.velocity for limit in safety.limit])
+    low, high = (np.array([getattr(limit, end) for limit in safety.limit]) for end in ("min", "max"))
     stand = world.workpiece.stand if world.workpiece is not None else world.stand
     assert stand is not None
     carried = np.linalg.inv(stand) @ world.flange(world.base)
@@ -204,6 +211,8 @@ def share_of_speed(place: str, motion: Motion) -> float:
     for elapsed_s in np.arange(0.0, SETTLE_S + JUDGED_S, STEP_S) + STEP_S:
         wanted = moved_pose(stand, motion.at(start_ns + round(elapsed_s * 1e9))) @ carried
         before, (q, _) = q, joints_nearby(world.robot, wanted, q)
+        if (np.minimum(q - low, high - q) < RANGE_LEFT).any():
+            return np.inf
         largest = max(largest, float((np.abs(q - before) / (STEP_S * limits)).max()))
     return largest
 
