@@ -5,6 +5,7 @@ them out, read back and judged.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ from pyarrow import parquet
 
 from stereoservo.cli.examine.lerobot import read_data_set
 from stereoservo.cli.main import invoke
+from stereoservo.cli.output import CommandError
 from stereoservo_sim.world.random_cells import random_case
 from stereoservo_sim.world.synthetic import rotation
 
@@ -301,6 +303,49 @@ def test_what_cannot_be_read_is_refused_with_what_would_be_right(
     assert code == 1
     assert answer["error"]["code"] in ("dataset", "units")
     assert named in answer["error"]["message"]
+
+
+def changed(folder: Path, part: str, name: str, values: list[Any]) -> None:
+    """Another column in the first table of a part of a data set."""
+    path = min((folder / part).glob("chunk-*/*.parquet"))
+    table = parquet.read_table(path)
+    columns = {column: table[column].combine_chunks() for column in table.column_names}
+    write_table(path, columns | {name: pa.array(values)})
+
+
+def without_rows(folder: Path) -> None:
+    for path in (folder / "data").glob("chunk-*/*.parquet"):
+        parquet.write_table(parquet.read_table(path).slice(0, 0), path)
+
+
+UP = "observation.images.up"
+
+
+@pytest.mark.parametrize(
+    ("kind", "damage", "named"),
+    [
+        ("video", lambda f: (f / "meta/info.json").write_text('{"features":' + "[" * 100_000), "info.json"),
+        ("video", lambda f: (f / "meta/info.json").write_bytes(b'{"codebase_version":"\xff"}'), "not UTF-8"),
+        ("video", lambda f: rewritten(f, video_path="{video_key.x}"), "its parts may be video_key"),
+        ("video", lambda f: rewritten(f, video_path="{chunk_index[0]}"), "its parts may be video_key"),
+        ("video", lambda f: rewritten(f, video_path="a" * 5000), "no such video"),
+        ("video", without_rows, "parquet with rows"),
+        ("video", lambda f: changed(f, "data", "timestamp", [{"s": 1}] * 7), "timestamp"),
+        ("video", lambda f: changed(f, "data", "frame_index", [None] * 7), "frame_index"),
+        ("video", lambda f: changed(f, "data", "frame_index", [0] * 7), "is there twice"),
+        ("video", lambda f: changed(f, "data", "timestamp", [0.1 * k for k in range(7, 0, -1)]), "stamped before"),
+        ("video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/chunk_index", [None, 0]), "episode 0"),
+        ("video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/from_timestamp", [0.0, np.nan]), "episode 1"),
+        ("video", lambda f: changed(f, "meta/episodes", "episode_index", [0, None]), "episode None"),
+        ("image", lambda f: changed(f, "data", UP, ["up.png"] * 7), "at frame 0 of episode 0"),
+        ("image", lambda f: changed(f, "data", UP, [{"bytes": "up.png"}] * 7), "at frame 0 of episode 0"),
+    ],
+)  # fmt: skip
+def test_tables_that_lie_are_refused_by_name(kind: str, damage: Any, named: str, tmp_path: Path) -> None:
+    folder = write(tmp_path / "set", "v3.0", short(), kind)
+    damage(folder)
+    with pytest.raises(CommandError, match=re.escape(named)):
+        read_data_set(folder, UNITS)
 
 
 def test_units_of_a_data_set_are_refused_for_other_recordings(

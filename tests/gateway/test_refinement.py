@@ -168,7 +168,8 @@ class Gateway:
         log = SimpleNamespace(
             add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields))
         )
-        link = SimpleNamespace(send_model=lambda model: self.sent.append(model) or True)
+        self.connected = True
+        link = SimpleNamespace(send_model=lambda model: self.sent.append(model) or self.connected)
         self.jobs = RefinementJobs(
             self.settings, True, self.models, link, log, self.calibration, SimpleNamespace(busy=False),  # type: ignore[arg-type]
             self.taught, lambda: RunningGoals(self.running),
@@ -258,6 +259,47 @@ def test_a_verdict_of_the_watch_ends_the_collection(gateway: Gateway) -> None:
     gateway.bench.run(0.2)
     gateway.jobs.poll()
     assert not gateway.sent  # what was found with it is dropped, too
+
+
+def test_a_model_that_the_servo_process_does_not_take_leaves_all_as_it_was(gateway: Gateway) -> None:
+    before, gateway.connected = gateway.taught.goals, False
+    gateway.visit(LEAST_POSES)
+    for _ in range(2):
+        gateway.jobs.poll()
+    assert [model.epoch for model in gateway.sent] == [2]
+    assert gateway.calibration.model is gateway.base
+    assert gateway.models.epochs() == [1]
+    assert gateway.taught.goals == before
+    assert [(e.kind, e.accepted) for e in gateway.told] == [("refined", False)]
+    gateway.connected = True
+    gateway.visit(LEAST_POSES, seed=1)
+    for _ in range(2):
+        gateway.jobs.poll()
+    assert [model.epoch for model in gateway.sent] == [2, 2]
+    with pytest.raises(MessageError, match="just being taken in"):
+        gateway.jobs.restore()  # the core still works with epoch 1
+    gateway.bench.epoch = 2
+    gateway.bench.run(0.2)
+    gateway.connected = False
+    with pytest.raises(MessageError, match="epoch 2 stays in use"):
+        gateway.jobs.restore()
+    assert gateway.models.epochs() == [1, 2]
+    assert {goal.target.model_epoch for goal in gateway.taught.goals.values()} == {2}
+
+
+def test_poses_after_a_verdict_are_judged_as_the_first_ones_were(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Job, "require", lambda *_: msgspec.to_builtins(REPORT) | {"score": None})
+    gateway.visit(2 * LEAST_POSES)
+    assert len(Job.made) == 2
+    assert gateway.told  # a report without a score is told, and ends nothing
+    assert not gateway.told[0].accepted
+    gateway.bench.health = Health("camera_moved", ("left",), text="camera left has moved by 3 px")
+    gateway.bench.run(0.2)
+    gateway.bench.health = Health("ok")
+    gateway.visit(LEAST_POSES, seed=1)
+    assert len(Job.made) == 3
 
 
 def test_nothing_is_refined_where_it_is_not_wanted_or_things_move(tmp_path: Path) -> None:

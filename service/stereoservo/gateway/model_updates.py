@@ -188,6 +188,7 @@ class RefinementJobs:
         self._poses = RestPoses(settings)
         self._cameras = frozenset(camera.name for camera in settings.cameras)
         self._due = LEAST_POSES
+        self._undone = False
         self._epoch = 0
         self._job: ChildJob | None = None
         self._found: tuple[CellModel, RefinementReport] | None = None
@@ -214,7 +215,7 @@ class RefinementJobs:
             return
         if status.model_epoch != self._epoch:
             self._forget("")
-            self._epoch, self._due = status.model_epoch, LEAST_POSES
+            self._epoch, self._due, self._undone = status.model_epoch, LEAST_POSES, False
         health = status.health
         if health.verdict not in ("ok", "unknown") or health.masked or health.reanchoring:
             self._forget(f"the watch over the model finds {health.verdict}: {health.text}")
@@ -238,6 +239,7 @@ class RefinementJobs:
         """Drop all poses, and what is being made of them."""
         dropped = len(self._poses.poses)
         self._poses.clear()
+        self._due = MOST_POSES + 1 if self._undone else LEAST_POSES
         if why and (dropped or self._job is not None):
             self._refuse(f"not refined: {why}. {dropped} rest poses are dropped", "watch")
         self.cancel()
@@ -283,12 +285,14 @@ class RefinementJobs:
             self._refuse(str(error), error.code)
             if error.code not in ("not_better", "too_few_stops"):
                 self._poses.clear()
-        except ModelFileError as error:
+        except (ModelFileError, msgspec.ValidationError) as error:
             self._refuse(str(error))
         job.close()
 
-    def _hand_over(self, used: CellModel, found: CellModel, why: str) -> None:
-        """Use ``found`` in the place of ``used``: a new epoch, for the goals that were taught, too."""
+    def _hand_over(self, used: CellModel, found: CellModel, why: str) -> bool:
+        """Use ``found`` in the place of ``used``: a new epoch, for the goals that were taught, too. False: all is as
+        it was, and told why.
+        """
         epoch = self._models.next_epoch()
         model = msgspec.structs.replace(found, epoch=epoch)
         path = self._models.path(epoch)
@@ -297,12 +301,18 @@ class RefinementJobs:
             self._taught.refine(used, model)
         except (OSError, ModelFileError) as error:
             path.unlink(missing_ok=True)
-            self._refuse(f"the refined model cannot be stored: {error}")
-            return
+            self._refuse(f"model epoch {epoch} cannot be stored: {error}")
+            return False
+        if not self._link.send_model(model):
+            path.unlink(missing_ok=True)
+            self._taught.refine(model, used)
+            self._refuse(
+                f"the servo process does not take model epoch {epoch}; epoch {used.epoch} stays in use"
+            )
+            return False
         self._epoch, self._calibration.model = epoch, model
         self._handed = used.epoch, epoch, f"model epoch {epoch}: {why}"
-        if not self._link.send_model(model):
-            self._refuse(f"the servo process does not take the model; it is saved as {path}")
+        return True
 
     def restore(self) -> str:
         """Bring the calibrated model back that the one in use was refined from, and refine no more until the next
@@ -314,6 +324,10 @@ class RefinementJobs:
         busy = self._calibration.busy or self._relocalization.busy
         if busy or not self._idle or self._running().goals:
             raise MessageError("the arm is at work: wait until no goal runs, or cancel it, then undo again")
+        if self._handed is not None:
+            raise MessageError(
+                f"refined model epoch {used.epoch} is just being taken in: undo again in a moment"
+            )
         base = self._models.of_epoch(used.refined_from)
         if base is None:
             raise MessageError(
@@ -321,9 +335,12 @@ class RefinementJobs:
             )
         self.cancel()
         self._poses.clear()
-        self._due = MOST_POSES + 1
         text = f"the calibrated model epoch {base.epoch} is back, in place of refined epoch {used.epoch}"
-        self._hand_over(used, base, text)
+        if not self._hand_over(used, base, text):
+            raise MessageError(
+                f"refined epoch {used.epoch} stays in use; event `refined` says why nothing was undone"
+            )
+        self._due, self._undone = MOST_POSES + 1, True
         return text
 
     def _refuse(self, message: str, code: str = "") -> None:

@@ -5,7 +5,9 @@ docs/recordings.md has what is read of it.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +27,7 @@ from stereoservo.cli.examine.folder import (
 )
 from stereoservo.cli.output import CommandError, note
 from stereoservo.kinematics.parameterization import Kind
+from stereoservo.messages.decoding import decoding
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 INFO = Path("meta") / "info.json"
@@ -38,6 +41,8 @@ MOST_FRAMES = 6000
 """Frames that are examined; of longer data sets every second one, every third, …"""
 COMPRESSED_PX = 0.1
 """Deviation of pixels in compressed pictures at least, whatever detectors state for others."""
+MOST_COUNTED = 2**40
+"""Number of a frame or an episode at most."""
 COUNTED_S = 1e-3
 """Difference of stamps from the count of frames at which they are that count."""
 
@@ -128,12 +133,15 @@ def read_data_set(
 # -- what the data set is of ----------------------------------------------------------------------------------
 
 
+def _reading(what: Path | str) -> AbstractContextManager[None]:
+    """Boundary around a decoder of ``what``: what it raises becomes a CommandError."""
+    return decoding(lambda cause: CommandError("dataset", f"{what}: {cause}"), (CommandError,))
+
+
 def _info(folder: Path) -> Info:
     path = folder / INFO
-    try:
+    with _reading(path):
         info = msgspec.json.decode(path.read_bytes(), type=Info)
-    except (OSError, msgspec.DecodeError) as error:
-        raise CommandError("dataset", f"{path}: {error}") from error
     if info.codebase_version not in VERSIONS:
         raise _wrong(
             folder,
@@ -231,44 +239,58 @@ def _of_depth(feature: Feature) -> bool:
 
 def _tables(folder: Path, part: str, columns: list[str]) -> list[Mapping[str, Any]]:
     """Columns of all parquet files of a part of a data set, as lists by name. Raises CommandError."""
-    from pyarrow import ArrowException, parquet  # an extra of its own: see missing_extra
+    from pyarrow import parquet  # an extra of its own: see missing_extra
 
     found = []
     for path in sorted((folder / part).glob("chunk-*/*.parquet")):
-        try:
+        with _reading(path):
             file = parquet.ParquetFile(path)
             there = file.schema_arrow.names
             lacking = [name for name in columns if name not in there]
-            if not lacking:
+            if lacking:
+                raise _wrong(
+                    folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}"
+                )
+            if file.metadata.num_rows:
                 found.append(file.read(columns=columns).to_pydict())
-        except (OSError, ArrowException) as error:
-            raise CommandError("dataset", f"{path}: {error}") from error
-        if lacking:
-            raise _wrong(folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}")
     if not found:
-        raise _wrong(folder, f"no {part}/chunk-*/*.parquet")
+        raise _wrong(folder, f"no {part}/chunk-*/*.parquet with rows")
     return found
 
 
 def _rows(folder: Path, info: Info) -> _Rows:
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
     tables = _tables(folder, "data", needed)
-    try:
+    with _reading(f"LeRobot data set {folder}: {', '.join(needed)} are to be numbers, as many in each row"):
         state, stamp, frame, episode = (
             np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
         )
-    except ValueError as error:
-        raise _wrong(folder, f"states of different lengths: {error}") from error
-    state = state.reshape(len(stamp), -1)
-    if state.shape[1] != info.features[STATE].shape[0] or not len(stamp):
+        state = state.reshape(len(stamp), -1)
+        stamp, frame, episode = (values.reshape(len(state)) for values in (stamp, frame, episode))
+    if state.shape[1] != info.features[STATE].shape[0]:
         raise _wrong(
             folder,
             f"{len(stamp)} rows of {state.shape[1]} states; info.json has {info.features[STATE].shape}",
         )
     if not (np.isfinite(state).all() and np.isfinite(stamp).all()):
         raise _wrong(folder, "states or stamps that are not finite")
+    counts = np.concatenate([frame, episode])
+    if not ((counts >= 0.0) & (counts <= MOST_COUNTED) & (counts == np.floor(counts))).all():
+        raise _wrong(
+            folder, f"frame_index and episode_index are to be whole numbers from 0 to {MOST_COUNTED}"
+        )
     order = np.lexsort((frame, episode))
-    return _Rows(episode[order].astype(np.int64), frame[order].astype(np.int64), stamp[order], state[order])
+    episode, frame, stamp = episode[order].astype(np.int64), frame[order].astype(np.int64), stamp[order]
+    together = np.diff(episode) == 0
+    for wrong, what in (
+        (np.diff(frame) == 0, "is there twice"),
+        (np.diff(stamp) < 0.0, "is stamped before the one before it"),
+    ):
+        found = np.flatnonzero(together & wrong)
+        if len(found):
+            row = int(found[0]) + 1
+            raise _wrong(folder, f"frame {frame[row]} of episode {episode[row]} {what}")
+    return _Rows(episode, frame, stamp, state[order])
 
 
 def _one_clock(rows: _Rows) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -313,11 +335,11 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
     template = info.video_path
 
     def file_of(**numbers: int) -> Path:
-        try:
+        names = ", ".join(("video_key", *numbers))
+        with _reading(
+            f"LeRobot data set {folder}: video_path = {template[:200]!r}; its parts may be {names}"
+        ):
             return folder / template.format(video_key=key, **numbers)
-        except (KeyError, IndexError, ValueError) as error:
-            names = ", ".join(("video_key", *numbers))
-            raise _wrong(folder, f"video_path = {template!r}; its parts may be {names}") from error
 
     if info.codebase_version != VERSIONS[-1]:
 
@@ -331,7 +353,12 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
         for episode, chunk, file, begin in zip(
             *(table[name] for name in ("episode_index", *needed)), strict=True
         ):
-            places[int(episode)] = file_of(chunk_index=chunk, file_index=file), round(begin * info.fps)
+            with _reading(
+                f"LeRobot data set {folder}: meta/episodes, episode {episode}, {', '.join(needed)}"
+            ):
+                places[int(episode)] = (
+                    file_of(chunk_index=int(chunk), file_index=int(file)), round(float(begin) * info.fps)
+                )  # fmt: skip
 
     def shared_file(episode: int) -> tuple[Path, int]:
         if episode not in places:
@@ -343,7 +370,7 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
 
 def _decoded(path: Path, wanted: list[_Wanted]) -> Iterator[tuple[int, Picture]]:
     """Pictures of a video in their order. Raises CommandError where it cannot be decoded, or ends before."""
-    if not path.is_file():
+    if not os.path.isfile(path):  # also of a name that the system does not take
         raise CommandError("dataset", f"{path}: no such video")
     pictures, number = _all_pictures(path), -1
     for one in wanted:
@@ -395,12 +422,13 @@ def _stored_pictures(folder: Path, key: str, rows: _Rows, kept: set[int]) -> Ite
             row = row_of[int(episode), int(frame)]
             if row not in kept:
                 continue
-            data = np.frombuffer((picture or {}).get("bytes") or b"", dtype=np.uint8)
-            image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+            at = f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
+            image = None
+            with _reading(f"LeRobot data set {folder}: {at}"):
+                data = np.frombuffer((picture or {}).get("bytes") or b"", dtype=np.uint8)
+                image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
             if image is None:
-                raise _wrong(
-                    folder, f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
-                )
+                raise _wrong(folder, at)
             yield row, image
 
 
