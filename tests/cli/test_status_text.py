@@ -8,7 +8,7 @@ import msgspec
 
 from stereoservo.cli.status import describe
 from stereoservo.messages.status import CameraHealth, Health
-from stereoservo.messages.wire import LoopInfo, StateMessage, decode, encode
+from stereoservo.messages.wire import LoopInfo, RefinementState, StateMessage, decode, encode
 
 STATE = StateMessage(
     cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
@@ -71,3 +71,13 @@ def test_messages_that_could_not_be_taken_are_counted() -> None:
     assert (
         decode(encode(msgspec.structs.replace(STATE, refused_messages=3)), StateMessage).refused_messages == 3
     )
+
+
+def test_how_far_the_refinement_is_and_how_it_is_undone() -> None:
+    assert not any("refine" in line for line in said())
+    assert "  refine  5 rest poses, a model is estimated from 16 on" in said(
+        refinement=RefinementState(5, 16)
+    )
+    (line,) = (one for one in said(refinement=RefinementState(130, None, refined_from=3)) if "refine" in one)
+    assert "no model is estimated before the next calibration or start" in line
+    assert "refined from epoch 3 (`calibrate CELL --undo-refinement`" in line

@@ -25,7 +25,7 @@ from stereoservo.gateway.persistence import ModelStore, TaughtStore
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.goals import TaughtTarget
 from stereoservo.messages.status import Health
-from stereoservo.messages.wire import MessageError, RunningGoals
+from stereoservo.messages.wire import MessageError, RefinementState, RunningGoals
 from stereoservo.ports.devices import CameraObservation
 
 STATE_NS, FRAME_NS = 50_000_000, 30_000_000
@@ -203,8 +203,10 @@ def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Gateway:
 def test_a_refined_model_is_taken_in_between_goals_and_undone(gateway: Gateway) -> None:
     before = gateway.taught.goals["park"]
     gateway.bench.source = "law"  # streams that never end: they rest, but the goal goes on
-    gateway.visit(LEAST_POSES)
-    gateway.visit(3, seed=1)
+    gateway.visit(LEAST_POSES - 1)
+    assert gateway.jobs.state() == RefinementState(LEAST_POSES - 1, LEAST_POSES)
+    gateway.visit(4, seed=1)
+    assert gateway.jobs.state() == RefinementState(LEAST_POSES + 3, 2 * LEAST_POSES, "waiting")
     assert len(Job.made) == 1
     assert not gateway.sent
     gateway.bench.source, gateway.running = "hold", ("queued",)
@@ -226,7 +228,11 @@ def test_a_refined_model_is_taken_in_between_goals_and_undone(gateway: Gateway) 
     found = resolve(TaughtTarget("park"), goal, refined, {})
     assert (found.target, found.note) == (goal.target, "")  # no camera is taken for a moved one
     assert goal.target.model_epoch == 2
+    state = gateway.jobs.state()
+    assert state is not None
+    assert (state.doing, state.refined_from) == ("collecting", 1)
     gateway.jobs.restore()
+    assert gateway.jobs.state() == RefinementState(0, None)
     assert [model.epoch for model in gateway.sent] == [2, 3]
     assert np.array_equal(gateway.sent[-1].cameras[0].matrix, gateway.base.cameras[0].matrix)
     back = gateway.taught.goals["park"]

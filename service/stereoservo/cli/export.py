@@ -88,7 +88,9 @@ def export(
     if file.suffix == ".json":
         if urdf is None and not dh:
             raise CommandError(
-                "usage", f"{file} is a model: --urdf FILE writes it, --dh prints its dimensions"
+                "usage",
+                f"what to write of {file} is not said: of a model --urdf FILE or --dh, of cameras of `calibrate --rig` "
+                "--opencv FILE.yml, --ros DIR or --kalibr FILE.yaml",
             )
         _export_model(file, urdf, dh, length, cell, json)
     elif urdf is not None or dh:

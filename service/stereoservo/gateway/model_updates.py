@@ -24,7 +24,7 @@ from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model
 from stereoservo.messages.goals import ReanchorRefused
-from stereoservo.messages.wire import MessageError, RunningGoals
+from stereoservo.messages.wire import MessageError, RefinementState, RunningGoals
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 
@@ -223,6 +223,21 @@ class RefinementJobs:
             self._poses.add_state(status)
         else:
             self._poses.leave()
+
+    def state(self) -> RefinementState | None:
+        """How far the refinement is; None where nothing is refined."""
+        if not self._on:
+            return None
+        model, poses = self._calibration.model, len(self._poses.poses)
+        doing = (
+            "refining" if self._job is not None else "waiting" if self._found is not None else "collecting"
+        )
+        return RefinementState(
+            poses,
+            self._due if self._due <= MOST_POSES else None,
+            doing,
+            0 if model is None else model.refined_from,
+        )
 
     def _trusted(self, status: Status) -> bool:
         """Whether the core itself goes by all cameras and their stamps, with a valid model, and does not calibrate."""

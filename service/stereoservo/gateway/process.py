@@ -441,6 +441,7 @@ class Gateway:
                 last_event=self.log.last,
                 notes=(*self._calibration.notes, *self._notes.texts),
                 refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
+                refinement=self._refinement.state(),
             )
         elif (
             self._state is not None

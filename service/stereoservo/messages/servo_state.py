@@ -16,7 +16,7 @@ import msgspec
 from stereoservo.messages.files import read_bounded
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Health
-from stereoservo.messages.wire import LoopInfo, StateMessage
+from stereoservo.messages.wire import LoopInfo, RefinementState, StateMessage
 
 STATE_LAYOUT = "ServoState.1"
 """Of the records of `daemon.ipc_messages.ServoState` in their slot."""
@@ -145,6 +145,7 @@ def state_message(
     last_event: int,
     notes: tuple[str, ...] = (),
     refused_messages: int = 0,
+    refinement: RefinementState | None = None,
 ) -> StateMessage:
     """The state in the clients' format; numbers that are not finite are left out.
 
@@ -189,6 +190,7 @@ def state_message(
         last_event=last_event,
         notes=(*notes, *state.notes),
         refused_messages=refused_messages,
+        refinement=refinement,
         progress=_number(status.progress),
         seconds_left=_number(status.seconds_left),
         efforts=_finite(names, status.efforts),

@@ -178,6 +178,19 @@ class LoopInfo(msgspec.Struct, frozen=True):
     records_dropped: int = 0
 
 
+class RefinementState(msgspec.Struct, frozen=True):
+    """How far on-line refinement of the model in use is."""
+
+    poses: int
+    """Different rest poses that are collected."""
+    due: int | None
+    """Number of poses at which a model is estimated next; None: not before the next calibration or start."""
+    doing: str = "collecting"
+    """``collecting``, ``refining``, or ``waiting``: for the arm to rest without a goal, to use a refined model."""
+    refined_from: int = 0
+    """Epoch of the calibrated model that the one in use was refined from; 0: it is a calibrated one."""
+
+
 class StateMessage(msgspec.Struct, frozen=True):
     """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970]."""
 
@@ -225,6 +238,8 @@ class StateMessage(msgspec.Struct, frozen=True):
     """Auxiliary joints [rad or m] and digital outputs (0 or 1), as the driver tells them."""
     refused_messages: int = 0
     """Messages that the gateway could not take since its start: not JSON, of a wrong shape, on a wrong key."""
+    refinement: RefinementState | None = None
+    """With `[calibration] refine`; None: nothing is refined on-line."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):

@@ -298,7 +298,10 @@ def test_real_pairs_as_opencv_has_them(tmp_path: Path, capsys: pytest.CaptureFix
         (["--rig"], "needs a cell file"),
         (["--rig", "--images", "EMPTY", "--board", "9x6", "--pitch", "0.02"], "a folder a camera"),
         (["--rig", "--images", "PICTURES"], "needs --board"),
-        (["--rig", "--images", "PICTURES", "--board", "9x6", "--pitch", "0.02"], "too few places"),
+        (
+            ["--rig", "--images", "PICTURES", "--board", "9x6", "--pitch", "0.02"],
+            "none of the 1 pictures of camera",
+        ),
         ([], "CELL is needed"),
     ],
 )

@@ -171,7 +171,8 @@ def examine_views(views: RecordedViews) -> RecordingReport:
         _rms(left), _rms(before), float(np.median(problem.data.sigmas)), model.stratum,
         _by_camera(views, problem, left, tested, found, dropped), _by_joint(views, problem, left),
         {str(e): _rms(left[views.episodes[problem.data.stop] == e]) for e in np.unique(views.episodes).tolist()},
-        tuple(sorted(causes, key=_when)), () if reference.report is None else tuple(reference.report.notes),
+        tuple(sorted(causes, key=_when)),
+        (*views.notes, *(() if reference.report is None else reference.report.notes)),
         _learnt_from(reference), int(outliers.sum()),
     )  # fmt: skip
 
@@ -410,16 +411,20 @@ def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames
         RecordingCause(
             "unexplained",
             views.cameras[worst].name,
-            f"what is left is {math.sqrt(chi2 / here.size):.3g} times the expected noise and no single change explains "
-            f"it: most in camera {views.cameras[worst].name} ({by_camera[worst]:.3g} times), the largest at frame "
-            f"{onset.frame} of camera {onset.camera} ({math.sqrt(float(frame[one])):.3g} times). Detections that are "
-            "worse than stated, play or errors of the joints (or of the poses), stamps that scatter; a marker that "
-            "stands still, and frames at rest, would tell pictures from joints",
+            f"what is left is {_times(math.sqrt(chi2 / here.size))} times the expected noise and no single change "
+            f"explains it: most in camera {views.cameras[worst].name} ({_times(by_camera[worst])} times), the largest "
+            f"at frame {onset.frame} of camera {onset.camera} ({_times(math.sqrt(float(frame[one])))} times). "
+            "Detections that are worse than stated, play or errors of the joints (or of the poses), stamps that "
+            "scatter; a marker that stands still, and frames at rest, would tell pictures from joints",
             onset,
             _rms(_residuals_px(problem)),
             episodes=_episodes(views, problem.data.stop[(here**2).reshape(-1, 2).sum(axis=1) > UNLIKELY]),
         )
     ]
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.3g}" if ratio < 100.0 else f"{ratio:.0f}"
 
 
 def _not_learnt(
@@ -450,7 +455,7 @@ def _not_learnt(
     }
     return RecordingReport(
         None, None, None, "", cameras, {}, {}, (cause, *lost),
-        (f"no model could be learnt, so that nothing else was examined: {error.message}",), None, 0,
+        (*views.notes, f"no model could be learnt, so that nothing else was examined: {error.message}"), None, 0,
     )  # fmt: skip
 
 

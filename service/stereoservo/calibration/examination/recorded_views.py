@@ -40,7 +40,7 @@ class RecordedViews:
     of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
     ``counted``: whether stamps are a count of frames over their rate, which tells of no drops.
     ``model``: one that the recording holds, for where none can be learnt. ``added`` (f,) [s]: to the stamps, where
-    these were found wrong.
+    these were found wrong. ``notes``: what the reader of the report is to know of the recording.
     """
 
     joint_names: tuple[str, ...]
@@ -60,6 +60,7 @@ class RecordedViews:
     model: CellModel | None = None
     added: FloatArray | None = None
     counted: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def stamped(self) -> FloatArray:

@@ -190,9 +190,14 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
             size = image.shape
             found[key] = detector.detect(Frame(name, len(found), 0, 0, image), None)
         assert size is not None
-        note(
-            f"camera {name}: the body in {sum(o.ids.size > 0 for o in found.values())} of {len(files)} pictures"
-        )
+        shown = sum(o.ids.size > 0 for o in found.values())
+        note(f"camera {name}: the body in {shown} of {len(files)} pictures")
+        if board is not None and not shown:
+            raise CommandError(
+                "images",
+                f"none of the {len(files)} pictures of camera {name!r} shows a board of {board[0]}x{board[1]} inner "
+                "corners: --board counts the corners where four squares meet, 9x6 on a board of 10x7 squares",
+            )
         cameras.append(TrialCamera(name, size[1], size[0]))
         seen[name] = found
     return _stacked(cameras, keys, seen)
