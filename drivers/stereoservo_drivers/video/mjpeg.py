@@ -51,6 +51,7 @@ class MjpegSource:
         self._interrupted = False
         self._over = False
         self._spoiled = 0
+        self._handshake_ns: int | None = None  # of TCP, with the last server asked: there and back once
 
     def open(self) -> None:
         """Connect and read the response's head. Raises DriverError."""
@@ -66,6 +67,8 @@ class MjpegSource:
             url = target
         else:
             raise self._place.error("http", f"sent on more than {REDIRECTIONS} times; use the last address")
+        if self._server_clock is not None and self._handshake_ns is not None:
+            self._server_clock.round_trip(self._handshake_ns)
         self._response = response
         self._parser = MultipartParser(self._boundary(response))
         self._chunked = ChunkedDecoder() if self._is_chunked(response) else None
@@ -91,8 +94,7 @@ class MjpegSource:
         try:
             begun_ns = self._clock.now_ns()
             connection.connect()
-            if self._server_clock is not None and not secure:  # TCP's handshake: there and back once
-                self._server_clock.round_trip(self._clock.now_ns() - begun_ns)
+            self._handshake_ns = None if secure else self._clock.now_ns() - begun_ns
             self._socket = connection.sock
             if self._interrupted:
                 raise self._place.error("closed", "the driver was closed while it connected", retry=True)

@@ -16,6 +16,7 @@ from stereoservo.daemon.lockstep import MemoryVisionLinks
 from stereoservo.daemon.vision import CameraPipeline, camera_loop, run_camera
 from stereoservo.ports.devices import CameraObservation, CountingCameraDriver, DriverError
 from stereoservo_drivers.video.driver import VideoCameraDriver
+from stereoservo_drivers.video.server_clock import ServerClock
 
 from .conftest import HEIGHT, WIDTH, MjpegServer, jpeg, number_of, picture, poll_until
 
@@ -263,6 +264,18 @@ def test_a_redirection_is_followed_and_a_circle_of_them_is_not(camera, server):
             assert refused(camera(other.url)).code == "http"
     finally:
         other.close()
+
+
+def test_the_server_that_sends_on_says_nothing_of_the_clock_of_the_one_that_sends(camera, server, monkeypatch):
+    taken = []
+    monkeypatch.setattr(ServerClock, "round_trip", lambda self, duration_ns: taken.append(duration_ns))
+    near = MjpegServer()
+    try:
+        near.status, near.reply = 302, {"Location": server.url}
+        poll_until(start(camera(near.url, server_clock_s=0.005)), 1)
+    finally:
+        near.close()
+    assert len(taken) == 1
 
 
 def test_user_and_password_are_sent_and_not_told(camera, server):
