@@ -266,7 +266,9 @@ def test_a_redirection_is_followed_and_a_circle_of_them_is_not(camera, server):
         other.close()
 
 
-def test_the_server_that_sends_on_says_nothing_of_the_clock_of_the_one_that_sends(camera, server, monkeypatch):
+def test_the_server_that_sends_on_says_nothing_of_the_clock_of_the_one_that_sends(
+    camera, server, monkeypatch
+):
     taken = []
     monkeypatch.setattr(ServerClock, "round_trip", lambda self, duration_ns: taken.append(duration_ns))
     near = MjpegServer()
