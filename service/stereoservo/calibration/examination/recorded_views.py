@@ -20,6 +20,8 @@ SAME_INSTANT_S = 1e-3
 """Frames of several cameras are of one instant where their stamps are no further apart."""
 SPEED_OVER_S = 0.02
 """Half of the time over which joint speeds are taken."""
+REST_ENDS = 0.3
+"""Share of a rest at either end whose frames, where their stamps are wrong, may show motion; they are of no stop."""
 LEAST_RESTS = 12
 """Rests from which a model is learnt from these alone: a late stamp does not matter there."""
 LEAST_RUN = 4
@@ -189,9 +191,20 @@ def instants(views: RecordedViews) -> IntArray:
         began |= still & np.concatenate([[False], jumped])
         rests = np.where(still, np.cumsum(began) - 1, -1)
         if int(rests.max(initial=-1)) + 1 >= LEAST_RESTS:
-            return np.asarray(rests)
+            return _without_ends(rests, views.times)
     apart = np.diff(views.times, prepend=views.times[:1]) > (SAME_INSTANT_S if views.timed else 0.0)
     return np.asarray(np.cumsum(apart))
+
+
+def _without_ends(rests: IntArray, times: FloatArray) -> IntArray:
+    """Rests (f,) without the frames near their ends; a rest keeps those in its middle, one at least."""
+    kept = rests.copy()
+    for rest in range(int(rests.max()) + 1):
+        mine = np.flatnonzero(rests == rest)
+        first, last = times[mine[0]], times[mine[-1]]
+        away = np.abs(times[mine] - 0.5 * (first + last))
+        kept[mine[(away > (0.5 - REST_ENDS) * (last - first)) & (away > away.min())]] = -1
+    return kept
 
 
 def single_joint_motions(positions: FloatArray) -> IntArray:
