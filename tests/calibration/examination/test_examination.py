@@ -47,8 +47,7 @@ def test_what_was_done_is_told_and_nothing_else(seed: int, kinds: list[str]) -> 
     assert list(verdict.found) == kinds == list(verdict.true)
     assert verdict.falsely == ()
     assert all(abs(frames) <= 2 for frames in verdict.late_by)
-    limit = 6.0 if verdict.imperfect else 5.0  # ripple of the readings is not in the deviation
-    assert all(abs(deviations) < limit for deviations in verdict.sizes_in_deviations)
+    assert all(abs(deviations) < 5.0 for deviations in verdict.sizes_in_deviations)
 
 
 @pytest.mark.slow

@@ -20,8 +20,8 @@ SAME_INSTANT_S = 1e-3
 """Frames of several cameras are of one instant where their stamps are no further apart."""
 SPEED_OVER_S = 0.02
 """Half of the time over which joint speeds are taken."""
-REST_ENDS = 0.3
-"""Share of a rest at either end whose frames, where their stamps are wrong, may show motion; they are of no stop."""
+MOVED = 3.0
+"""Times what noise gives, of the squares by which a frame differs from another of its rest that shows another place."""
 LEAST_RESTS = 12
 """Rests from which a model is learnt from these alone: a late stamp does not matter there."""
 LEAST_RUN = 4
@@ -191,19 +191,28 @@ def instants(views: RecordedViews) -> IntArray:
         began |= still & np.concatenate([[False], jumped])
         rests = np.where(still, np.cumsum(began) - 1, -1)
         if int(rests.max(initial=-1)) + 1 >= LEAST_RESTS:
-            return _without_ends(rests, views.times)
+            return _standing(rests, views)
     apart = np.diff(views.times, prepend=views.times[:1]) > (SAME_INSTANT_S if views.timed else 0.0)
     return np.asarray(np.cumsum(apart))
 
 
-def _without_ends(rests: IntArray, times: FloatArray) -> IntArray:
-    """Rests (f,) without the frames near their ends; a rest keeps those in its middle, one at least."""
+def _standing(rests: IntArray, views: RecordedViews) -> IntArray:
+    """Rests (f,) without the frames that show another place than the one nearest to the middle of the rest, in their
+    camera: where stamps are wrong, the first or the last ones show motion.
+    """
     kept = rests.copy()
     for rest in range(int(rests.max()) + 1):
-        mine = np.flatnonzero(rests == rest)
-        first, last = times[mine[0]], times[mine[-1]]
-        away = np.abs(times[mine] - 0.5 * (first + last))
-        kept[mine[(away > (0.5 - REST_ENDS) * (last - first)) & (away > away.min())]] = -1
+        for camera in range(len(views.cameras)):
+            mine = np.flatnonzero((rests == rest) & (views.camera == camera))
+            if not len(mine):
+                continue
+            times = views.times[mine]
+            middle = mine[np.abs(times - 0.5 * (times[0] + times[-1])).argmin()]
+            apart = np.linalg.norm(views.pixels[mine] - views.pixels[middle], axis=2)
+            sigmas = np.sqrt(views.sigmas[mine] ** 2 + views.sigmas[middle] ** 2)
+            both = np.isfinite(apart) & np.isfinite(sigmas)
+            squares = (np.where(both, apart / sigmas, 0.0) ** 2).sum(axis=1)
+            kept[mine[squares > MOVED * 2.0 * both.sum(axis=1)]] = -1
     return kept
 
 
