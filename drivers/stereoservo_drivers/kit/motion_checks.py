@@ -353,15 +353,19 @@ def keeps_position_limits(bench: JointBench) -> str:
     seconds = min(float((distance / speed).max()) + 0.5, LONGEST_DRIVE_S)
     states = bench.drive(driver, outward * speed, seconds)
     bench.write(driver, zero(driver))
+    times_ns = [*(s.t_ns for s in states), bench.now_ns()]
     state = bench.settle(driver, bench.setup.brake_s)
     beyond = np.max([(s.positions - limit) * outward for s in (*states, state)], axis=0)
     steps = resolutions(driver)
-    allowed = 2.0 * speed * period + 0.5 * speed**2 / acceleration + steps + SLACK
+    silence = float(np.diff(times_ns).max()) * 1e-9  # longer than a cycle on a machine that stalls
+    unled = period + min(max(silence, period), 1.5 * description.command_timeout_s)
+    allowed = unled * speed + 0.5 * speed**2 / acceleration + steps + SLACK
     worst = int(np.argmax(beyond - allowed))
     name = description.joints[worst].name
     require(
         bool(beyond[worst] <= allowed[worst]),
-        f"joint {name} goes {beyond[worst]:.3g} rad or m beyond its limit; {allowed[worst]:.3g} is allowed (braking)",
+        f"joint {name} goes {beyond[worst]:.3g} rad or m beyond its limit; {allowed[worst]:.3g} is allowed (braking, "
+        f"and {1e3 * unled:.3g} ms until the next command)",
     )
     before = bench.read(driver).positions
     bench.drive(driver, -outward * 0.2 * speed, 0.3)

@@ -18,9 +18,11 @@ from stereoservo_drivers.kit.watchdog import CommandWatchdog
 
 from .faulty_drivers import (
     FAULTY,
+    LOW,
     ConfigureFails,
     Driver,
     LimitsInDegrees,
+    LimitsNotKept,
     OptionsRefused,
     ReadFailsInConfigure,
     ReadsFeedTheWatchdog,
@@ -121,6 +123,40 @@ def test_outputs_are_left_as_they_were_found(tmp_path):
     result = run_check(check, Kept(), tmp_path)
     assert (result.verdict, result.measured) == ("passed", "gripper 0.01, valve 1")
     assert made[-1].read_auxiliary() == {"gripper": pytest.approx(0.01), "valve": 0.0}
+
+
+@pytest.mark.parametrize("stall_s", [0.03, 1.5])
+@pytest.mark.parametrize(
+    ("name", "driver", "verdict"),
+    [
+        ("keeps position limits", Driver, "passed"),
+        ("keeps position limits", LimitsNotKept, "failed"),
+        ("agrees with its velocities", Driver, "passed"),
+    ],
+)
+def test_a_computer_that_stands_still_is_no_fault_of_the_driver(name, driver, verdict, stall_s, tmp_path):
+    (check,) = (check for check in JOINT_CHECKS if check.name == name)
+
+    class Stalling(SmallSetup):
+        """Stands still once: at a joint's limit, or beyond the middle of what is driven."""
+
+        waits, stalled = 0, False
+
+        def wait(self, context, seconds):
+            self.waits += 1
+            at_limit = made[-1].device.positions[0] <= LOW[0] + 2.0e-3
+            stalls = not self.stalled and (at_limit if name == "keeps position limits" else self.waits == 120)
+            self.stalled = self.stalled or stalls
+            super().wait(context, seconds + stalls * stall_s)
+
+        def make_driver(self, context):
+            made.append(driver({}, context))
+            return made[-1]
+
+    made, setup = [], Stalling()
+    result = run_check(check, setup, tmp_path)
+    assert setup.stalled
+    assert result.verdict == verdict, result
 
 
 def command(*arguments):
