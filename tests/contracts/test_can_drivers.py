@@ -104,7 +104,10 @@ class TestCia402OnVirtual(CanContract):
     bus = "virtual:{name}"
 
 
+@pytest.mark.slow
 class TestCia402OnSlcanTcp(CanContract):
+    """Protocol and transport each in another of these suites."""
+
     bus = "socket://127.0.0.1:0"
 
 
