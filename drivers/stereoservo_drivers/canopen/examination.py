@@ -289,11 +289,12 @@ def _question(joint: CanJoint, sign: float) -> str:
 def _jog(driver: CanJointDriver, k: int, share: float) -> tuple[JogTrace, DriverError | None]:
     """Enable, move joint ``k`` by ``share`` of the usual jog, rest, switch off; returns what ended it early."""
     joint = driver.options.joint[k]
-    trace = JogTrace(joint, float(driver.read_state().positions[k]))
+    cycle_s = 1.0 / driver.options.rate_hz
+    trace = JogTrace(joint, float(driver.read_state().positions[k]), cycle_s)
     try:
         driver.activate()
         _hold(driver, trace, k, SETTLE_S)  # released brakes let an arm sink a little: that is not the jog
-        trace = JogTrace(joint, float(driver.read_state().positions[k]))
+        trace = JogTrace(joint, float(driver.read_state().positions[k]), cycle_s)
         _move(driver, trace, k, share)
         if not trace.runs_away():
             _hold(driver, trace, k, SETTLE_S)
@@ -305,27 +306,28 @@ def _jog(driver: CanJointDriver, k: int, share: float) -> tuple[JogTrace, Driver
 
 
 def _move(driver: CanJointDriver, trace: JogTrace, k: int, share: float) -> None:
-    start = time.monotonic()
+    start = now = time.monotonic()
     while not trace.runs_away():
-        velocity = jog_velocity(trace.joint, time.monotonic() - start, share)
+        velocity = jog_velocity(trace.joint, now - start, share)
         if velocity is None:
             return
-        _step(driver, trace, k, velocity)
+        now = _step(driver, trace, k, velocity, now)
 
 
 def _hold(driver: CanJointDriver, trace: JogTrace, k: int, seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        _step(driver, trace, k, 0.0)
+    now = time.monotonic()
+    end = now + seconds
+    while now < end:
+        now = _step(driver, trace, k, 0.0, now)
 
 
-def _step(driver: CanJointDriver, trace: JogTrace, k: int, velocity: float) -> None:
-    """Command for one period, then read."""
-    begun = time.monotonic()
+def _step(driver: CanJointDriver, trace: JogTrace, k: int, velocity: float, begun_s: float) -> float:
+    """Command for one period, then read; returns when that was done, at which the next step has ``begun_s``."""
     command = np.zeros(len(driver.options.joint))
     command[k] = velocity
     driver.write_velocity(command)
-    time.sleep(1.0 / driver.options.rate_hz)
+    time.sleep(trace.cycle_s)
     state = driver.read_state()
-    dt_s = time.monotonic() - begun
-    trace.add(velocity * dt_s, float(state.positions[k]), float(state.velocities[k]), dt_s)
+    now = time.monotonic()
+    trace.add(velocity, float(state.positions[k]), float(state.velocities[k]), now - begun_s)
+    return now

@@ -109,11 +109,18 @@ def jog_velocity(joint: CanJoint, t_s: float, share: float) -> float | None:
 
 @dataclass
 class JogTrace:
-    """Record of a jog. ``add`` every cycle; ``asked``: commanded travel so far [rad or m]."""
+    """Record of a jog, ``add`` every cycle. ``asked``: commanded travel so far [rad or m]; ``unsure``: what of it, and
+    beside it, cycles may account for that took more than twice their ``cycle_s``: drives that hear nothing stop by
+    themselves at some time, or go on.
+    """
 
     joint: CanJoint
     start: float
+    cycle_s: float
     asked: float = 0.0
+    unsure: float = 0.0
+    longest_s: float = 0.0
+    commanded: float = 0.0
     longest_lag: float = 0.0
     reported: float = 0.0
     positions: list[float] = field(default_factory=list)
@@ -123,9 +130,13 @@ class JogTrace:
         """Travel by the joint's encoder."""
         return self.positions[-1] - self.start if self.positions else 0.0
 
-    def add(self, asked: float, position: float, velocity: float, dt_s: float) -> None:
-        """Add one cycle: its commanded travel, position and velocity as reported."""
-        self.asked += asked
+    def add(self, commanded: float, position: float, velocity: float, dt_s: float) -> None:
+        """Add one cycle: the velocity commanded in it, position and velocity as reported at its end."""
+        fastest = max(abs(commanded), abs(self.commanded))
+        self.asked += commanded * dt_s
+        self.unsure += fastest * max(dt_s - 2.0 * self.cycle_s, 0.0)
+        self.longest_s = max(self.longest_s, dt_s if fastest else 0.0)
+        self.commanded = commanded
         self.positions.append(position)
         self.reported += velocity * dt_s
         self.longest_lag = max(self.longest_lag, abs(self.asked - self.travel))
@@ -135,9 +146,33 @@ class JogTrace:
         margin = max(NOISE, NOISE_COUNTS / abs(JointScale.of(self.joint).counts_per_unit))
         return abs(self.travel) > RUNAWAY * abs(self.asked) + 3.0 * margin
 
+    def in_doubt(self) -> bool:
+        """Whether a drive with right units may have moved so, because cycles took too long."""
+        asked, travel = abs(self.asked), math.copysign(1.0, self.asked) * self.travel
+        low, high = (1.0 - TOLERANCE) * (asked - self.unsure), (1.0 + TOLERANCE) * (asked + self.unsure)
+        apart = abs(self.reported - self.travel)
+        return (
+            self.unsure > 0.0 and low <= travel <= high and apart <= 2 * TOLERANCE * abs(travel) + self.unsure
+        )
+
 
 def jog_finding(trace: JogTrace) -> ExaminationFinding:
-    """Finding on a finished jog: direction, travel, and the factor by which the units are wrong."""
+    """Finding on a finished jog: direction, travel, and the factor by which the units are wrong; None where this
+    computer stood still for so long that it cannot be told.
+    """
+    found = _finding_of_units(trace)
+    if found.ok is True or not trace.in_doubt():
+        return found
+    asked, travel = _travel_text(trace.joint, trace.asked), _travel_text(trace.joint, trace.travel)
+    return ExaminationFinding(
+        found.name, None,
+        f"asked for {asked}, moved {travel} by its own encoder, but while it moved a cycle took "
+        f"{trace.longest_s * 1e3:.0f} ms instead of {trace.cycle_s * 1e3:.0f}, in which drives may stop: not judged",
+        "repeat it when this computer has less to do",
+    )  # fmt: skip
+
+
+def _finding_of_units(trace: JogTrace) -> ExaminationFinding:
     joint = trace.joint
     name = f"{joint.name} jog"
     asked, travel = _travel_text(joint, trace.asked), _travel_text(joint, trace.travel)

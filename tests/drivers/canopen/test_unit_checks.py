@@ -28,23 +28,32 @@ H = 0.004
 
 
 def jogged(
-    joint: CanJoint, speed: float, *, encoder: float = 1.0, reported: float = 1.0, lag_s: float = 0.01
+    joint: CanJoint,
+    speed: float,
+    *,
+    encoder: float = 1.0,
+    reported: float = 1.0,
+    lag_s: float = 0.01,
+    stall: tuple[float, float, float] = (math.inf, 0.0, 0.0),
 ) -> tuple[ExaminationFinding, float]:
     """Jog a drive that runs at ``speed`` times the velocity meant, behind a lag of first order; the finding, and the
-    farthest that the joint got [rad].
+    farthest that the joint got [rad]. ``stall``: at this time of the jog the computer stands still for so long [s], and
+    the drive goes on for so much of it.
     """
-    trace = JogTrace(joint, start=0.3)
+    trace = JogTrace(joint, start=0.3, cycle_s=H)
     q, v, t, farthest = 0.3, 0.0, 0.0, 0.0
     over = False
     for _ in range(2000):
+        stalled = stall[0] <= t < stall[0] + H
         asked = None if over else jog_velocity(joint, t, 1.0)
         over = over or asked is None
         asked = asked or 0.0
         v += (speed * asked - v) * H / (lag_s + H)
-        q += v * H
-        t += H
+        q += v * (H + stalled * stall[2])
+        t += H + stalled * stall[1]
+        v *= not stalled or stall[2] == stall[1]
         farthest = max(farthest, abs(q - 0.3))
-        trace.add(asked * H, 0.3 + encoder * (q - 0.3), reported * encoder * v, H)
+        trace.add(asked, 0.3 + encoder * (q - 0.3), reported * encoder * v, H + stalled * stall[1])
         if trace.runs_away():
             over = True
         if over and abs(v) < 1e-9:
@@ -87,6 +96,18 @@ def test_other_units_are_named_and_stopped_early(configured: float | None, true:
     assert finding.ok is False
     assert said in finding.remedy, finding
     assert math.degrees(farthest) < 3.0
+
+
+@pytest.mark.parametrize("at_s", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("stall_s", [0.05, 0.2, 0.5])
+def test_a_computer_that_stands_still_is_not_told_as_wrong_units(at_s: float, stall_s: float) -> None:
+    for goes_on_s in (min(0.05, stall_s), stall_s):  # until the drive's own deadline; for ever
+        finding, _ = jogged(JOINT, 1.0, stall=(at_s, stall_s, goes_on_s))
+        assert finding.ok is not False, finding
+        assert (finding.ok is True) or "instead of 4" in finding.message
+    for speed in (1.0 / 60.0, -1.0):
+        finding, _ = jogged(JOINT, speed, stall=(0.6, 0.1, 0.05))
+        assert finding.ok is False
 
 
 def test_an_encoder_against_the_motor_and_a_joint_that_stands() -> None:
