@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -255,10 +255,10 @@ def _listed(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} from {numbers[0]} to {numbers[-1]}"
 
 
-def read_rows(folder: Path, info: Info, episode: int | None = None) -> Rows:
-    """Rows of all episodes, or of one. Raises DataSetError."""
+def read_rows(folder: Path, info: Info, only: int | None = None) -> Rows:
+    """Rows of all episodes, or of that one ``only``. Raises DataSetError."""
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
-    tables = _tables(folder, "data", needed, episode)
+    tables = _tables(folder, "data", needed, only)
     with _reading(f"LeRobot data set {folder}: {', '.join(needed)} are to be numbers, as many in each row"):
         state, stamp, frame, episode = (
             np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
@@ -296,7 +296,7 @@ def read_rows(folder: Path, info: Info, episode: int | None = None) -> Rows:
 
 def pictures(
     folder: Path, info: Info, key: str, rows: Rows, every: int = 1, *, gray: bool = False
-) -> Iterator[tuple[int, Picture]]:
+) -> Generator[tuple[int, Picture], None, None]:
     """Rows, each one of ``every``, and their pictures of one camera, in ``gray`` where that is asked for. A picture
     that is not called is not decoded, where the codec allows that. Raises DataSetError.
     """
@@ -378,7 +378,7 @@ def _all_pictures(path: Path, *, gray: bool) -> Iterator[Picture]:
     def take() -> ImageArray:
         with _reading(path):
             image: ImageArray = video.retrieve()[1]
-            return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) if gray else image
 
     try:
         if int(video.get(cv2.CAP_PROP_FOURCC)) in AV1:
@@ -421,7 +421,7 @@ def _stored_pictures(
         at = f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
 
         def take(picture: Any = stored[episode, frame], at: str = at) -> ImageArray:
-            image = None
+            image: ImageArray | None = None
             with _reading(f"LeRobot data set {folder}: {at}"):
                 data = np.frombuffer((picture or {}).get("bytes") or b"", dtype=np.uint8)
                 image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
