@@ -59,7 +59,7 @@ class Episode:
     """
 
     info: lerobot.Info
-    rows: lerobot.Rows
+    rows: lerobot.EpisodeRows
     stamps_ns: IntArray
     period_ns: int
 

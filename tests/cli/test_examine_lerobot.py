@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write
+from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write, write_in_av1
 from stereoservo.cli.examine.lerobot import read_data_set
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
@@ -133,17 +133,9 @@ def test_a_data_set_is_judged_by_episode(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_pictures_in_lerobots_own_codec_are_read(tmp_path: Path) -> None:
     """AV1, as lerobot encodes by default."""
-    av = pytest.importorskip("av")
+    pytest.importorskip("av")
     folder = write(tmp_path / "set", "v3.0", short())
-    for c, camera in enumerate(CAMERAS):
-        path = folder / f"videos/observation.images.{camera}/chunk-000/file-000.mp4"
-        with av.open(str(path), "w") as container:
-            stream = container.add_stream("libsvtav1", rate=FPS, options={"crf": "30", "g": "2"})
-            stream.height, stream.width = short()[0].pictures.shape[2:]
-            stream.pix_fmt = "yuv420p"
-            for image in np.concatenate([one.pictures[c] for one in short()]):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
-            container.mux(stream.encode(None))
+    write_in_av1(folder, short())
     views = read_data_set(folder, UNITS)
     for c in range(2):
         truth = np.concatenate([one.corners[c] for one in short()])

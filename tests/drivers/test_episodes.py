@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write
+from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write, write_in_av1
 from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import CameraDriver, DriverContext, DriverError
@@ -126,6 +126,22 @@ def test_an_episode_without_loop_ends(tmp_path: Path) -> None:
     assert [number_of(frame.image) for _ in range(9) for frame in driver.poll()] == list(range(9))
     with pytest.raises(DriverError, match="the recording is over"):
         driver.poll()
+
+
+@pytest.mark.parametrize("channel", ["gray", "red"])
+def test_videos_in_lerobots_own_codec_are_played(channel: str, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    folder = write(tmp_path / "set", "v3.0", episodes())
+    write_in_av1(folder, episodes())
+    driver = begun(tmp_path, VirtualClock(), "up", pace="every", loop=False, channel=channel)
+    assert [number_of(frame.image) for _ in range(12) for frame in driver.poll()] == list(range(12))
+    driver.close()
+    path = folder / f"videos/{UP}/chunk-000/file-000.mp4"
+    whole = path.read_bytes()
+    for kept in (len(whole) // 2, len(whole) - 400):  # no header; fewer pictures, or none
+        path.write_bytes(whole[:kept])
+        with pytest.raises(DriverError, match=r"file-000\.mp4"):
+            play(begun(tmp_path, VirtualClock(), "up", pace="every", loop=False))
 
 
 @pytest.mark.parametrize(

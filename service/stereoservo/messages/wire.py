@@ -190,6 +190,25 @@ class RefinementState(msgspec.Struct, frozen=True):
     refined_from: int = 0
     """Epoch of the calibrated model that the one in use was refined from; 0: it is a calibrated one."""
 
+    @property
+    def text(self) -> str:
+        """How far it is, and how a refined model is undone, in words."""
+        words = f"{self.poses} rest poses"
+        if self.doing == "refining":
+            words += ", a model is being estimated from them"
+        elif self.doing == "waiting":
+            words += ", a refined model is used as soon as the arm rests without a goal"
+        elif self.due is not None:
+            words += f", a model is estimated from {self.due} on"
+        else:
+            words += ", no model is estimated before the next calibration or start"
+        if self.refined_from:
+            words += (
+                f"; the model in use is refined from epoch {self.refined_from} "
+                "(`calibrate CELL --undo-refinement` brings that back)"
+            )
+        return words
+
 
 class StateMessage(msgspec.Struct, frozen=True):
     """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970]."""

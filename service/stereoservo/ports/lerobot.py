@@ -74,8 +74,8 @@ class Info(msgspec.Struct):
     video_path: str | None = None
 
 
-class Rows(NamedTuple):
-    """Rows of all episodes in order: ``episode`` (r,), ``frame`` (r,) in it, ``stamp`` (r,) [s], ``state`` (r, n)."""
+class EpisodeRows(NamedTuple):
+    """Rows of episodes in order: ``episode`` (r,), ``frame`` (r,) in it, ``stamp`` (r,) [s], ``state`` (r, n)."""
 
     episode: IntArray
     frame: IntArray
@@ -255,7 +255,7 @@ def _listed(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} from {numbers[0]} to {numbers[-1]}"
 
 
-def read_rows(folder: Path, info: Info, only: int | None = None) -> Rows:
+def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
     """Rows of all episodes, or of that one ``only``. Raises DataSetError."""
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
     tables = _tables(folder, "data", needed, only)
@@ -288,14 +288,14 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> Rows:
         if len(found):
             row = int(found[0]) + 1
             raise _wrong(folder, f"frame {frame[row]} of episode {episode[row]} {what}")
-    return Rows(episode, frame, stamp, state[order])
+    return EpisodeRows(episode, frame, stamp, state[order])
 
 
 # -- pictures -------------------------------------------------------------------------------------------------
 
 
 def pictures(
-    folder: Path, info: Info, key: str, rows: Rows, every: int = 1, *, gray: bool = False
+    folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False
 ) -> Generator[tuple[int, Picture], None, None]:
     """Rows, each one of ``every``, and their pictures of one camera, in ``gray`` where that is asked for. A picture
     that is not called is not decoded, where the codec allows that. Raises DataSetError.
@@ -377,8 +377,10 @@ def _all_pictures(path: Path, *, gray: bool) -> Iterator[Picture]:
 
     def take() -> ImageArray:
         with _reading(path):
-            image: ImageArray = video.retrieve()[1]
-            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)) if gray else image
+            whole, image = video.retrieve()
+            if not whole:
+                raise DataSetError("dataset", f"{path}: a picture that cannot be decoded")
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image)
 
     try:
         if int(video.get(cv2.CAP_PROP_FOURCC)) in AV1:
@@ -406,7 +408,7 @@ def _by_pyav(path: Path, *, gray: bool) -> Iterator[Picture]:
 
 
 def _stored_pictures(
-    folder: Path, key: str, rows: Rows, kept: Sequence[int], *, gray: bool
+    folder: Path, key: str, rows: EpisodeRows, kept: Sequence[int], *, gray: bool
 ) -> Iterator[tuple[int, Picture]]:
     """Pictures that the tables hold themselves."""
     numbers = list(zip(rows.episode.tolist(), rows.frame.tolist(), strict=True))
@@ -421,13 +423,13 @@ def _stored_pictures(
         at = f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
 
         def take(picture: Any = stored[episode, frame], at: str = at) -> ImageArray:
-            image: ImageArray | None = None
+            image = None
             with _reading(f"LeRobot data set {folder}: {at}"):
                 data = np.frombuffer((picture or {}).get("bytes") or b"", dtype=np.uint8)
                 image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
             if image is None:
                 raise _wrong(folder, at)
-            return image
+            return np.asarray(image)
 
         yield row, take
 

@@ -85,7 +85,7 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     return gathered_views(frames, joint_times, names, kinds, positions, None, True, counted)
 
 
-def _one_clock(rows: lerobot.Rows) -> tuple[FloatArray, FloatArray, IntArray]:
+def _one_clock(rows: lerobot.EpisodeRows) -> tuple[FloatArray, FloatArray, IntArray]:
     """Stamps (r,) [s] of one clock, episodes one after another, and times (j,) of the joints with the rows (j,) that
     they are of; joints stand for a moment before and after each episode.
     """
