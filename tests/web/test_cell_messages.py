@@ -8,7 +8,8 @@ import msgspec
 import pytest
 
 from stereoservo.client import NoReplyError
-from stereoservo.messages.wire import LoopInfo, RefinementState, StateMessage, encode
+from stereoservo.messages.status import RefinementState
+from stereoservo.messages.wire import LoopInfo, StateMessage, encode
 from stereoservo.web import cell_link
 from stereoservo.web.cell_link import CellLink
 

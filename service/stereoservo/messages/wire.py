@@ -37,7 +37,7 @@ from stereoservo.messages.goals import (
 )
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.recording_request import ImagesRecorded
-from stereoservo.messages.status import Health
+from stereoservo.messages.status import Health, RefinementState
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
@@ -176,38 +176,6 @@ class LoopInfo(msgspec.Struct, frozen=True):
     lateness_us: dict[str, float]
     work_us: dict[str, float]
     records_dropped: int = 0
-
-
-class RefinementState(msgspec.Struct, frozen=True):
-    """How far on-line refinement of the model in use is."""
-
-    poses: int
-    """Different rest poses that are collected."""
-    due: int | None
-    """Number of poses at which a model is estimated next; None: not before the next calibration or start."""
-    doing: str = "collecting"
-    """``collecting``, ``refining``, or ``waiting``: for the arm to rest without a goal, to use a refined model."""
-    refined_from: int = 0
-    """Epoch of the calibrated model that the one in use was refined from; 0: it is a calibrated one."""
-
-    @property
-    def text(self) -> str:
-        """How far it is, and how a refined model is undone, in words."""
-        words = f"{self.poses} rest poses"
-        if self.doing == "refining":
-            words += ", a model is being estimated from them"
-        elif self.doing == "waiting":
-            words += ", a refined model is used as soon as the arm rests without a goal"
-        elif self.due is not None:
-            words += f", a model is estimated from {self.due} on"
-        else:
-            words += ", no model is estimated before the next calibration or start"
-        if self.refined_from:
-            words += (
-                f"; the model in use is refined from epoch {self.refined_from} "
-                "(`calibrate CELL --undo-refinement` brings that back)"
-            )
-        return words
 
 
 class StateMessage(msgspec.Struct, frozen=True):
