@@ -12,10 +12,11 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor import cameras
-from stereoservo.cli.doctor.camera_findings import CameraRecord
+from stereoservo.cli.doctor.camera_findings import CameraRecord, examine_record
 from stereoservo.cli.doctor.cameras import WatchedCamera, annotated
 from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import FileLock
+from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import (
     CameraDescription,
     CameraObservation,
@@ -26,7 +27,9 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
+from stereoservo_drivers.edges.detector import EdgeDetector
 from stereoservo_drivers.fake import FakeCameraDriver
+from stereoservo_sim.cells import shipped_cell_path
 
 DESCRIPTION = CameraDescription("still", "left", 64, 48, 30.0, "frames", 1000.0, (1, 2))
 
@@ -119,6 +122,26 @@ def test_the_saved_picture_shows_what_was_found() -> None:
     ring = picture[24, 39]  # nine pixels to the right
     assert ring[1] > ring[0] + 50
     np.testing.assert_array_equal(image, 90)
+
+
+def test_it_is_told_why_a_detector_reports_no_markers(tmp_path: Path) -> None:
+    """The detector of edges, before a picture without its part; then of single vertices, by reason."""
+    part = shipped_cell_path("edges").parent
+    context = DriverContext(MonotonicClock(), "c", tmp_path, part, camera="left")
+    camera = WatchedCamera(
+        CameraRecord(DESCRIPTION), StillCamera(), EdgeDetector({"part": "wedge.part"}, context)
+    )
+    for _ in range(3):
+        camera.poll()
+    camera.finish()
+    found = {finding.name: finding for finding in examine_record(camera.record, 4)}
+    assert found["left refused"].ok is None
+    assert "newest picture: no pose of the part explains enough edges" in found["left refused"].message
+    camera.record.refused = {401: "its edges do not meet", 400: "its edges do not meet", 402: "it is outside"}
+    (finding,) = (one for one in examine_record(camera.record, 4) if one.name == "left refused")
+    assert finding.message.endswith("400, 401: its edges do not meet; 402: it is outside")
+    camera.record.refused = {}
+    assert not any(one.name == "left refused" for one in examine_record(camera.record, 4))
 
 
 @pytest.fixture

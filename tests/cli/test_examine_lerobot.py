@@ -6,39 +6,29 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write, write_in_av1
 from stereoservo.cli.examine.lerobot import read_data_set
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
+from stereoservo.ports.lerobot import DataSetError, Feature, Info, camera_features
 from stereoservo_sim.world.random_cells import random_case
 from stereoservo_sim.world.synthetic import rotation
 
-SEED, FPS, CELLS_PX = 5, 10, 24
+SEED, CELLS_PX = 5, 24
 TAGS = (1, 2, 3)
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-CAMERAS = ("up", "side")
-UNITS = "deg,gripper.pos=none"
 BUMPED_FROM = 20
 """Frame of the second episode from which the camera ``side`` is turned."""
-
-
-@dataclass(frozen=True)
-class Episode:
-    """Joints (f, n) [rad] of an episode and its pictures (c, f, h, w), with the tags' true corners (c, f, m, 2)."""
-
-    joints: np.ndarray
-    pictures: np.ndarray
-    corners: np.ndarray
 
 
 def tagged_cell():
@@ -102,102 +92,6 @@ def whole() -> list[Episode]:
     return [episode(cell, cell.stops(9)[0]), episode(cell, work, BUMPED_FROM)]
 
 
-def info(version: str, episodes: list[Episode], kind: str) -> dict[str, Any]:
-    """``meta/info.json`` as lerobot writes it, without what is not read."""
-    names = [f"joint{k}.pos" for k in range(episodes[0].joints.shape[1])] + ["gripper.pos"]
-    _, _, height, width = episodes[0].pictures.shape
-    features: dict[str, Any] = {
-        "action": {"dtype": "float32", "shape": [len(names)], "names": names},
-        "observation.state": {"dtype": "float32", "shape": [len(names)], "names": names},
-    }
-    for camera in CAMERAS:
-        features[f"observation.images.{camera}"] = {
-            "dtype": kind,
-            "shape": [height, width, 3],
-            "names": ["height", "width", "channels"],
-        }
-    for name, dtype in (("timestamp", "float32"), ("frame_index", "int64"), ("episode_index", "int64")):
-        features[name] = {"dtype": dtype, "shape": [1], "names": None}
-    v2 = version.startswith("v2")
-    return {
-        "codebase_version": version,
-        "robot_type": "so101_follower",
-        "total_episodes": len(episodes),
-        "chunks_size": 1000,
-        "fps": FPS,
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-        if v2
-        else "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
-        if v2
-        else "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
-        "features": features,
-    }
-
-
-def rows(number: int, one: Episode, kind: str) -> dict[str, pa.Array]:
-    count = len(one.joints)
-    state = np.hstack([np.degrees(one.joints), np.full((count, 1), 37.5)])
-    table = {
-        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32())),
-        "timestamp": pa.array(np.arange(count) / FPS, pa.float32()),
-        "frame_index": pa.array(np.arange(count)),
-        "episode_index": pa.array(np.full(count, number)),
-    }
-    for c, camera in enumerate(CAMERAS if kind == "image" else ()):
-        table[f"observation.images.{camera}"] = pa.array(
-            [{"bytes": cv2.imencode(".png", image)[1].tobytes(), "path": None} for image in one.pictures[c]]
-        )
-    return table
-
-
-def write_video(path: Path, pictures: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(
-        str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (pictures.shape[2], pictures.shape[1])
-    )
-    for image in pictures:
-        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    video.release()
-
-
-def write_table(path: Path, table: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    parquet.write_table(pa.table(table), path)
-
-
-def write(folder: Path, version: str, episodes: list[Episode], kind: str = "video") -> Path:
-    """A data set as lerobot of that format lays it out: a file an episode, or files that hold several."""
-    (folder / "meta").mkdir(parents=True)
-    (folder / "meta" / "info.json").write_text(json.dumps(info(version, episodes, kind)))
-    tables = [rows(number, one, kind) for number, one in enumerate(episodes)]
-    if version == "v3.0":
-        together = {name: pa.concat_arrays([table[name] for table in tables]) for name in tables[0]}
-        write_table(folder / "data/chunk-000/file-000.parquet", together)
-        begins = np.cumsum([0, *(len(one.joints) for one in episodes)])[:-1] / FPS
-        about: dict[str, Any] = {"episode_index": np.arange(len(episodes))}
-        for c, camera in enumerate(CAMERAS):
-            key = f"observation.images.{camera}"
-            about |= {
-                f"videos/{key}/{part}_index": np.zeros(len(episodes), int) for part in ("chunk", "file")
-            }
-            about[f"videos/{key}/from_timestamp"] = begins
-            pictures = np.concatenate([one.pictures[c] for one in episodes])
-            if kind == "video":
-                write_video(folder / f"videos/{key}/chunk-000/file-000.mp4", pictures)
-        write_table(folder / "meta/episodes/chunk-000/file-000.parquet", about)
-    else:
-        for number, (one, table) in enumerate(zip(episodes, tables, strict=True)):
-            write_table(folder / f"data/chunk-000/episode_{number:06d}.parquet", table)
-            for c, camera in enumerate(CAMERAS if kind == "video" else ()):
-                path = f"videos/chunk-000/observation.images.{camera}/episode_{number:06d}.mp4"
-                write_video(folder / path, one.pictures[c])
-    (folder / "detector.toml").write_text(
-        'detector = "aruco"\n[options]\ntags = [1, 2, 3]\ndictionary = "4x4_50"\n'
-    )
-    return folder
-
-
 def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
     code = invoke(["examine", *arguments, "--json"])
     return code, json.loads(capsys.readouterr().out)
@@ -239,26 +133,13 @@ def test_a_data_set_is_judged_by_episode(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_pictures_in_lerobots_own_codec_are_read(tmp_path: Path) -> None:
     """AV1, as lerobot encodes by default."""
-    av = pytest.importorskip("av")
+    pytest.importorskip("av")
     folder = write(tmp_path / "set", "v3.0", short())
-    for c, camera in enumerate(CAMERAS):
-        path = folder / f"videos/observation.images.{camera}/chunk-000/file-000.mp4"
-        with av.open(str(path), "w") as container:
-            stream = container.add_stream("libsvtav1", rate=FPS, options={"crf": "30", "g": "2"})
-            stream.height, stream.width = short()[0].pictures.shape[2:]
-            stream.pix_fmt = "yuv420p"
-            for image in np.concatenate([one.pictures[c] for one in short()]):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
-            container.mux(stream.encode(None))
+    write_in_av1(folder, short())
     views = read_data_set(folder, UNITS)
     for c in range(2):
         truth = np.concatenate([one.corners[c] for one in short()])
         assert np.nanmax(np.abs(views.pixels[views.camera == c] - truth)) < 0.5
-
-
-def rewritten(folder: Path, **changes: Any) -> None:
-    path = folder / "meta" / "info.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
 @pytest.mark.parametrize(
@@ -305,14 +186,6 @@ def test_what_cannot_be_read_is_refused_with_what_would_be_right(
     assert named in answer["error"]["message"]
 
 
-def changed(folder: Path, part: str, name: str, values: list[Any]) -> None:
-    """Another column in the first table of a part of a data set."""
-    path = min((folder / part).glob("chunk-*/*.parquet"))
-    table = parquet.read_table(path)
-    columns = {column: table[column].combine_chunks() for column in table.column_names}
-    write_table(path, columns | {name: pa.array(values)})
-
-
 def without_rows(folder: Path) -> None:
     for path in (folder / "data").glob("chunk-*/*.parquet"):
         parquet.write_table(parquet.read_table(path).slice(0, 0), path)
@@ -354,3 +227,17 @@ def test_units_of_a_data_set_are_refused_for_other_recordings(
     code, answer = told(capsys, str(tmp_path), "--units", "deg")
     assert code == 1
     assert "are for LeRobot data sets" in answer["error"]["message"]
+
+
+def test_two_features_of_one_name_are_two_cameras() -> None:
+    """``observation.image.up`` and ``observation.images.up`` of one set were one."""
+    picture = Feature("video", [48, 64, 3])
+    keys = ["observation.image.up", "observation.images.up", "observation.images.side", "observation.image"]
+    info = Info("v2.1", 10.0, dict.fromkeys(keys, picture))
+    names = {keys[0]: keys[0], keys[1]: keys[1], "side": keys[2], "image": keys[3]}
+    assert camera_features(info, Path("set")) == names
+    assert camera_features(info, Path("set"), ["side", keys[1]]) == {"side": keys[2], keys[1]: keys[1]}
+    with pytest.raises(
+        DataSetError, match=r"no camera 'up'; the cameras are observation\.image\.up, observation"
+    ):
+        camera_features(info, Path("set"), ["up"])

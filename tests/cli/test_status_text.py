@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 
 from stereoservo.cli.status import describe
-from stereoservo.messages.status import CameraHealth, Health
-from stereoservo.messages.wire import LoopInfo, RefinementState, StateMessage, decode, encode
+from stereoservo.messages.status import CameraHealth, Health, RefinementState
+from stereoservo.messages.wire import LoopInfo, StateMessage, decode, encode
 
 STATE = StateMessage(
     cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",

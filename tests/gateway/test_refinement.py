@@ -24,8 +24,8 @@ from stereoservo.gateway.model_updates import RefinementJobs
 from stereoservo.gateway.persistence import ModelStore, TaughtStore
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.goals import TaughtTarget
-from stereoservo.messages.status import Health
-from stereoservo.messages.wire import MessageError, RefinementState, RunningGoals
+from stereoservo.messages.status import Health, RefinementState
+from stereoservo.messages.wire import MessageError, RunningGoals
 from stereoservo.ports.devices import CameraObservation
 
 STATE_NS, FRAME_NS = 50_000_000, 30_000_000

@@ -57,6 +57,8 @@ def test_a_hardware_channel_has_one_lock_whatever_the_cell_is_called(tmp_path: P
         == tmp_path / "channel-video-dev-video0.lock"
     )
     assert hardware_lock_path(tmp_path, "fake", {}) is None
+    assert hardware_lock_path(tmp_path, "video", {"source": "set", "episode": 0}) is None
+    assert hardware_lock_path(tmp_path, "video", {"source": "set"}) is not None
 
 
 HOLD_CHANNEL = """

@@ -8,6 +8,8 @@ import msgspec
 import pytest
 
 from stereoservo.client import NoReplyError
+from stereoservo.messages.status import RefinementState
+from stereoservo.messages.wire import LoopInfo, StateMessage, encode
 from stereoservo.web import cell_link
 from stereoservo.web.cell_link import CellLink
 
@@ -75,3 +77,20 @@ def test_a_picture_without_its_header_is_passed_over(monkeypatch: pytest.MonkeyP
             cast(Any, SimpleNamespace(attachment=attachment, key_expr="c/preview/left", payload=payload))
         )
     assert told == ["picture left"]
+
+
+def test_how_far_the_refinement_is_comes_with_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[Any] = []
+    monkeypatch.setattr(cell_link, "Client", lambda *arguments, **named: Cell())
+    link = CellLink(
+        "far", None, "page", lambda slot, message, keep: told.append(msgspec.json.decode(message))
+    )
+    state = StateMessage(
+        cell="far", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="none", model_epoch=0, source="hold",
+        goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None, task_error=(),
+        innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0}, {}),
+    )  # fmt: skip
+    for refinement in (None, RefinementState(5, 16)):
+        link._take_state(cast(Any, None), encode(msgspec.structs.replace(state, refinement=refinement)))
+    assert [one["refinement"] for one in told] == ["", "5 rest poses, a model is estimated from 16 on"]
+    assert told[1]["state"]["refinement"]["poses"] == 5

@@ -63,6 +63,7 @@ class VideoCameraDriver:
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         self._options, self._place = decode_video_options(options, context.cell_dir)
         self._context = context
+        self._check_arm()
         self._life = DriverLifecycle(f"camera driver {DRIVER!r} ({context.camera})")
         self._watch = Watch(self._options.rate_hz)
         limit_s = self._options.server_clock_s
@@ -119,6 +120,23 @@ class VideoCameraDriver:
         self._feed = feed
         self._openings += 1
         self._life.state = LifecycleState.CONFIGURED
+
+    def _check_arm(self) -> None:
+        """Raises DriverError where the cell's joints are played back from an episode that this camera is not with."""
+        arm, options, place = self._context.arm, self._options, self._place
+        if place.kind != "episode" or "dataset" not in arm:
+            return
+        if (arm.get("dataset"), arm.get("episode")) != (options.source, options.episode):
+            raise place.error(
+                "option",
+                f"the joints are of episode {arm.get('episode')} of {arm.get('dataset')}: cameras are to be, too",
+            )
+        if not options.loop or options.pace != "recorded":
+            raise place.error(
+                "option",
+                'the joints play this episode again and again: loop = true and pace = "recorded" make cameras play it '
+                "at the same times",
+            )
 
     def _new_feed(self) -> Feed:
         place, options, context = self._place, self._options, self._context

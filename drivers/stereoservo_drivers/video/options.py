@@ -13,13 +13,14 @@ import msgspec
 from msgspec import Meta
 
 from stereoservo.ports.devices import DriverError
+from stereoservo_drivers.episodes import EpisodeNumber
 from stereoservo_drivers.options import decode_options
 
 DRIVER = "video"
 Channel = Literal["gray", "red", "green", "blue"]
 Flip = Literal["none", "horizontal", "vertical", "rotate180"]
 Pace = Literal["recorded", "every"]
-SourceKind = Literal["device", "file", "sequence", "http", "rtsp", "genicam"]
+SourceKind = Literal["device", "file", "sequence", "episode", "http", "rtsp", "genicam"]
 Pixels = Annotated[int, Meta(ge=16, le=16384)]
 Seconds = Annotated[float, Meta(ge=0.05, le=60)]
 
@@ -31,7 +32,8 @@ _NUMBER = re.compile(r"%(0\d+)?d")
 _NO_URL = urlsplit("")
 VALID_SOURCES = (
     "a device number (0) or path (/dev/video0), a file (.avi, .mkv, .mp4), numbered pictures (left-%04d.png), "
-    "http://, https:// (MJPEG), rtsp://, genicam:// (GigE Vision, USB3 Vision)"
+    "http://, https:// (MJPEG), rtsp://, genicam:// (GigE Vision, USB3 Vision), or, with `episode`, the folder of a "
+    "LeRobot data set"
 )
 
 
@@ -62,6 +64,10 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     Of files and pictures: ``start``, number of the first picture used; ``loop``, begin again at the end;
     ``pace``: ``recorded``, each at its time since delivery began (of this camera: several are not aligned), or
     ``every``, the next one at each poll, with the recording's own stamps.
+
+    Of a LeRobot data set, whose folder is the ``source``: ``episode``, and ``feature``, the camera's name there or the
+    whole feature (default: the name of the cell's camera). With ``loop`` its times are those of
+    `episodes.Episode`, which cameras and joints of one episode share.
     """
 
     source: int | str
@@ -85,6 +91,8 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     start: Annotated[int, Meta(ge=0)] = 0
     loop: bool = False
     pace: Pace = "recorded"
+    episode: EpisodeNumber | None = None
+    feature: str = ""
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,7 @@ class Place:
 def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[VideoOptions, Place]:
     """Options and the source they name; nothing is opened. Raises DriverError (``option``)."""
     decoded = decode_options(VideoOptions, options, DRIVER)
-    place = place_of(decoded.source, cell_dir)
+    place = _place(decoded, cell_dir)
     if place.live:
         for name, value, usual in (
             ("start", decoded.start, 0),
@@ -144,6 +152,23 @@ def frozen_frames(options: VideoOptions, place: Place) -> int:
     if options.frozen_frames is not None:
         return options.frozen_frames
     return LIVE_FROZEN_FRAMES if place.live else 0
+
+
+def _place(options: VideoOptions, cell_dir: Path) -> Place:
+    """The source; an episode's folder needs no ending. Raises DriverError."""
+    source = options.source
+    if options.episode is None:
+        if options.feature:
+            raise _wrong("feature", options.feature, "is for LeRobot data sets, with `episode`")
+        return place_of(source, cell_dir)
+    if isinstance(source, int) or "://" in source or source.startswith("/dev/"):
+        raise _wrong(
+            "episode", options.episode, f"is for the folder of a LeRobot data set; source is {source}"
+        )
+    if options.start:
+        raise _wrong("start", options.start, "an episode is played from its beginning: leave it out")
+    path = cell_dir / source
+    return Place("episode", f"{path}, episode {options.episode}", path=path)
 
 
 def place_of(source: int | str, cell_dir: Path) -> Place:

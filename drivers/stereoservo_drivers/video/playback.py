@@ -5,7 +5,7 @@ from __future__ import annotations
 from stereoservo.ports.devices import Clock, DriverError, Frame
 from stereoservo_drivers.video.options import Place, VideoOptions, frozen_frames
 from stereoservo_drivers.video.pictures import one_channel
-from stereoservo_drivers.video.recorded import Recording, open_recording
+from stereoservo_drivers.video.recorded import EpisodePictures, Recording, open_recording
 from stereoservo_drivers.video.sources import Settings
 from stereoservo_drivers.video.stream_monitor import Watch
 
@@ -47,9 +47,23 @@ class Playback:
         return first
 
     def begin(self) -> None:
-        """Start delivery: the next frame is due now."""
-        if self._coming is not None and self._options.pace == "recorded":
-            self._offset_ns = self._clock.now_ns() - self._coming.t_received_ns
+        """Start delivery: the next frame is due now; of an episode that is played again and again, the one that the
+        clock's time is of. Raises DriverError.
+        """
+        if self._coming is None or self._options.pace != "recorded":
+            return
+        now_ns = self._clock.now_ns()
+        self._offset_ns = now_ns - self._coming.t_received_ns
+        if isinstance(self._recording, EpisodePictures) and self._options.loop:
+            into_ns = now_ns % self._recording.period_ns
+            self._offset_ns = now_ns - into_ns
+            if self._coming.t_received_ns < into_ns:
+                coming = self._recording.read_from(into_ns)
+                if coming is None:  # after its last frame
+                    self._offset_ns += self._recording.period_ns
+                    self._recording.close()
+                    coming = self._open()
+                self._coming = coming
 
     def take(self) -> Frame | None:
         """The newest frame that is due. Raises DriverError: the recording's, ``frozen``, or ``end_of_file``."""

@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 
 from stereoservo.numerics.arrays import ImageArray
+from stereoservo.ports import lerobot
 from stereoservo.ports.devices import DriverError, Frame
 from stereoservo.ports.image_files import ImageFileError, ImageReader, sidecar_of
+from stereoservo_drivers.episodes import episode_of, refused
 from stereoservo_drivers.video.options import Place, VideoOptions
 from stereoservo_drivers.video.pictures import PICTURE_FLAG, check_size, jpeg_size
 
@@ -36,6 +38,8 @@ class Recording(Protocol):
 
 def open_recording(place: Place, options: VideoOptions, camera: str) -> Recording:
     """The recording from its frame ``start`` on. Raises DriverError."""
+    if place.kind == "episode":
+        return EpisodePictures(place, options, camera)
     if place.kind == "sequence":
         return NumberedPictures(place, options, camera)
     check_file(place, place.path)
@@ -233,6 +237,54 @@ class NumberedPictures:
 
     def close(self) -> None:
         """No effect: no file is open between images."""
+
+
+class EpisodePictures:
+    """Pictures of one camera of an episode of a LeRobot data set; stamps are the data set's, from 0 on.
+
+    ``period_ns``: after which the episode begins again, if it does.
+    """
+
+    def __init__(self, place: Place, options: VideoOptions, camera: str) -> None:
+        self._place = place
+        self._options = options
+        self._camera = camera
+        assert options.episode is not None  # of such a place
+        with refused(place.shown):
+            self._episode = episode_of(place.path, options.episode)
+            info = self._episode.info
+            wanted = options.feature or camera
+            (key,) = lerobot.camera_features(info, place.path, [wanted]).values()
+            self._pictures = lerobot.pictures(
+                place.path, info, key, self._episode.rows, gray=options.channel == "gray"
+            )
+        if options.rate_hz != info.fps:
+            raise place.error(
+                "rate", f"rate_hz = {options.rate_hz!r}; the data set has {info.fps!r} frames a second"
+            )
+        self.period_ns = self._episode.period_ns
+
+    def read(self) -> Frame | None:
+        """The next frame. Raises DriverError."""
+        return self.read_from(0)
+
+    def read_from(self, t_ns: int) -> Frame | None:
+        """The next frame from a time [ns] on; None where there is none. Raises DriverError."""
+        with refused(self._place.shown):
+            for row, decoded in self._pictures:
+                received_ns = int(self._episode.stamps_ns[row])
+                if received_ns < t_ns:
+                    continue
+                image = decoded()
+                check_size(self._place, self._options, image.shape[1], image.shape[0])
+                number = int(self._episode.rows.frame[row])
+                shutter_ns = received_ns - round(self._options.latency_s * 1e9)
+                return Frame(self._camera, number, shutter_ns, received_ns, image)
+        return None
+
+    def close(self) -> None:
+        """Close the files."""
+        self._pictures.close()
 
 
 def _numbers(place: Place) -> Iterator[int]:

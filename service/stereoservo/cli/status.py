@@ -21,7 +21,7 @@ from stereoservo.client import Client, InvalidReplyError, NoReplyError, SessionE
 from stereoservo.messages.compilation_progress import read_progress
 from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import find_daemon
-from stereoservo.messages.wire import EventMessage, RefinementState, StateMessage
+from stereoservo.messages.wire import EventMessage, StateMessage
 
 CAUSES = ("held", "stopped", "goal_aborted", "calibration_aborted", "ring_kept")
 """Kinds of the events that tell why an arm stands."""
@@ -118,7 +118,7 @@ def describe(state: StateMessage) -> str:
         for reason in state.reasons
     ]
     if state.refinement is not None:
-        lines.append(f"  refine  {_refinement(state.refinement)}")
+        lines.append(f"  refine  {state.refinement.text}")
     lines += [f"  note    {text}" for text in state.notes]
     if state.refused_messages:
         lines.append(
@@ -127,25 +127,6 @@ def describe(state: StateMessage) -> str:
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)
-
-
-def _refinement(refinement: RefinementState) -> str:
-    """How far on-line refinement is, and how a refined model is undone."""
-    words = f"{refinement.poses} rest poses"
-    if refinement.doing == "refining":
-        words += ", a model is being estimated from them"
-    elif refinement.doing == "waiting":
-        words += ", a refined model is used as soon as the arm rests without a goal"
-    elif refinement.due is not None:
-        words += f", a model is estimated from {refinement.due} on"
-    else:
-        words += ", no model is estimated before the next calibration or start"
-    if refinement.refined_from:
-        words += (
-            f"; the model in use is refined from epoch {refinement.refined_from} "
-            "(`calibrate CELL --undo-refinement` brings that back)"
-        )
-    return words
 
 
 def progress_words(state: StateMessage) -> str:

@@ -24,7 +24,8 @@ from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model
 from stereoservo.messages.goals import ReanchorRefused
-from stereoservo.messages.wire import MessageError, RefinementState, RunningGoals
+from stereoservo.messages.status import RefinementState
+from stereoservo.messages.wire import MessageError, RunningGoals
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 

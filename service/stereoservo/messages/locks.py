@@ -148,8 +148,11 @@ def holder(path: Path) -> int | None:
 
 def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> Path | None:
     """The lock file of the hardware channel that ``options`` name, None where they name none (a
-    simulation). A device has one, whichever of its links it is called by.
+    simulation, or an episode of a data set, which any number of cameras read). A device has one, whichever of its links
+    it is called by.
     """
+    if options.get("episode") is not None:
+        return None
     for key in CHANNEL_OPTIONS:
         value = options.get(key)
         if isinstance(value, str | int) and value != "":

@@ -15,8 +15,8 @@ import msgspec
 
 from stereoservo.messages.files import read_bounded
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Health
-from stereoservo.messages.wire import LoopInfo, RefinementState, StateMessage
+from stereoservo.messages.status import Health, RefinementState
+from stereoservo.messages.wire import LoopInfo, StateMessage
 
 STATE_LAYOUT = "ServoState.1"
 """Of the records of `daemon.ipc_messages.ServoState` in their slot."""

@@ -1,4 +1,4 @@
-"""Lifecycle, model readiness and model health of a cell, as the core writes them and clients read them."""
+"""Lifecycle, model readiness, model health and refinement of a cell, as the core writes them and clients read them."""
 
 from __future__ import annotations
 
@@ -59,3 +59,35 @@ class Health(msgspec.Struct, frozen=True):
     cameras: dict[str, CameraHealth] = {}
     masked: tuple[int, ...] = ()
     reanchoring: str = ""
+
+
+class RefinementState(msgspec.Struct, frozen=True):
+    """How far on-line refinement of the model in use is."""
+
+    poses: int
+    """Different rest poses that are collected."""
+    due: int | None
+    """Number of poses at which a model is estimated next; None: not before the next calibration or start."""
+    doing: str = "collecting"
+    """``collecting``, ``refining``, or ``waiting``: for the arm to rest without a goal, to use a refined model."""
+    refined_from: int = 0
+    """Epoch of the calibrated model that the one in use was refined from; 0: it is a calibrated one."""
+
+    @property
+    def text(self) -> str:
+        """How far it is, and how a refined model is undone, in words."""
+        words = f"{self.poses} rest poses"
+        if self.doing == "refining":
+            words += ", a model is being estimated from them"
+        elif self.doing == "waiting":
+            words += ", a refined model is used as soon as the arm rests without a goal"
+        elif self.due is not None:
+            words += f", a model is estimated from {self.due} on"
+        else:
+            words += ", no model is estimated before the next calibration or start"
+        if self.refined_from:
+            words += (
+                f"; the model in use is refined from epoch {self.refined_from} "
+                "(`calibrate CELL --undo-refinement` brings that back)"
+            )
+        return words

@@ -37,7 +37,7 @@ from stereoservo.messages.goals import (
 )
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.recording_request import ImagesRecorded
-from stereoservo.messages.status import Health
+from stereoservo.messages.status import Health, RefinementState
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
@@ -176,19 +176,6 @@ class LoopInfo(msgspec.Struct, frozen=True):
     lateness_us: dict[str, float]
     work_us: dict[str, float]
     records_dropped: int = 0
-
-
-class RefinementState(msgspec.Struct, frozen=True):
-    """How far on-line refinement of the model in use is."""
-
-    poses: int
-    """Different rest poses that are collected."""
-    due: int | None
-    """Number of poses at which a model is estimated next; None: not before the next calibration or start."""
-    doing: str = "collecting"
-    """``collecting``, ``refining``, or ``waiting``: for the arm to rest without a goal, to use a refined model."""
-    refined_from: int = 0
-    """Epoch of the calibrated model that the one in use was refined from; 0: it is a calibrated one."""
 
 
 class StateMessage(msgspec.Struct, frozen=True):

@@ -372,3 +372,10 @@ class Detector(Protocol):
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """Markers in ``frame``; without a (fresh) prior, acquisition in the whole image. Never raises on content."""
         ...
+
+
+@runtime_checkable
+class ExplainingDetector(Protocol):
+    """A detector that tells of the newest frame why markers are not reported, by id; -1: why none is."""
+
+    refused: dict[int, str]

@@ -156,7 +156,9 @@ class CellLink:
         self._state = state
         if state.model_epoch != self._epoch:
             self._load_model(client, state.model_epoch)
-        self._tell("state", {"state": msgspec.Raw(data), **self.view.at(state)}, keep=True)
+        refinement = "" if state.refinement is None else state.refinement.text
+        told = {"state": msgspec.Raw(data), "refinement": refinement, **self.view.at(state)}
+        self._tell("state", told, keep=True)
         if state.goal != self._goal:
             self._tell_goal(client, state.goal)
 

@@ -51,6 +51,8 @@ class CameraRecord:
     statistics: CameraStatistics | None = None
     """Counts of the driver over ``watched_s`` [s], where it reports them."""
     watched_s: float = 0.0
+    refused: dict[int, str] = field(default_factory=dict)
+    """Why the detector reports no such markers in ``frame``, where it tells; -1: none."""
 
     @property
     def name(self) -> str:
@@ -79,6 +81,8 @@ def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Examinati
     yield from _server_clock(record)
     yield _latency(record)
     yield _markers(record, min_markers)
+    if record.refused:
+        yield _refused(record)
     if record.frame is not None:
         yield from _picture_quality(record.name, record.frame.image, record.seen[-1])
 
@@ -171,6 +175,18 @@ def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
         )  # fmt: skip
     sigma = float(np.median([np.sqrt(0.5 * np.trace(C)) for C in record.seen[-1].covariances]))
     return ExaminationFinding(name, True, f"{summary}; standard deviation {sigma:.3f} px{_scatter(record)}")
+
+
+def _refused(record: CameraRecord) -> ExaminationFinding:
+    """Why markers are not reported, each reason with those that it is of."""
+    by_reason: dict[str, list[str]] = {}
+    for marker, reason in sorted(record.refused.items()):
+        by_reason.setdefault(reason, []).append("" if marker < 0 else str(marker))
+    told = [f"{', '.join(ids)}: {reason}".removeprefix(": ") for reason, ids in by_reason.items()]
+    return ExaminationFinding(
+        f"{record.name} refused", None, f"not reported in the newest picture: {'; '.join(told)}",
+        "better light, the part nearer, its file; or the limits in detector_options",
+    )  # fmt: skip
 
 
 def _scatter(record: CameraRecord) -> str:

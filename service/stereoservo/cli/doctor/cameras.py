@@ -31,6 +31,7 @@ from stereoservo.ports.devices import (
     Detector,
     DriverError,
     ExaminationFinding,
+    ExplainingDetector,
     Frame,
 )
 
@@ -94,6 +95,8 @@ class WatchedCamera:
             self.record.watched_s = time.monotonic() - self._began_s
         frame = self.record.frame
         none = not any(o.ids.size for o in self.record.seen)
+        if isinstance(self._detector, ExplainingDetector):
+            self.record.refused = dict(self._detector.refused)
         if frame is not None and self._detector is not None and none and not self.record.error:
             mirror = msgspec.structs.replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]))
             self.record.flipped = int(self._detector.detect(mirror, None).ids.size)

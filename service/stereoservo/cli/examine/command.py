@@ -10,8 +10,9 @@ import typer
 from stereoservo.calibration.examination.examination import RecordingReport, examine_views
 from stereoservo.cli.examine.flight import read_flight
 from stereoservo.cli.examine.folder import read_folder
-from stereoservo.cli.examine.lerobot import is_data_set, read_data_set
+from stereoservo.cli.examine.lerobot import read_data_set
 from stereoservo.cli.output import CommandError, JsonOption, emit
+from stereoservo.ports.lerobot import is_data_set
 
 
 def examine(

@@ -24,6 +24,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import Detector, DriverContext, Frame
+from stereoservo.ports.lerobot import UNITS
 
 JOINTS, POSES, MARKERS, FRAMES, CAMERAS = (
     "joints.csv",
@@ -35,13 +36,6 @@ JOINTS, POSES, MARKERS, FRAMES, CAMERAS = (
 DETECTOR = "detector.toml"
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TIME, ORDER = "t", "index"
-UNITS: dict[str, tuple[Kind, float]] = {
-    "rad": ("revolute", 1.0),
-    "deg": ("revolute", math.pi / 180.0),
-    "m": ("prismatic", 1.0),
-    "mm": ("prismatic", 1e-3),
-}
-"""By suffix of a joint's column: its kind and the size of its unit."""
 STATED_PX = 0.1
 """Deviation that is stated of a pixel without one; what the pixels scatter is estimated."""
 LARGEST = 10**9

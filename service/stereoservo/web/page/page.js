@@ -140,7 +140,7 @@ function showRights() {
 
 function badge(id, text, kind = "") { $(id).textContent = text; $(id).className = `badge ${kind}`; }
 
-function showState({ state: s, predicted, scene: shape }) {
+function showState({ state: s, predicted, scene: shape, refinement }) {
   state = s;
   badge("lifecycle", s.dry_run ? `${s.lifecycle}, dry run` : s.lifecycle, { active: "good", fault: "bad" }[s.lifecycle]);
   badge("model", `model ${s.model}`, { valid: "good", suspect: "warn" }[s.model]);
@@ -151,6 +151,8 @@ function showState({ state: s, predicted, scene: shape }) {
     $("reasons").dataset.shown = texts.join("\n");
     $("reasons").replaceChildren(...(texts.length ? texts : ["none"]).map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   }
+  $("refinement").textContent = refinement ? `Refinement: ${refinement}` : ""; // a flight tells none
+  $("refinement").hidden = !refinement;
   const t = s.t_ns * 1e-9;
   const last = history.error.at(-1);
   if (last && t <= last[0]) return redraw(); // the plots hold it

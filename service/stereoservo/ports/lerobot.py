@@ -1,0 +1,438 @@
+"""Reader of LeRobot data sets (formats 2.0, 2.1 and 3.0: parquet tables, and videos or pictures in them):
+docs/recordings.md has what is read of them. What else reading raises than DataSetError is the ModuleNotFoundError of
+the extra ``lerobot``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import msgspec
+import numpy as np
+
+from stereoservo.messages.decoding import decoding
+from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
+from stereoservo.ports.devices import JointKindName
+
+INFO = Path("meta") / "info.json"
+VERSIONS = ("v2.0", "v2.1", "v3.0")
+STATE, IMAGES = "observation.state", "observation.image"
+LEFT_OUT = "none"
+"""Unit of a state that is no joint of the arm, such as a gripper's."""
+UNITS: dict[str, tuple[JointKindName, float]] = {
+    "rad": ("revolute", 1.0),
+    "deg": ("revolute", math.pi / 180.0),
+    "m": ("prismatic", 1.0),
+    "mm": ("prismatic", 1e-3),
+}
+"""Units of joints: the kind of such a joint, and the unit's size [rad or m]."""
+MOST_COUNTED = 2**40
+"""Number of a frame or an episode at most."""
+LARGEST_STAMP_S = 1e6
+MOST_NAMED = 20
+"""Episodes that a refusal names."""
+
+AV1 = tuple(cv2.VideoWriter.fourcc(*name) for name in ("av01", "AV01"))
+
+Picture = Callable[[], ImageArray]
+"""Decodes a picture ``(height, width[, 3])``, blue first; to be called before the next one is asked for. Raises
+DataSetError.
+"""
+
+
+class DataSetError(Exception):
+    """A data set, or what is asked of one, cannot be used. ``code``: ``dataset`` or ``units``."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class Feature(msgspec.Struct):
+    """An entry of ``features``: its ``dtype``, ``shape`` and the ``names`` of its parts, as data sets have them."""
+
+    dtype: str
+    shape: list[int]
+    names: Any = None
+    info: dict[str, Any] | None = None
+
+
+class Info(msgspec.Struct):
+    """What is read of ``meta/info.json``."""
+
+    codebase_version: str
+    fps: float
+    features: dict[str, Feature]
+    chunks_size: int = 1000
+    video_path: str | None = None
+
+
+class EpisodeRows(NamedTuple):
+    """Rows of episodes in order: ``episode`` (r,), ``frame`` (r,) in it, ``stamp`` (r,) [s], ``state`` (r, n)."""
+
+    episode: IntArray
+    frame: IntArray
+    stamp: FloatArray
+    state: FloatArray
+
+
+class _Wanted(NamedTuple):
+    """A picture: number ``at`` in the file of its ``episode``, and the ``row`` that it is of."""
+
+    at: int
+    row: int
+    episode: int
+
+
+def is_data_set(folder: Path) -> bool:
+    """Whether a folder is a LeRobot data set."""
+    return (folder / INFO).is_file()
+
+
+# -- what the data set is of ----------------------------------------------------------------------------------
+
+
+def _reading(what: Path | str) -> AbstractContextManager[None]:
+    """Boundary around a decoder of ``what``: what it raises becomes a DataSetError."""
+    return decoding(lambda cause: DataSetError("dataset", f"{what}: {cause}"), (DataSetError,))
+
+
+def read_info(folder: Path) -> Info:
+    """What ``meta/info.json`` says. Raises DataSetError."""
+    path = folder / INFO
+    if not is_data_set(folder):
+        raise _wrong(folder, f"there is no file {INFO}; a LeRobot data set has one")
+    with _reading(path):
+        info = msgspec.json.decode(path.read_bytes(), type=Info)
+    if info.codebase_version not in VERSIONS:
+        raise _wrong(
+            folder,
+            f"format {info.codebase_version!r}; {', '.join(VERSIONS)} are read: lerobot has converters",
+        )
+    if not (math.isfinite(info.fps) and info.fps > 0.0 and info.chunks_size > 0):
+        raise _wrong(
+            folder, f"fps = {info.fps}, chunks_size = {info.chunks_size}; positive numbers are needed"
+        )
+    return info
+
+
+def state_names(info: Info, folder: Path) -> list[str]:
+    """Names of the parts of ``observation.state``; ``state0`` and so on where it has none. Raises DataSetError."""
+    feature = info.features.get(STATE)
+    if feature is None or len(feature.shape) != 1:
+        raise _wrong(folder, f"no feature {STATE!r} of one row a frame; it has {', '.join(info.features)}")
+    stated = feature.names
+    if isinstance(stated, dict) and len(stated) == 1:
+        (stated,) = stated.values()
+    if isinstance(stated, list) and len(stated) == feature.shape[0]:
+        return [str(name) for name in stated]
+    return [f"state{k}" for k in range(feature.shape[0])]
+
+
+def joints_of(
+    states: Sequence[str], units: str | None
+) -> tuple[tuple[str, ...], tuple[JointKindName, ...], FloatArray, list[int]]:
+    """Names, kinds and scales (n,) of those states that are joints, and their columns, as ``units`` say. Raises
+    DataSetError.
+    """
+    valid = f"{', '.join(UNITS)}, with a factor (deg*0.9 of what counts from -100 to 100), or {LEFT_OUT}"
+    if units is None:
+        raise DataSetError(
+            "units",
+            f"a LeRobot data set does not say in what its states are ({', '.join(states)}): units are to be stated, "
+            f"such as deg,gripper.pos=none; valid are {valid}. Those from -100 to 100 are parts of the range in the "
+            "arm's calibration file",
+        )
+    default, by_name = "", {}
+    for part in units.split(","):
+        name, given, unit = part.strip().rpartition("=")
+        if given and name not in states:
+            raise DataSetError("units", f"units {part!r}: the states are {', '.join(states)}")
+        if given:
+            by_name[name] = unit
+        else:
+            default = unit
+    names, kinds, scales, columns = [], [], [], []
+    for column, state in enumerate(states):
+        unit = by_name.get(state, default)
+        if unit == LEFT_OUT:
+            continue
+        known, _, factor = unit.partition("*")
+        if known not in UNITS or not _positive(factor or "1"):
+            raise DataSetError("units", f"units: {state} is in {unit!r}; valid are {valid}")
+        names.append(state)
+        kinds.append(UNITS[known][0])
+        scales.append(UNITS[known][1] * float(factor or "1"))
+        columns.append(column)
+    if not names:
+        raise DataSetError("units", f"units {units}: no state is left that is a joint")
+    return tuple(names), tuple(kinds), np.array(scales), columns
+
+
+def _positive(text: str) -> bool:
+    try:
+        return math.isfinite(float(text)) and float(text) > 0.0
+    except ValueError:
+        return False
+
+
+def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = None) -> dict[str, str]:
+    """By name the features of all cameras, or of those ``wanted`` by name or feature. A camera is named by what follows
+    ``observation.images.``; two of which that is the same, by the whole features. Raises DataSetError.
+    """
+    keys = [
+        key
+        for key, feature in info.features.items()
+        if key.startswith(IMAGES) and feature.dtype in ("video", "image") and not _of_depth(feature)
+    ]
+    short = [key.removeprefix(IMAGES).removeprefix("s").removeprefix(".") or "image" for key in keys]
+    count = Counter([*short, *keys])
+    found = {name if count[name] == 1 else key: key for name, key in zip(short, keys, strict=True)}
+    if wanted is None:
+        return found
+    chosen = {}
+    for one in wanted:
+        name = next((name for name, key in found.items() if one in (name, key)), None)
+        if name is None:
+            raise _wrong(folder, f"no camera {one!r}; the cameras are {', '.join(found) or 'none'}")
+        chosen[name] = found[name]
+    return chosen
+
+
+def _of_depth(feature: Feature) -> bool:
+    info = feature.info or {}
+    return bool(info.get("video.is_depth_map") or info.get("is_depth_map"))
+
+
+# -- tables ---------------------------------------------------------------------------------------------------
+
+
+def _tables(
+    folder: Path, part: str, columns: list[str], episode: int | None = None
+) -> list[Mapping[str, Any]]:
+    """Columns of all parquet files of a part of a data set, or of the rows of one ``episode``, as lists by name.
+    Raises DataSetError.
+    """
+    from pyarrow import compute, parquet  # an extra of its own: see missing_extra
+
+    found, episodes = [], set()
+    for path in sorted((folder / part).glob("chunk-*/*.parquet")):
+        with _reading(path):
+            if not path.is_file():
+                raise _wrong(folder, f"{path} is no file")
+            file = parquet.ParquetFile(path)
+            there = file.schema_arrow.names
+            lacking = [name for name in columns if name not in there]
+            if lacking:
+                raise _wrong(
+                    folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}"
+                )
+            if episode is not None:
+                index = file.read(columns=["episode_index"])["episode_index"]
+                episodes |= {int(number) for number in index.unique().to_pylist() if number is not None}
+                mine = compute.equal(index, episode)
+                if compute.any(mine).as_py():
+                    found.append(file.read(columns=columns).filter(mine).to_pydict())
+            elif file.metadata.num_rows:
+                found.append(file.read(columns=columns).to_pydict())
+    if not found and episodes:
+        raise _wrong(folder, f"no episode {episode} in {part}; it has {_listed(sorted(episodes))}")
+    if not found:
+        raise _wrong(folder, f"no {part}/chunk-*/*.parquet with rows")
+    return found
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    if len(numbers) <= MOST_NAMED:
+        return ", ".join(map(str, numbers))
+    return f"{len(numbers)} from {numbers[0]} to {numbers[-1]}"
+
+
+def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
+    """Rows of all episodes, or of that one ``only``. Raises DataSetError."""
+    needed = [STATE, "timestamp", "frame_index", "episode_index"]
+    tables = _tables(folder, "data", needed, only)
+    with _reading(f"LeRobot data set {folder}: {', '.join(needed)} are to be numbers, as many in each row"):
+        state, stamp, frame, episode = (
+            np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
+        )
+        state = state.reshape(len(stamp), -1)
+        stamp, frame, episode = (values.reshape(len(state)) for values in (stamp, frame, episode))
+    if state.shape[1] != info.features[STATE].shape[0]:
+        raise _wrong(
+            folder,
+            f"{len(stamp)} rows of {state.shape[1]} states; info.json has {info.features[STATE].shape}",
+        )
+    if not (np.isfinite(state).all() and (np.abs(stamp) <= LARGEST_STAMP_S).all()):
+        raise _wrong(folder, f"states that are not finite, or stamps beyond {LARGEST_STAMP_S:g} s")
+    counts = np.concatenate([frame, episode])
+    if not ((counts >= 0.0) & (counts <= MOST_COUNTED) & (counts == np.floor(counts))).all():
+        raise _wrong(
+            folder, f"frame_index and episode_index are to be whole numbers from 0 to {MOST_COUNTED}"
+        )
+    order = np.lexsort((frame, episode))
+    episode, frame, stamp = episode[order].astype(np.int64), frame[order].astype(np.int64), stamp[order]
+    together = np.diff(episode) == 0
+    for wrong, what in (
+        (np.diff(frame) == 0, "is there twice"),
+        (np.diff(stamp) < 0.0, "is stamped before the one before it"),
+    ):
+        found = np.flatnonzero(together & wrong)
+        if len(found):
+            row = int(found[0]) + 1
+            raise _wrong(folder, f"frame {frame[row]} of episode {episode[row]} {what}")
+    return EpisodeRows(episode, frame, stamp, state[order])
+
+
+# -- pictures -------------------------------------------------------------------------------------------------
+
+
+def pictures(
+    folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False
+) -> Generator[tuple[int, Picture], None, None]:
+    """Rows, each one of ``every``, and their pictures of one camera, in ``gray`` where that is asked for. A picture
+    that is not called is not decoded, where the codec allows that. Raises DataSetError.
+    """
+    kept = range(0, len(rows.stamp), every)
+    if info.features[key].dtype == "image":
+        yield from _stored_pictures(folder, key, rows, kept, gray=gray)
+        return
+    files: dict[Path, list[_Wanted]] = {}
+    place = _video_places(folder, info, key)
+    for row in kept:
+        episode = int(rows.episode[row])
+        path, begin = place(episode)
+        files.setdefault(path, []).append(_Wanted(begin + int(rows.frame[row]), row, episode))
+    for path, wanted in files.items():
+        yield from _decoded(path, sorted(wanted), gray=gray)
+
+
+def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[Path, int]]:
+    """Function from an episode to the video file that holds it and the number of its first frame there."""
+    if info.video_path is None:
+        raise _wrong(folder, "info.json has no video_path")
+    template = info.video_path
+
+    def file_of(**numbers: int) -> Path:
+        names = ", ".join(("video_key", *numbers))
+        with _reading(
+            f"LeRobot data set {folder}: video_path = {template[:200]!r}; its parts may be {names}"
+        ):
+            return folder / template.format(video_key=key, **numbers)
+
+    if info.codebase_version != VERSIONS[-1]:
+
+        def own_file(episode: int) -> tuple[Path, int]:
+            return file_of(episode_chunk=episode // info.chunks_size, episode_index=episode), 0
+
+        return own_file
+    needed = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
+    places = {}
+    for table in _tables(folder, "meta/episodes", ["episode_index", *needed]):
+        for episode, chunk, file, begin in zip(
+            *(table[name] for name in ("episode_index", *needed)), strict=True
+        ):
+            with _reading(
+                f"LeRobot data set {folder}: meta/episodes, episode {episode}, {', '.join(needed)}"
+            ):
+                places[int(episode)] = (
+                    file_of(chunk_index=int(chunk), file_index=int(file)), round(float(begin) * info.fps)
+                )  # fmt: skip
+
+    def shared_file(episode: int) -> tuple[Path, int]:
+        if episode not in places:
+            raise _wrong(folder, f"meta/episodes has no episode {episode}")
+        return places[episode]
+
+    return shared_file
+
+
+def _decoded(path: Path, wanted: list[_Wanted], *, gray: bool) -> Iterator[tuple[int, Picture]]:
+    """Pictures of a video in their order. Raises DataSetError where it cannot be decoded, or ends before."""
+    if not os.path.isfile(path):  # also of a name that the system does not take
+        raise DataSetError("dataset", f"{path}: no such video")
+    found, number = _all_pictures(path, gray=gray), -1
+    for one in wanted:
+        take: Picture | None = None
+        while number < one.at and (take := next(found, None)) is not None:
+            number += 1
+        if take is None:
+            raise DataSetError(
+                "dataset",
+                f"{path}: no picture {one.at} (episode {one.episode}); {number + 1} could be decoded. Has it been "
+                "copied as a whole?",
+            )
+        yield one.row, take
+
+
+def _all_pictures(path: Path, *, gray: bool) -> Iterator[Picture]:
+    video = cv2.VideoCapture(str(path))
+
+    def take() -> ImageArray:
+        with _reading(path):
+            whole, image = video.retrieve()
+            if not whole:
+                raise DataSetError("dataset", f"{path}: a picture that cannot be decoded")
+            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image)
+
+    try:
+        if int(video.get(cv2.CAP_PROP_FOURCC)) in AV1:
+            # LeRobot's own codec, which the FFmpeg in OpenCV's wheels does not decode.
+            yield from _by_pyav(path, gray=gray)
+            return
+        while video.grab():
+            yield take
+    finally:
+        video.release()
+
+
+def _by_pyav(path: Path, *, gray: bool) -> Iterator[Picture]:
+    import av  # of the extra that also brings pyarrow: see missing_extra
+
+    with _reading(path), av.open(str(path)) as container:
+        for frame in container.decode(video=0):
+
+            def take(frame: Any = frame) -> ImageArray:
+                with _reading(path):
+                    image: ImageArray = frame.to_ndarray(format="gray" if gray else "bgr24")
+                    return image
+
+            yield take
+
+
+def _stored_pictures(
+    folder: Path, key: str, rows: EpisodeRows, kept: Sequence[int], *, gray: bool
+) -> Iterator[tuple[int, Picture]]:
+    """Pictures that the tables hold themselves."""
+    numbers = list(zip(rows.episode.tolist(), rows.frame.tolist(), strict=True))
+    only = {episode for episode, _ in numbers}
+    names = [key, "episode_index", "frame_index"]
+    stored: dict[tuple[int, int], Any] = {}
+    for table in _tables(folder, "data", names, only.pop() if len(only) == 1 else None):
+        for picture, *number in zip(*(table[name] for name in names), strict=True):
+            stored[int(number[0]), int(number[1])] = picture
+    for row in kept:
+        episode, frame = numbers[row]
+        at = f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
+
+        def take(picture: Any = stored[episode, frame], at: str = at) -> ImageArray:
+            image = None
+            with _reading(f"LeRobot data set {folder}: {at}"):
+                data = np.frombuffer((picture or {}).get("bytes") or b"", dtype=np.uint8)
+                image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
+            if image is None:
+                raise _wrong(folder, at)
+            return np.asarray(image)
+
+        yield row, take
+
+
+def _wrong(folder: Path, what: str) -> DataSetError:
+    return DataSetError("dataset", f"LeRobot data set {folder}: {what}")
