@@ -155,6 +155,34 @@ def test_a_camera_that_moves_while_the_arm_is_learnt_is_told_to_the_frame() -> N
     assert moved_camera(late) is None
 
 
+def test_what_else_happened_is_told_beside_a_camera_that_moved_while_the_arm_is_learnt() -> None:
+    """Of a bump during the trial motions its size, and the other camera's stamps, late from later on."""
+    views = examined_case(REFUSED_OTHERWISE).views
+    f = len(views.camera)
+    late = np.where((views.camera == 0) & (np.arange(f) >= 850), 0.03, 0.0)
+    report = examine_views(views.shifted(-late))
+    bump, stamps = report.causes
+    assert (bump.kind, bump.subject, stamps.kind, stamps.subject) == (
+        "camera_moved",
+        "cam1",
+        "late_stamps",
+        "cam0",
+    )
+    assert bump.onset is not None
+    assert bump.onset.frame == 150
+    assert bump.effect_px == pytest.approx(examined_case(REFUSED_OTHERWISE).faults[0].size, rel=0.1)
+    assert stamps.value == pytest.approx(0.03, abs=1e-3)
+    assert report.rms_px == pytest.approx(examined_case(REFUSED_OTHERWISE).sigma, rel=0.05)
+
+
+def test_of_a_body_that_moves_by_itself_stamps_are_not_examined() -> None:
+    views = examined_case(LATE).views
+    assert any(cause.kind == "late_stamps" for cause in examine_views(views).causes)
+    report = examine_views(replace(views, body_moves=True))
+    assert all(cause.kind != "late_stamps" for cause in report.causes)
+    assert all(camera.offset_s is None for camera in report.cameras.values())
+
+
 def test_stamps_are_told_against_poses_before_any_camera_is_known() -> None:
     """Offsets against those of the generated recording, of either half, and of a recording without any."""
     late, plain = examined_case(LATE_POSES), examined_case(POSES).views

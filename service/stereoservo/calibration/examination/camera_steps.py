@@ -8,6 +8,7 @@ same parameters for all markers: generalised likelihood ratio over onsets, the f
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ ROUNDS = 6
 """Times that the onset is estimated again."""
 LASTING = 3
 """Frames that a step must last, and that must be before it."""
+INVERTED, PARALLAX = 4, 0.1
+"""Steps in which a displacement is inverted, and the share of it that depends on how far a marker is."""
 LEAST_DEPTH = 0.1
 """Of a marker, over that where no joint is away."""
 KNOWN = 1e-6
@@ -40,13 +43,14 @@ frames of all cameras within which steps of several are one event."""
 
 
 class Step(NamedTuple):
-    """A step of a camera's pixels at frame ``onset`` (among all), the ``span`` of frames that are not excluded, and its
-    ``gain``: chi-square that it explains, in the noise that it leaves.
+    """A step of a camera's pixels at frame ``onset`` (among all), the ``span`` of frames that are not excluded, its
+    ``gain``: chi-square that it explains, in the noise that it leaves; and its parameters (q,).
     """
 
     onset: int
     span: tuple[int, int]
     gain: float
+    x: FloatArray
 
 
 def moved_camera(views: RecordedViews) -> int | None:
@@ -89,7 +93,8 @@ def step_of_camera(
         gains, found, left, freedom = _profile(tracks, courses, onsets)
         level = max((left - float(gains.max())) / freedom, 1e-12)
         k, first, last = probable_onset(gains / level)
-        step = Step(int(onsets[k]), (int(onsets[first]), int(onsets[last])), float(gains.max()) / level)
+        span = int(onsets[first]), int(onsets[last])
+        step = Step(int(onsets[k]), span, float(gains.max()) / level, found[k])
         if step.onset == best:
             break
         best = step.onset
@@ -100,7 +105,22 @@ def step_of_camera(
     return step
 
 
-class _Track(NamedTuple):
+def without_step(views: RecordedViews, camera: int, step: Step) -> RecordedViews:
+    """The recording with the later pixels of a camera where they would be without the step, and as uncertain as a share
+    of it is: what a homography does not follow.
+    """
+    later = (views.camera == camera) & (np.arange(len(views.camera)) >= step.onset)
+    half, shown = 0.5 * views.cameras[camera].width, views.pixels[later]
+    moved = np.zeros_like(shown)
+    for _ in range(INVERTED):
+        moved = (_warps((shown - moved).reshape(-1, 2), half, len(step.x) > 2) @ step.x).reshape(shown.shape)
+    pixels, sigmas = views.pixels.copy(), views.sigmas.copy()
+    pixels[later] = shown - moved
+    sigmas[later] = np.hypot(sigmas[later], PARALLAX * np.sqrt(np.nanmean(moved**2)))
+    return replace(views, pixels=pixels, sigmas=sigmas)
+
+
+class _MarkerTrack(NamedTuple):
     """``pixels`` (k, 2) and ``sigmas`` (k,) [px] of a marker in the ``frames`` (k,) that show it, with the ``forms``
     (k, r) of the joints there; ``half`` of the picture's width [px], and whether a step may do more than shift it.
     """
@@ -142,7 +162,7 @@ def _forms(views: RecordedViews) -> tuple[FloatArray, BoolArray]:
 
 def _track(
     views: RecordedViews, frames: IntArray, marker: int, forms: FloatArray, together: bool
-) -> _Track | None:
+) -> _MarkerTrack | None:
     """The track of a marker, its steps those of all markers ``together`` or its own; None where seen too little."""
     shown = frames[views.seen[frames, marker]]
     own = forms[shown]
@@ -150,7 +170,7 @@ def _track(
     if 2 * len(shown) < SPARE * (2 + 3 * own.shape[1]) or not own.shape[1]:
         return None
     half = 0.5 * views.cameras[int(views.camera[shown[0]])].width
-    return _Track(shown, views.pixels[shown, marker], views.sigmas[shown, marker], own, half, together)
+    return _MarkerTrack(shown, views.pixels[shown, marker], views.sigmas[shown, marker], own, half, together)
 
 
 def _warps(pixels: FloatArray, half: float, together: bool) -> FloatArray:
@@ -163,7 +183,7 @@ def _warps(pixels: FloatArray, half: float, together: bool) -> FloatArray:
     return np.array(rows).transpose(2, 1, 0)
 
 
-def _course(track: _Track, pixels: FloatArray) -> _Course:
+def _course(track: _MarkerTrack, pixels: FloatArray) -> _Course:
     """The course of a track whose pixels (k, 2) are as given: least squares (Levenberg, Marquardt), from forms without
     depth on.
     """
@@ -216,7 +236,7 @@ def _slopes(terms: FloatArray, none: FloatArray, here: FloatArray, depths: Float
 
 
 def _profile(
-    tracks: list[_Track], courses: list[_Course], onsets: IntArray
+    tracks: list[_MarkerTrack], courses: list[_Course], onsets: IntArray
 ) -> tuple[FloatArray, FloatArray, float, int]:
     """Reduction (b,) of chi-square by a step at each of ``onsets`` (b,), its parameters (b, q), chi-square without one,
     and the freedom beside one.
