@@ -68,13 +68,14 @@ def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, Reference
     """Recording, with stamps and joints put right, the model learnt from it, and what was taken back. Raises
     LearningError, CalibrationError (``bad_data``, ``too_few_stops``).
     """
-    moved = _learnt_beside_step(views)
     try:
         reference = learn_reference(views)
     except LearningError:
+        moved = _learnt_beside_step(views)
         if moved is None:
             raise
         return views, moved, []
+    moved = _learnt_beside_step(views)
     if moved is not None and moved.scatter_px * AS_GOOD < reference.scatter_px:
         return views, moved, []
     views = reference.put_right(views)
