@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.change.model_changes import start_state
+from stereoservo.calibration.examination.camera_steps import CLEAR, moved_camera, step_of_camera
 from stereoservo.calibration.examination.examination import examine_views
 from stereoservo.calibration.examination.examined_frames import examined_frames
-from stereoservo.calibration.examination.frame_times import gaps, step_between
+from stereoservo.calibration.examination.frame_times import gaps
 from stereoservo.calibration.examination.recorded_views import single_joint_motions
 from stereoservo.calibration.examination.reference_model import frame_noise, learn_reference
 from stereoservo.calibration.examination.stamp_offsets import course
@@ -24,8 +25,8 @@ from stereoservo_sim.experiments.cameras.examined_recordings import (
 )
 
 BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, STOP_MISTAKEN, DRIFTED_IN_TRIALS, POSES = 5, 11, 8, 2, 22, 7, 12
-LATE_POSES, DRIFTED_AND_RIPPLED = 5004, 5012
-"""Seeds of cases; of one the fit's refusal names a stop that is wrong by five."""
+LATE_POSES, DRIFTED_AND_RIPPLED, REFUSED_OTHERWISE = 5004, 5012, 84004
+"""Seeds of cases; of one the fit's refusal names a stop that is wrong by five, of another no camera."""
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,7 @@ LATE_POSES, DRIFTED_AND_RIPPLED = 5004, 5012
         (QUIET, []),
         (BUMPED_IN_TRIALS, ["camera_moved"]),
         (STOP_MISTAKEN, ["camera_moved"]),
+        (REFUSED_OTHERWISE, ["camera_moved"]),
         (LATE_POSES, ["late_stamps"]),
         pytest.param(DRIFTED_AND_RIPPLED, ["joint_zero"], marks=pytest.mark.slow),
         pytest.param(POSES, ["camera_moved"], marks=pytest.mark.slow),
@@ -121,20 +123,64 @@ def test_dropped_frames_are_counted_by_numbers_and_by_stamps() -> None:
     assert gaps(irregular, 0) is None
 
 
-def test_a_jump_beside_the_course_of_the_joints_is_found_to_the_frame() -> None:
+def test_a_camera_that_moves_while_the_arm_is_learnt_is_told_to_the_frame() -> None:
+    """A shift of 0.5 px, and of one marker, found by the pixels of that camera alone; late stamps are none."""
     rng = np.random.default_rng(5)
     views = examined_case(QUIET).views
+    assert moved_camera(views) is None
+    every = np.ones(len(views.camera), dtype=np.bool_)
     mine = np.flatnonzero(views.camera == 1)
-    jump = int(mine[20])
-    pixels = views.pixels.copy()
-    later = (views.camera == 1) & (np.arange(len(views.camera)) >= jump)
-    pixels[later] += rng.normal(0.0, 2.0, 2)
-    moved = replace(views, pixels=pixels)
-    onset, span, gain = step_between(moved, 1, (int(mine[8]), int(mine[32])), (int(mine[15]), int(mine[26])))
-    assert onset == jump
-    assert span[0] <= jump <= span[1]
-    still = step_between(views, 1, (int(mine[8]), int(mine[32])), (int(mine[15]), int(mine[26])))
-    assert still.gain < 0.05 * gain
+    for jump in (int(mine[20]), int(mine[150])):
+        later = (views.camera == 1) & (np.arange(len(views.camera)) >= jump)
+        shift = rng.normal(0.0, 1.0, 2)
+        shift *= 0.5 / np.linalg.norm(shift)
+        pixels = views.pixels.copy()
+        pixels[later] += shift
+        moved = replace(views, pixels=pixels)
+        assert moved_camera(moved) == 1
+        step = step_of_camera(moved, 1, every)
+        assert step is not None
+        assert step.onset == jump
+        assert step.span[0] <= jump <= step.span[1]
+        other = step_of_camera(moved, 0, every)
+        assert other is not None
+        assert other.gain < CLEAR
+        one = np.where(np.arange(views.pixels.shape[1]) == 2, 5.0, 0.0)
+        pixels = views.pixels.copy()
+        pixels[later] += one[:, None] * shift
+        slipped = step_of_camera(replace(views, pixels=pixels), 1, every, 2)
+        assert slipped is not None
+        assert abs(slipped.onset - jump) <= 2
+    late = views.shifted(np.where(views.camera == 1, -0.04, 0.0))
+    assert moved_camera(late) is None
+
+
+def test_what_else_happened_is_told_beside_a_camera_that_moved_while_the_arm_is_learnt() -> None:
+    """Of a bump during the trial motions its size, and the other camera's stamps, late from later on."""
+    views = examined_case(REFUSED_OTHERWISE).views
+    f = len(views.camera)
+    late = np.where((views.camera == 0) & (np.arange(f) >= 850), 0.03, 0.0)
+    report = examine_views(views.shifted(-late))
+    bump, stamps = report.causes
+    assert (bump.kind, bump.subject, stamps.kind, stamps.subject) == (
+        "camera_moved",
+        "cam1",
+        "late_stamps",
+        "cam0",
+    )
+    assert bump.onset is not None
+    assert bump.onset.frame == 150
+    assert bump.effect_px == pytest.approx(examined_case(REFUSED_OTHERWISE).faults[0].size, rel=0.1)
+    assert stamps.value == pytest.approx(0.03, abs=1e-3)
+    assert report.rms_px == pytest.approx(examined_case(REFUSED_OTHERWISE).sigma, rel=0.05)
+
+
+def test_of_a_body_that_moves_by_itself_stamps_are_not_examined() -> None:
+    views = examined_case(LATE).views
+    assert any(cause.kind == "late_stamps" for cause in examine_views(views).causes)
+    report = examine_views(replace(views, body_moves=True))
+    assert all(cause.kind != "late_stamps" for cause in report.causes)
+    assert all(camera.offset_s is None for camera in report.cameras.values())
 
 
 def test_stamps_are_told_against_poses_before_any_camera_is_known() -> None:

@@ -131,7 +131,7 @@ def change_of(
     part = problem.select(rows)
     return ChangePoint(
         one, frames, True, onset, span, np.array([x]), np.array([[deviation**2]]), rows,
-        _effect(part, (one.change,), np.array([x])), 0.0,
+        change_effect(part, (one.change,), np.array([x])), 0.0,
     )  # fmt: skip
 
 
@@ -243,11 +243,11 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     covariance: FloatArray = np.linalg.pinv(estimate.information).astype(np.float64)
     return ChangePoint(
         one.hypothesis, frames, one.after, onset, span, estimate.x, covariance, rows,
-        _effect(part, estimate.changes, estimate.x), ratio,
+        change_effect(part, estimate.changes, estimate.x), ratio,
     )  # fmt: skip
 
 
-def _effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: FloatArray) -> FloatArray:
+def change_effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: FloatArray) -> FloatArray:
     """Change (r, 2) [px] of the pixels, observed less predicted, by changes ``x`` (q,)."""
     plain = replace(part, joint_slopes=np.zeros((0, len(part.order))))
     changed = plain.residuals_at(changed_state(plain, changes, x))

@@ -14,6 +14,7 @@ import numpy as np
 from stereoservo.calibration.change.hypothesis_test import is_unexplained
 from stereoservo.calibration.change.model_changes import change_jacobian, estimate_changes, start_state
 from stereoservo.calibration.change.model_check import NOISE_MARGIN, SENTENCES, isolated_outliers
+from stereoservo.calibration.examination.camera_steps import CLEAR, moved_camera, step_of_camera
 from stereoservo.calibration.examination.change_points import (
     FALSE_ALARM,
     LEAST_PX,
@@ -27,7 +28,7 @@ from stereoservo.calibration.examination.examined_frames import (
     examined_frames,
     hypotheses,
 )
-from stereoservo.calibration.examination.frame_times import Gap, Step, gaps, step_near, step_of_one_camera
+from stereoservo.calibration.examination.frame_times import Gap, gaps
 from stereoservo.calibration.examination.learning_changes import learnt_and_put_right
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.examination.reference_model import (
@@ -430,22 +431,19 @@ def _times(ratio: float) -> str:
 def _not_learnt(
     views: RecordedViews, failed: LearningError, lost: list[RecordingCause], dropped: _Gaps
 ) -> RecordingReport:
-    """The report where no model can be learnt: the refusal of the fit is the cause, with the frame of its stop."""
-    error, frames = failed.error, failed.stops.frames
+    """The report where no model can be learnt: a camera that moved meanwhile, else the refusal of the fit is the cause,
+    with the frame of its stop.
+    """
+    error = failed.error
     names = [camera.name for camera in views.cameras]
-    stop, camera = error.data.get("stop"), error.data.get("camera")
-    kind = _REFUSALS.get(error.code, "not_learnt")
-    found: tuple[int, Step] | None = None
-    message = error.message
-    if isinstance(stop, int) and 0 <= stop < len(frames):
-        c = names.index(camera) if camera in names else int(views.camera[frames[stop]])
-        found = c, step_near(views, c, frames, stop)
-    elif views.generators is None and (found := step_of_one_camera(views, frames)) is not None:
-        kind, camera = "camera_moved", names[found[0]]
+    alone = moved_camera(views) if views.generators is None else None
+    kind, camera, message = _REFUSALS.get(error.code, "not_learnt"), error.data.get("camera"), error.message
+    if alone is not None:
+        kind, camera = "camera_moved", names[alone]
+    onset = _refused_from(views, failed, names.index(camera) if camera in names else None)
     if kind == "camera_moved":
         # The stops that the refusal names may be some beside the step.
         message = f"camera {camera} moved: all markers jump in its pictures and stay off, in no other camera"
-    onset = None if found is None else _onset(views, found[1].onset, found[1].span, found[0])
     if onset is not None:
         message += f"; from frame {onset.frame} of camera {onset.camera} on ({_stamp(views, onset)})"
     cause = RecordingCause(kind, str(camera or error.data.get("joint", "")), message, onset)
@@ -457,6 +455,23 @@ def _not_learnt(
         None, None, None, "", cameras, {}, {}, (cause, *lost),
         (*views.notes, f"no model could be learnt, so that nothing else was examined: {error.message}"), None, 0,
     )  # fmt: skip
+
+
+def _refused_from(views: RecordedViews, failed: LearningError, camera: int | None) -> Onset | None:
+    """Onset of what a fit was refused for: of a camera, or a marker, told by its pixels; else of the stop named."""
+    error, frames = failed.error, failed.stops.frames
+    marker, stop = error.data.get("marker"), error.data.get("stop")
+    one = views.marker_ids.index(marker) if marker in views.marker_ids else None
+    if views.generators is None and (camera is not None or one is not None):
+        shown = camera or 0
+        step = step_of_camera(views, shown, np.ones(len(views.camera), dtype=np.bool_), one)
+        if step is not None and step.gain >= CLEAR:
+            return _onset(views, step.onset, step.span, shown)
+    if not isinstance(stop, int) or not 0 <= stop < len(frames):
+        return None
+    first = int(frames[stop])
+    span = (int(frames[stop - 1]) + 1 if stop else first, first)
+    return _onset(views, first, span, int(views.camera[first]) if camera is None else camera)
 
 
 # -- figures --------------------------------------------------------------------------------------------------

@@ -148,14 +148,14 @@ def hypotheses(model: CellModel, views: RecordedViews, problem: ExaminedFrames) 
     """All that may have happened: changes of the model, and where stamps are times, late ones.
 
     Of an arm whose displacements are given the joints have no zeros of their own; what moved is then the body or all
-    cameras.
+    cameras. Of a body that moves by itself stamps are not asked for.
     """
     found = [
         Hypothesis(change.kind, change.subject, change)
         for change in possible_changes(model, problem)
         if views.generators is None or change.kind != "joint"
     ]
-    if views.timed:
+    if views.timed and not views.body_moves:
         for c, camera in enumerate(model.cameras):
             found.append(_late(views, problem, camera.name, np.asarray(views.camera == c)))
         if len(model.cameras) > 1:

@@ -10,8 +10,14 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.change.model_changes import bounded, change_jacobian, start_state
-from stereoservo.calibration.examination.change_points import LASTING, ChangePoint, change_of
+from stereoservo.calibration.change.model_changes import (
+    bounded,
+    change_jacobian,
+    estimate_changes,
+    start_state,
+)
+from stereoservo.calibration.examination.camera_steps import moved_camera, step_of_camera, without_step
+from stereoservo.calibration.examination.change_points import LASTING, ChangePoint, change_effect, change_of
 from stereoservo.calibration.examination.examined_frames import (
     ExaminedFrames,
     Hypothesis,
@@ -32,6 +38,8 @@ from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
+PUT_BACK = 2
+"""Times that the pixels of a camera that moved are put back by a model, and it is learnt again."""
 MENDS, TRIED = 2, 2
 """Times that something is taken back, and changes that are tried for each."""
 FREE = 30.0
@@ -60,7 +68,16 @@ def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, Reference
     """Recording, with stamps and joints put right, the model learnt from it, and what was taken back. Raises
     LearningError, CalibrationError (``bad_data``, ``too_few_stops``).
     """
-    reference = learn_reference(views)
+    try:
+        reference = learn_reference(views)
+    except LearningError:
+        moved = _learnt_beside_step(views)
+        if moved is None:
+            raise
+        return views, moved, []
+    moved = _learnt_beside_step(views)
+    if moved is not None and moved.scatter_px * AS_GOOD < reference.scatter_px:
+        return views, moved, []
     views = reference.put_right(views)
     found: list[_Step] = []
     while len(found) < MENDS and not reference.fits:
@@ -70,6 +87,42 @@ def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, Reference
         views, reference, step = better
         found.append(step)
     return views, reference, [_change(views, reference, step) for step in found]
+
+
+def _learnt_beside_step(views: RecordedViews) -> ReferenceModel | None:
+    """The model of an arm and its cameras as they were first, where one of these moved while the arm is learnt, its
+    later pixels put back; None where none did, or more than noise is left.
+
+    First along a homography, then by the camera's motion as the model so learnt tells it.
+    """
+    camera = moved_camera(views) if views.generators is None else None
+    step = (
+        None if camera is None else step_of_camera(views, camera, np.ones(len(views.camera), dtype=np.bool_))
+    )
+    if camera is None or step is None:
+        return None
+    reference = _learnt(without_step(views, camera, step))
+    for _ in range(PUT_BACK):
+        if reference is None:
+            return None
+        reference = _learnt(_put_back(views, reference, camera, step.onset))
+    return replace(reference, of_first=True) if reference is not None and reference.fits else None
+
+
+def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onset: int) -> RecordedViews:
+    """The recording with a camera's pixels from a frame on as they would be had it not moved, by a model."""
+    problem = examined_frames(reference.model, views, reference.noise_factor)
+    name = views.cameras[camera].name
+    one = next(
+        h for h in hypotheses(reference.model, views, problem) if (h.kind, h.subject) == ("camera", name)
+    )
+    rows = (problem.data.camera == camera) & (problem.data.stop >= onset)
+    part = problem.select(rows)
+    estimate = estimate_changes(part, (one.change,))
+    column = np.array([views.marker_ids.index(i) for i in reference.model.marker_ids])
+    pixels = views.pixels.copy()
+    pixels[part.data.stop, column[part.data.marker]] -= change_effect(part, (one.change,), estimate.x)
+    return replace(views, pixels=pixels)
 
 
 def _better(

@@ -42,7 +42,8 @@ class RecordedViews:
     of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
     ``counted``: whether stamps are a count of frames over their rate, which tells of no drops.
     ``model``: one that the recording holds, for where none can be learnt. ``added`` (f,) [s]: to the stamps, where
-    these were found wrong. ``notes``: what the reader of the report is to know of the recording.
+    these were found wrong. ``body_moves``: whether the markers are also carried by something else than the arm, whose
+    motion is then as one of late stamps. ``notes``: what the reader of the report is to know of the recording.
     """
 
     joint_names: tuple[str, ...]
@@ -62,6 +63,7 @@ class RecordedViews:
     model: CellModel | None = None
     added: FloatArray | None = None
     counted: bool = False
+    body_moves: bool = False
     notes: tuple[str, ...] = ()
 
     @property

@@ -54,6 +54,8 @@ class ReferenceModel:
     """(c,) [s] by which pictures were found to be later than stamped, before the model was learnt."""
     at_rest: bool = False
     """Whether its stops are rests, at which stamps do not matter."""
+    of_first: bool = False
+    """Whether it is of the first frames: later ones were put back to be learnt from."""
 
     def put_right(self, views: RecordedViews) -> RecordedViews:
         """The recording that it was learnt from, with the stamps that it was learnt with."""
@@ -62,7 +64,7 @@ class ReferenceModel:
     @property
     def middle(self) -> int:
         """A frame that the model is of; -1 where it was there before the first."""
-        return (self.first + self.last) // 2
+        return -1 if self.of_first else (self.first + self.last) // 2
 
     @property
     def noise_factor(self) -> float:

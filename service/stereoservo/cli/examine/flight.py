@@ -20,7 +20,7 @@ from stereoservo.recording.step_layout import decode_step
 
 BODY_MOVES = (
     "the marker body of this cell moves by itself ([scene] moves = true): where it did, that is in the residuals and "
-    "may be told as a cause, and is no fault"
+    "may be told as a cause, and is no fault; stamps are not examined, since such motion looks as if they were late"
 )
 MOST_FRAMES = 6000
 """Frames that are examined; of longer recordings every second one, every third, …"""
@@ -62,7 +62,7 @@ def read_flight(path: Path) -> RecordedViews:
         np.array([cameras.index(one.camera) for one in kept], dtype=np.int64),
         np.array(stamps), np.array(numbers, dtype=np.int64),
         np.zeros(len(kept), dtype=np.int64), pixels, sigmas, model=model,
-        notes=(BODY_MOVES,) if settings.body_moves else (),
+        body_moves=settings.body_moves, notes=(BODY_MOVES,) if settings.body_moves else (),
     )  # fmt: skip
 
 
