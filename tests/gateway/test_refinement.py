@@ -4,6 +4,8 @@ what becomes of taught goals, and the way back.
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -18,11 +20,12 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.jobs.refinement_job import APART, MOST_POSES, RestPoses
 from stereoservo.daemon.kernel_compilation import example_model, example_settings
 from stereoservo.daemon.taught_goals import taught_goal
-from stereoservo.gateway import model_updates
+from stereoservo.gateway import model_updates, persistence
 from stereoservo.gateway.goal_transfer import resolve
 from stereoservo.gateway.model_updates import RefinementJobs
 from stereoservo.gateway.persistence import ModelStore, TaughtStore
 from stereoservo.kinematics.model import CellModel, load_model, save_model
+from stereoservo.messages import files as files_module
 from stereoservo.messages.goals import TaughtTarget
 from stereoservo.messages.status import Health, RefinementState
 from stereoservo.messages.wire import MessageError, RunningGoals
@@ -291,6 +294,152 @@ def test_a_model_that_the_servo_process_does_not_take_leaves_all_as_it_was(gatew
         gateway.jobs.restore()
     assert gateway.models.epochs() == [1, 2]
     assert {goal.target.model_epoch for goal in gateway.taught.goals.values()} == {2}
+
+
+class Crash(BaseException):
+    """The process is killed."""
+
+
+@pytest.mark.parametrize("way", ["refine", "refused", "undo", "refused undo"])
+def test_a_crash_between_any_two_writes_leaves_model_and_goals_that_belong_together(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    """Every change of a file is preceded by a crash once; at the next start no camera is taken for a moved one."""
+    left = -1
+
+    def dying(change: Any) -> Any:
+        def changed(*given: Any, **named: Any) -> Any:
+            nonlocal left
+            if left == 0:
+                raise Crash
+            left -= 1
+            return change(*given, **named)
+
+        return changed
+
+    gateway.visit(LEAST_POSES - 1)
+    gateway.bench.visit(np.full(len(gateway.bench.q), 0.3))
+    gateway.jobs.poll()  # the job has started
+    if "undo" in way:
+        for _ in range(2):
+            gateway.jobs.poll()
+        gateway.bench.epoch = 2
+        gateway.bench.run(0.2)
+    gateway.connected = "refused" not in way
+    folder = gateway.models.path(1).parent
+    files = {path: path.read_bytes() for path in folder.iterdir()}
+    stands = vars(gateway.jobs).copy(), gateway.calibration.model, gateway.taught.goals
+
+    def hand_over() -> bool:
+        """Whether it was carried to its end."""
+        try:
+            if "undo" in way:
+                gateway.jobs.restore()
+            else:
+                for _ in range(2):
+                    gateway.jobs.poll()
+        except Crash:
+            return False
+        except MessageError:
+            return True
+        return True
+
+    found = set()
+    ended, crashes = False, 0
+    while not ended:
+        left = crashes
+        with monkeypatch.context() as patch:
+            patch.setattr(files_module.os, "replace", dying(os.replace))
+            patch.setattr(Path, "unlink", dying(Path.unlink))
+            ended = hand_over()
+        started = NextStart(gateway, folder)
+        model = started.calibration.model
+        found.add(model.epoch)
+        goal = started.taught.goals["park"]
+        assert goal.target.model_epoch == model.epoch, f"crash before write {crashes}"
+        assert resolve(TaughtTarget("park"), goal, model, {}).note == ""
+        assert TaughtStore(folder / "taught.json").goals == started.taught.goals
+        crashes += 1
+        if not ended:  # as before, once more
+            for path in folder.iterdir():
+                path.unlink()
+            for path, data in files.items():
+                path.write_bytes(data)
+            vars(gateway.jobs).update(stands[0])
+            gateway.calibration.model, gateway.taught.goals = stands[1:]
+    assert crashes >= (5 if "refused" in way else 3)
+    assert len(found) == 2
+
+
+def test_goals_that_cannot_be_stored_at_the_next_start_are_good_in_memory(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = gateway.models.path(1).parent
+    before = gateway.taught.goals
+    gateway.visit(LEAST_POSES)
+    for _ in range(2):
+        gateway.jobs.poll()
+    assert gateway.models.epochs() == [1, 2]
+    gateway.taught.put_back(before)  # as if the crash had been before this file
+    with monkeypatch.context() as patch:
+        patch.setattr(persistence, "save_taught", _disk_is_full)
+        started = NextStart(gateway, folder)
+    assert started.taught.goals["park"].target.model_epoch == 2
+    assert "No space left" in started.told[0].message
+    assert NextStart(gateway, folder).told == []
+    assert TaughtStore(folder / "taught.json").goals["park"].target.model_epoch == 2
+    gateway.taught.put_back(before)
+    gateway.models.path(1).unlink()
+    started = NextStart(gateway, folder)
+    assert started.taught.goals == before
+    assert "model epoch 1" in started.told[0].message
+    assert "teach" in started.told[0].message
+
+
+def test_what_cannot_be_taken_back_is_whole_at_the_next_start(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, folder = gateway.taught.goals, gateway.models.path(1).parent
+    save, writes = persistence.save_taught, 0
+
+    def full_at_the_second(path: Path, goals: Any) -> None:
+        nonlocal writes
+        writes += 1
+        save(path, goals) if writes == 1 else _disk_is_full()
+
+    monkeypatch.setattr(persistence, "save_taught", full_at_the_second)
+    gateway.connected = False
+    gateway.visit(LEAST_POSES)
+    for _ in range(2):
+        gateway.jobs.poll()
+    assert writes == 2
+    assert gateway.taught.goals == before  # of the model that the core goes on with
+    assert "No space left" in gateway.told[-1].message
+    started = NextStart(gateway, folder)
+    assert started.calibration.model.epoch == started.taught.goals["park"].target.model_epoch == 2
+
+
+def _disk_is_full(*_: Any) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class NextStart:
+    """The gateway after a restart, with what the files say."""
+
+    def __init__(self, before: Gateway, folder: Path) -> None:
+        models, self.told = ModelStore(folder), list[Any]()
+        model, passed = models.newest_fitting(before.settings)
+        assert model is not None, passed
+        self.calibration: Any = SimpleNamespace(model=model, busy=False)
+        self.taught = TaughtStore(folder / "taught.json")
+        log: Any = SimpleNamespace(
+            add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields))
+        )
+        link: Any = SimpleNamespace(send_model=lambda model: True)
+        jobs = RefinementJobs(
+            before.settings, False, models, link, log, self.calibration, link, self.taught, RunningGoals
+        )
+        jobs.complete_hand_over()
 
 
 def test_poses_after_a_verdict_are_judged_as_the_first_ones_were(

@@ -17,6 +17,7 @@ from stereoservo.core.cycle import Event, Status
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.jobs.refinement_job import MOST_POSES, RestPoses
 from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, RelocalizationReport, save_events
+from stereoservo.daemon.taught_goals import TaughtGoal
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.child_jobs import ChildJob, FitFailedError
 from stereoservo.gateway.persistence import ModelStore, TaughtStore
@@ -307,28 +308,66 @@ class RefinementJobs:
 
     def _hand_over(self, used: CellModel, found: CellModel, why: str) -> bool:
         """Use ``found`` in the place of ``used``: a new epoch, for the goals that were taught, too. False: all is as
-        it was, and told why.
+        it was, and told why. The model's file commits: after a crash the next start restates the goals by what it says
+        (`complete_hand_over`).
         """
         epoch = self._models.next_epoch()
-        model = msgspec.structs.replace(found, epoch=epoch)
-        path = self._models.path(epoch)
+        model = msgspec.structs.replace(found, epoch=epoch, in_place_of=used.epoch)
+        before = self._taught.goals
         try:
-            save_model(model, path)
+            save_model(
+                model, self._models.path(epoch)
+            )  # from here on the next start has this model, and its goals
             self._taught.refine(used, model)
         except (OSError, ModelFileError) as error:
-            path.unlink(missing_ok=True)
-            self._refuse(f"model epoch {epoch} cannot be stored: {error}")
+            self._refuse(f"model epoch {epoch} cannot be stored: {error}{self._take_back(epoch, before)}")
             return False
         if not self._link.send_model(model):
-            path.unlink(missing_ok=True)
-            self._taught.refine(model, used)
             self._refuse(
                 f"the servo process does not take model epoch {epoch}; epoch {used.epoch} stays in use"
+                f"{self._take_back(epoch, before)}"
             )
             return False
         self._epoch, self._calibration.model = epoch, model
         self._handed = used.epoch, epoch, f"model epoch {epoch}: {why}"
         return True
+
+    def _take_back(self, epoch: int, goals: dict[str, TaughtGoal]) -> str:
+        """Undo a hand-over, the model's file last: while it is there, the next start completes what was begun. Returns
+        what of it stays, in words.
+        """
+        try:
+            self._taught.put_back(goals)
+            self._models.path(epoch).unlink(missing_ok=True)
+        except OSError as error:
+            return (
+                f". Its file stays ({error.strerror}): the next start uses it, with the goals restated in it"
+            )
+        return ""
+
+    def complete_hand_over(self) -> None:
+        """Restate the taught goals in the model in use, where a crash came before that. At the start, once."""
+        model = self._calibration.model
+        if model is None or not model.in_place_of:
+            return
+        used = self._models.of_epoch(model.in_place_of)
+        try:
+            if used is not None:
+                self._taught.refine(used, model)
+        except OSError as error:
+            self._warn(f"taught goals are not stored as restated in model epoch {model.epoch}: {error}")
+        of_used = [
+            name for name, goal in sorted(self._taught.goals.items())
+            if goal.target.model_epoch == model.in_place_of
+        ]  # fmt: skip
+        if used is None and of_used:
+            self._warn(
+                f"taught goals {', '.join(of_used)} cannot be restated in model epoch {model.epoch}: the file of model "
+                f"epoch {model.in_place_of} is gone or damaged; teach them again"
+            )
+
+    def _warn(self, message: str) -> None:
+        self._log.add("warning", message=message, origin="gateway")
 
     def restore(self) -> str:
         """Bring the calibrated model back that the one in use was refined from, and refine no more until the next

@@ -59,9 +59,19 @@ class TaughtStore:
 
     def refine(self, used: CellModel, model: CellModel) -> None:
         """State the goals in ``model`` in the place of ``used``, where nothing but the estimate changed (see
-        `refined_goal`). Raises OSError, and they are as they were then.
+        `refined_goal`). Raises OSError where they cannot be stored; they are restated in memory then.
         """
-        self._replace({name: refined_goal(goal, used, model) for name, goal in self.goals.items()})
+        self.put_back({name: refined_goal(goal, used, model) for name, goal in self.goals.items()})
+
+    def put_back(self, goals: dict[str, TaughtGoal]) -> None:
+        """Have ``goals`` in memory, and in the file where it holds others. Raises OSError."""
+        self.goals = goals
+        try:
+            stored = load_taught(self._path)
+        except TaughtFileError:
+            stored = None
+        if stored != goals:
+            save_taught(self._path, goals)
 
     def _replace(self, goals: dict[str, TaughtGoal]) -> None:
         save_taught(self._path, goals)

@@ -259,6 +259,7 @@ class Gateway:
         if self._servo.connected and self._state is not None and not self._greeted:
             self._greeted = True
             self._calibration.load(self._state.model_epoch)
+            self._refinement.complete_hand_over()
         events = self._servo.events()
         if events:  # who hears of one finds no older state
             self._read_state()

@@ -181,6 +181,8 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Of the cameras whose stamps the trial motions could tell against the joints' stamps."""
     refined_from: int = 0
     """Epoch of the model that this one was refined from on-line; 0: it was not."""
+    in_place_of: int = 0
+    """Epoch of the model whose taught goals this one takes over, for nothing but the estimate changed; 0: of none."""
 
     @property
     def tip_first(self) -> bool:

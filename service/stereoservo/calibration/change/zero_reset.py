@@ -77,7 +77,7 @@ def reset_zeros(
         f"{after:.3g} times after. Teach the goals of epoch {model.epoch} again",
     )  # fmt: skip
     return msgspec.structs.replace(
-        model, epoch=epoch, created=created, source=source, zero=zero, refined_from=0,
+        model, epoch=epoch, created=created, source=source, zero=zero, refined_from=0, in_place_of=0,
         covariance=None if stated is None else _with_zeros(model, stated, problem, rest, covariance),
     ), reset  # fmt: skip
 

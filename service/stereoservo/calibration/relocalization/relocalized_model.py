@@ -126,7 +126,9 @@ def relocalize(
         msgspec.structs.replace(camera, matrix=matrices[c]) if c in matrices else camera
         for c, camera in enumerate(model.cameras)
     )
-    new = msgspec.structs.replace(model, epoch=epoch, created=created, cameras=cameras, refined_from=0)
+    new = msgspec.structs.replace(
+        model, epoch=epoch, created=created, cameras=cameras, refined_from=0, in_place_of=0
+    )
     errors = [one.errors for one in found]
     new = msgspec.structs.replace(new, covariance=with_moved_cameras(model, errors, matrices))
     joints = _workspace(model, observations, workspace)
