@@ -14,11 +14,12 @@ from stereoservo.control.face_choice import (
     FaceChoice,
     choose_face,
     choose_triangle,
+    kept_faces,
     law_scene,
     spread_in_images,
     triangle_sight,
 )
-from stereoservo.control.faces import kept_faces, sights_along
+from stereoservo.control.faces import Faces, sights_along
 from stereoservo.control.law import Options
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.primitives_kernel import minors
@@ -118,12 +119,28 @@ def test_sights_along_a_way_are_those_of_the_truth(virtual):
     led = [faces.markers()[f][0] for f in sights.lead]
     assert [a for a, b in pairwise([-1, *led]) if a != b] + [led[-1]] == [-1, 0, 4, 8]
     targets = world.hidden(body.at(poses[-1]))
-    assert len(kept_faces(faces, points, targets, world.camera_centres)) == 0
+    assert len(kept_faces(faces, points, targets, world.matrices, world.camera_centres)) == 0
     middle = world.hidden(body.at(poses[6]))
     np.testing.assert_array_equal(
-        kept_faces(faces, points, middle, world.camera_centres),
+        kept_faces(faces, points, middle, world.matrices, world.camera_centres),
         faces.triples[[0 in m for m in faces.markers()]],
     )
+
+
+def test_the_face_that_a_law_works_on_leads_in_whatever_order_they_are(virtual):
+    """Two alike faces are in an order that noise decides; the plan is turned by the first."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        T = upright(virtual, rng.uniform(-25.0, 25.0))
+        body = Body(virtual, rng, (-35, 35), T)
+        faces, world = body.find(T), body.world
+        points = world.hidden(body.at(T))
+        chosen = choose_face(faces, scene_of(body, T, rng, noise=0.0), task_of(body, T)).face
+        turned = Faces(*(array[::-1].copy() for array in faces[:3]), faces.body)
+        for one in (faces, turned):
+            kept = kept_faces(one, points, points, world.matrices, world.camera_centres)
+            assert len(kept) == 2
+            np.testing.assert_array_equal(kept[0], faces.triples[chosen])
 
 
 def drive(body, faces, T, T_star, rng, noise, tolerance):

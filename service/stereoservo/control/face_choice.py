@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.faces import Faces
+from stereoservo.control.faces import Faces, faces_fronting
 from stereoservo.control.law import Scene, Task
 from stereoservo.control.primitives_kernel import dot, minors
+from stereoservo.kinematics.kernels import project_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 
@@ -28,6 +29,9 @@ LOOKS = 32_768
 """
 LASTING = 8.0
 """How many times its area a triangle counts that shows its front at the goal too."""
+
+SEEN_TO_PX = 0.1
+"""Deviation of markers for which it is asked beforehand on which face a law will work."""
 
 
 class FaceChoice(NamedTuple):
@@ -75,6 +79,59 @@ def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
         return scene
     operators, composition, matrices, centres, points, pixels, weights = scene
     return Scene(operators, composition, matrices, _kept_rows(centres, choice.kept), points, pixels, weights)
+
+
+def kept_faces(
+    faces: Faces, points: FloatArray, targets: FloatArray, matrices: FloatArray, camera_centres: FloatArray
+) -> IntArray:
+    """Outward triples (k, 3) of the faces that some camera has both now and at the goal: those that a plan must keep.
+
+    That on which a law will work leads, for the way is turned by it: which of two alike faces the model names first is
+    a matter of noise. Empty where the body turns so far that no face lasts: the way has to hand over
+    (`faces.sights_along`). Faces whose side is not known ask for nothing.
+    """
+    return lasting_faces(
+        *faces, np.ascontiguousarray(points), np.ascontiguousarray(targets), np.ascontiguousarray(matrices),
+        np.ascontiguousarray(camera_centres),
+    )  # fmt: skip
+
+
+@kernel
+def lasting_faces(
+    triples: IntArray,
+    members: FloatArray,
+    sided: FloatArray,
+    body: FloatArray,
+    points: FloatArray,
+    targets: FloatArray,
+    matrices: FloatArray,
+    camera_centres: FloatArray,
+) -> IntArray:
+    """`kept_faces` on arrays."""
+    eye = np.eye(4).reshape((1, 4, 4))
+    now = faces_fronting(points, triples, sided, eye, camera_centres)
+    then = faces_fronting(targets, triples, sided, eye, camera_centres)
+    lasting = np.zeros(triples.shape[0])
+    for f in range(triples.shape[0]):
+        for c in range(camera_centres.shape[0]):
+            if sided[f] > 0.0 and now[0, f, c] > 0.0 and then[0, f, c] > 0.0:
+                lasting[f] = 1.0
+    kept = np.zeros((int(lasting.sum()), 3), np.int64)
+    count = 0
+    if len(kept) > 1:
+        pixels = project_points(matrices, points)[0]
+        weights, known = np.full(pixels.shape[:2], 1.0 / SEEN_TO_PX), np.ones(len(points))
+        face = choose_face_step(
+            triples, members, sided, body, points, pixels, weights, targets, known, camera_centres, -2,
+            np.zeros(3, np.int64),
+        )[0]  # fmt: skip
+        if face >= 0 and lasting[face] > 0.0:
+            kept[0], lasting[face], count = triples[face], 0.0, 1
+    for f in range(triples.shape[0]):
+        if lasting[f] > 0.0:
+            kept[count] = triples[f]
+            count += 1
+    return kept
 
 
 @kernel

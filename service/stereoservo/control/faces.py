@@ -126,19 +126,6 @@ def sights_along(
     return Sights(fronts, lead, cameras)
 
 
-def kept_faces(faces: Faces, points: FloatArray, targets: FloatArray, camera_centres: FloatArray) -> IntArray:
-    """Outward triples (k, 3) of the faces that some camera has both now and at the goal: those that a plan must keep.
-
-    Empty where the body turns so far that no face lasts: the way has to hand over (`sights_along`). Faces whose side is
-    not known ask for nothing.
-    """
-    eye = np.eye(4)[None]
-    now = faces_fronting(np.ascontiguousarray(points), faces.triples, faces.sided, eye, camera_centres)[0]
-    then = faces_fronting(np.ascontiguousarray(targets), faces.triples, faces.sided, eye, camera_centres)[0]
-    lasting = ((now > 0.0) & (then > 0.0)).any(axis=1) & (faces.sided > 0.0)
-    return np.ascontiguousarray(faces.triples[lasting])
-
-
 # -- kernels, without BLAS ------------------------------------------------------------------------------------
 
 

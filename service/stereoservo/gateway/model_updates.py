@@ -315,9 +315,8 @@ class RefinementJobs:
         model = msgspec.structs.replace(found, epoch=epoch, in_place_of=used.epoch)
         before = self._taught.goals
         try:
-            save_model(
-                model, self._models.path(epoch)
-            )  # from here on the next start has this model, and its goals
+            # From here on the next start has this model, and its goals.
+            save_model(model, self._models.path(epoch))
             self._taught.refine(used, model)
         except (OSError, ModelFileError) as error:
             self._refuse(f"model epoch {epoch} cannot be stored: {error}{self._take_back(epoch, before)}")

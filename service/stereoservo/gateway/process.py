@@ -567,9 +567,8 @@ def run(plan: RunPlan, parent: int, termination: Termination) -> None:
                 busy_s = time.monotonic()
             else:
                 time.sleep(IDLE_S if time.monotonic() - busy_s < REST_AFTER_S else REST_S)
-        for _ in range(
-            FINAL_PASSES
-        ):  # the last events of the servo process, above all that it stopped, are still published
+        # The last events of the servo process, above all that it stopped, are still published.
+        for _ in range(FINAL_PASSES):
             if not gateway.run_once():
                 break
         until = time.monotonic() + LAST_EVENTS_S

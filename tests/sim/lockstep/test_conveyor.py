@@ -5,18 +5,14 @@ pictures, waited for where it leaves, and reached when the belt stands; nothing 
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.control.faces import Faces, find_faces
 from stereoservo.core.cycle import Event, ModelUpdate
-from stereoservo.core.goals.plan import faces_to_keep
 from stereoservo.daemon.lockstep import LockstepCell
-from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_file
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 from stereoservo.numerics.arrays import FloatArray
@@ -177,32 +173,3 @@ def test_a_body_that_moves_by_itself_is_for_cameras_on_the_arm(tmp_path: Path) -
     cell = msgspec.structs.replace(with_fakes(SHIPPED), camera=standing, emulate={})
     with pytest.raises(CellFileError, match="--follow-markers"):
         LockstepCell(cell, cell_dir=tmp_path, runtime_dir=tmp_path)
-
-
-def test_a_plan_is_turned_by_the_face_that_the_law_works_on_in_whatever_order_they_are() -> None:
-    """Two alike faces are in an order that noise decides: demo, seed 731402, was refused for the other one's way."""
-    model = exact_simulated_model(WORLD, SEED)
-    assert np.array_equal(model.zero, WORLD.base)
-    points = np.ascontiguousarray(model.marker_points)
-    arrays: Any = SimpleNamespace(
-        matrices=np.array([camera.matrix for camera in model.cameras]),
-        camera_centres=np.array([camera_centre(camera.matrix, model) for camera in model.cameras]),
-    )
-    faces = find_faces(points, arrays.matrices, 0.1, arrays.camera_centres, np.ones((2, len(points))))
-    assert len(faces.triples) == 2
-    turned = Faces(
-        faces.triples[::-1].copy(), faces.members[::-1].copy(), faces.sided[::-1].copy(), faces.body
-    )
-    leads = []
-    for one in (faces, turned):
-        source: Any = SimpleNamespace(faces=one, target_points=points)
-        kept = faces_to_keep(source, arrays, points, np.array([0, 1]))
-        assert len(kept) == 2
-        leads.append(kept[0].tolist())
-    assert leads[0] == leads[1]
-
-
-def camera_centre(matrix: FloatArray, model: CellModel) -> FloatArray:
-    """Of height 1."""
-    centre: FloatArray = np.linalg.svd(matrix)[2][-1]
-    return centre / float(model.plane_at_infinity @ centre)

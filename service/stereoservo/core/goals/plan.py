@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from stereoservo.control.face_choice import NOT_CHOSEN, choose_face_step
-from stereoservo.control.faces import kept_faces
+from stereoservo.control.face_choice import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import (
@@ -30,7 +29,7 @@ from stereoservo.kinematics.kernels import project_points
 from stereoservo.messages import goals
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.path_search import MISSING_FREEDOMS, plan_on
 from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanRequest
@@ -57,10 +56,6 @@ def begin_plan(job: PlanJob, context: StepContext) -> None:
         job.planning = start_planning(_plan_request(source, context, arrays, job.points, job.joints))
     except PlanRequestError as error:
         raise RefusalError("NOT_PLANNED", str(error)) from error
-
-
-SEEN_TO_PX = 0.1
-"""Deviation of markers for which a plan asks on which face its law will work."""
 
 
 def plan_again(source: ServoGoal, context: StepContext) -> PlanJob:
@@ -102,7 +97,9 @@ def _plan_request(
         kept=kept,
         centre=centre_of(source, joints + context.state.block.correction, arrays, points),
         centre_target=source.centre_target.copy(),
-        faces=faces_to_keep(source, arrays, points, used),
+        faces=kept_faces(
+            source.faces, points, source.target_points, arrays.matrices[used], arrays.camera_centres[used]
+        ),
         limits=PlanLimits(
             position_min=limits.position_min + margin,
             position_max=limits.position_max - margin,
@@ -120,26 +117,6 @@ def _plan_request(
         speed_scale=goal.speed_scale,
         posture=None if goal.posture is None else _posture(goal.posture, joints, context),
     )
-
-
-def faces_to_keep(source: ServoGoal, arrays: ModelArrays, points: FloatArray, used: IntArray) -> IntArray:
-    """Triples (k, 3) of the faces that a plan must keep; that on which the law will work leads, for the way is turned
-    by it: which of two alike faces the model names first is a matter of noise.
-    """
-    centres = np.ascontiguousarray(arrays.camera_centres[used])
-    kept = kept_faces(source.faces, points, source.target_points, centres)
-    if len(kept) < 2:
-        return kept
-    pixels, _ = project_points(np.ascontiguousarray(arrays.matrices[used]), points)
-    weights, known = np.full(pixels.shape[:2], 1.0 / SEEN_TO_PX), np.ones(len(points))
-    face, *_ = choose_face_step(
-        *source.faces, points, pixels, weights, source.target_points, known, centres, NOT_CHOSEN.face,
-        NOT_CHOSEN.triple,
-    )  # fmt: skip
-    if face < 0:
-        return kept
-    behind = (kept != source.faces.triples[face]).any(axis=1)
-    return np.ascontiguousarray(kept[np.argsort(behind, kind="stable")])
 
 
 def _posture(named: dict[str, float], joints: FloatArray, context: StepContext) -> FloatArray:
