@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereoservo.control.face_choice import (
+from stereoservo.control.faces import (
     CLEARLY_BETTER,
     LASTING,
     MOST_TRIED,
     NOT_CHOSEN,
     FaceChoice,
+    Faces,
     choose_face,
     choose_triangle,
     kept_faces,
     law_scene,
+    sights_along,
     spread_in_images,
     triangle_sight,
 )
-from stereoservo.control.faces import Faces, sights_along
 from stereoservo.control.law import Options
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.primitives_kernel import minors
@@ -119,10 +120,10 @@ def test_sights_along_a_way_are_those_of_the_truth(virtual):
     led = [faces.markers()[f][0] for f in sights.lead]
     assert [a for a, b in pairwise([-1, *led]) if a != b] + [led[-1]] == [-1, 0, 4, 8]
     targets = world.hidden(body.at(poses[-1]))
-    assert len(kept_faces(faces, points, targets, world.matrices, world.camera_centres)) == 0
+    assert len(kept_faces(*faces, points, targets, world.matrices, world.camera_centres)) == 0
     middle = world.hidden(body.at(poses[6]))
     np.testing.assert_array_equal(
-        kept_faces(faces, points, middle, world.matrices, world.camera_centres),
+        kept_faces(*faces, points, middle, world.matrices, world.camera_centres),
         faces.triples[[0 in m for m in faces.markers()]],
     )
 
@@ -138,7 +139,7 @@ def test_the_face_that_a_law_works_on_leads_in_whatever_order_they_are(virtual):
         chosen = choose_face(faces, scene_of(body, T, rng, noise=0.0), task_of(body, T)).face
         turned = Faces(*(array[::-1].copy() for array in faces[:3]), faces.body)
         for one in (faces, turned):
-            kept = kept_faces(one, points, points, world.matrices, world.camera_centres)
+            kept = kept_faces(*one, points, points, world.matrices, world.camera_centres)
             assert len(kept) == 2
             np.testing.assert_array_equal(kept[0], faces.triples[chosen])
 

@@ -1,5 +1,6 @@
 """Faces of a marker body: which of the coplanar groups of its markers are faces, and which side of them is outward,
-from what cameras see; and which faces the cameras see along a path.
+from what cameras see; which faces the cameras see along a path; and the choice of the three markers that a control law
+servoes: of one face, seen in most cameras, largest in the images.
 
 A face has no other marker on one of its sides; that is where the body is, the other one is out, unless the cameras
 that see its markers say otherwise (an inner corner). Planes are signed minors of three markers in outward order: with
@@ -8,14 +9,33 @@ camera centres O of height 1, ``aᵀO > 0`` where the front is seen (7.4.2).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.control.law import Scene, Task
 from stereoservo.control.marker_groups import IN_PLANE, MarkerGroups, find_groups
 from stereoservo.control.primitives_kernel import dot, minors
+from stereoservo.kinematics.kernels import project_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
+
+LEAST_ALTITUDE = 10.0
+"""Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
+CLEARLY_BETTER = 2.0
+"""Ratio of image areas from which on another triangle takes over."""
+MOST_TRIED = 24
+"""Markers of a face of which every three are tried; of more, so many that are spread out in the images."""
+LEAST_TRIED = 6
+LOOKS = 32_768
+"""Triangles times cameras of one choice, at most: of a body with many large faces fewer markers of each are tried, but
+`LEAST_TRIED`.
+"""
+LASTING = 8.0
+"""How many times its area a triangle counts that shows its front at the goal too."""
+SEEN_TO_PX = 0.1
+"""Deviation of markers for which it is asked beforehand on which face a law will work."""
 
 
 class Faces(NamedTuple):
@@ -124,6 +144,53 @@ def sights_along(
         else:
             held = -1
     return Sights(fronts, lead, cameras)
+
+
+class FaceChoice(NamedTuple):
+    """On what a law shall work now.
+
+    ``face``: its index, -1 where the three markers are of several; ``triple`` (3,): their indices, in outward order.
+    ``cameras``: how many see them, 0: none does, and no law can work. ``kept`` (c,): 1 for the cameras that have the
+    face's front now and at the goal, whose sight of it is kept. ``changed``: other markers than before.
+    """
+
+    face: int
+    triple: IntArray
+    cameras: int
+    kept: FloatArray
+    changed: bool
+
+
+NOT_CHOSEN = FaceChoice(-2, np.zeros(3, np.int64), 0, np.zeros(0), False)
+"""What stands in for the choice before the first."""
+
+
+def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT_CHOSEN) -> FaceChoice:
+    """The three markers on which a law shall work now.
+
+    Of one face, seen in most cameras; among these, of largest image area in units of the noise, which prefers what is
+    spread, near and frontal. A face whose front some camera has at the goal too counts for more. Only markers that have
+    a point now (finite) and at the goal (``target_known``). The former choice stays until a marker of it is hidden,
+    more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
+    do.
+    """
+    face, triple, cameras, kept = choose_face_step(
+        *faces, scene.points, scene.pixels, scene.weights, task.target_points, task.target_known,
+        scene.camera_centres, before.face, before.triple,
+    )  # fmt: skip
+    changed = before.cameras > 0 and (cameras == 0 or set(triple.tolist()) != set(before.triple.tolist()))
+    return FaceChoice(face, triple, cameras, kept, changed)
+
+
+def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
+    """The scene for a law that keeps sight of its face: without the cameras that lose it at the goal or have it not.
+
+    Their way cannot be the face's front; what they see of the markers stays.
+    """
+    if all(choice.kept.tolist()):
+        return scene
+    operators, composition, matrices, centres, points, pixels, weights = scene
+    return Scene(operators, composition, matrices, _kept_rows(centres, choice.kept), points, pixels, weights)
 
 
 # -- kernels, without BLAS ------------------------------------------------------------------------------------
@@ -245,3 +312,238 @@ def faces_fronting(
                 if not dot(plane, camera_centres[c]) > 0.0:
                     out[s, f, c] = 0.0
     return out
+
+
+@kernel
+def kept_faces(
+    triples: IntArray,
+    members: FloatArray,
+    sided: FloatArray,
+    body: FloatArray,
+    points: FloatArray,
+    targets: FloatArray,
+    matrices: FloatArray,
+    camera_centres: FloatArray,
+) -> IntArray:
+    """Outward triples (k, 3) of the faces that some camera has both now and at the goal: those that a plan must keep.
+
+    That on which a law will work leads, for the way is turned by it: which of two alike faces the model names first is
+    a matter of noise. Empty where the body turns so far that no face lasts: the way has to hand over
+    (`sights_along`). Faces whose side is not known ask for nothing. Of `Faces`, and contiguous ``points``,
+    ``targets`` (m, 4), ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4).
+    """
+    eye = np.eye(4).reshape((1, 4, 4))
+    now = faces_fronting(points, triples, sided, eye, camera_centres)
+    then = faces_fronting(targets, triples, sided, eye, camera_centres)
+    lasting = np.zeros(triples.shape[0])
+    for f in range(triples.shape[0]):
+        for c in range(camera_centres.shape[0]):
+            if sided[f] > 0.0 and now[0, f, c] > 0.0 and then[0, f, c] > 0.0:
+                lasting[f] = 1.0
+    kept = np.zeros((int(lasting.sum()), 3), np.int64)
+    count = 0
+    if len(kept) > 1:
+        pixels = project_points(matrices, points)[0]
+        weights, known = np.full(pixels.shape[:2], 1.0 / SEEN_TO_PX), np.ones(len(points))
+        face = choose_face_step(
+            triples, members, sided, body, points, pixels, weights, targets, known, camera_centres, -2,
+            np.zeros(3, np.int64),
+        )[0]  # fmt: skip
+        if face >= 0 and lasting[face] > 0.0:
+            kept[0], lasting[face], count = triples[face], 0.0, 1
+    for f in range(triples.shape[0]):
+        if lasting[f] > 0.0:
+            kept[count] = triples[f]
+            count += 1
+    return kept
+
+
+@kernel
+def _kept_rows(rows: FloatArray, kept: FloatArray) -> FloatArray:
+    """Those of ``rows`` (c, 4) where ``kept`` (c,) > 0."""
+    found = np.empty(rows.shape)
+    count = 0
+    for c in range(rows.shape[0]):
+        if kept[c] > 0.0:
+            found[count] = rows[c]
+            count += 1
+    return found[:count]
+
+
+@kernel
+def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
+    """Cameras that see a triangle well, and its areas there, in squared deviations of its worst marker, summed."""
+    count, area = 0, 0.0
+    for c in range(weights.shape[0]):
+        weight = min(weights[c, i], weights[c, j], weights[c, k])
+        if not weight > 0.0:
+            continue
+        ux, uy = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
+        vx, vy = pixels[c, k, 0] - pixels[c, i, 0], pixels[c, k, 1] - pixels[c, i, 1]
+        wx, wy = vx - ux, vy - uy
+        double = abs(ux * vy - uy * vx)
+        longest = math.sqrt(max(ux * ux + uy * uy, vx * vx + vy * vy, wx * wx + wy * wy))
+        if double * weight >= LEAST_ALTITUDE * longest and longest > 0.0:
+            count += 1
+            area += 0.5 * double * weight * weight
+    return count, area
+
+
+@kernel
+def spread_in_images(
+    candidates: IntArray, pixels: FloatArray, weights: FloatArray, count: int = MOST_TRIED
+) -> IntArray:
+    """At most ``count`` of the ``candidates`` (k,), ascending, each the farthest in the images from those before it.
+
+    ``pixels`` (c, m, 2); two markers are apart in the cameras that see both, ``weights`` (c, m) above 0.
+    """
+    k = candidates.shape[0]
+    if k <= count:
+        return candidates.copy()
+    chosen = np.zeros(k, np.bool_)
+    nearest = np.empty(k)
+    latest = 0
+    for nth in range(count + 1):  # the first one only tells which is the farthest from it
+        far = -1
+        for a in range(k):
+            i, j = candidates[latest], candidates[a]
+            apart = 0.0
+            for c in range(weights.shape[0]):
+                if weights[c, i] > 0.0 and weights[c, j] > 0.0:
+                    u, v = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
+                    apart += u * u + v * v
+            nearest[a] = apart if nth < 2 else min(nearest[a], apart)
+            if not chosen[a] and (far < 0 or nearest[a] > nearest[far]):
+                far = a
+        if nth < count:
+            chosen[far] = True
+            latest = far
+    return candidates[chosen]
+
+
+@kernel
+def markers_tried(members: FloatArray, usable: FloatArray, cameras: int) -> int:
+    """Of how many ``usable`` (m,) markers of each face every three are tried: `MOST_TRIED`, or as `LOOKS` allows.
+
+    ``members`` (f, m).
+    """
+    sizes = np.zeros(members.shape[0], np.int64)
+    for f in range(members.shape[0]):
+        for i in range(members.shape[1]):
+            if usable[i] > 0.0 and members[f, i] > 0.0:
+                sizes[f] += 1
+    most = MOST_TRIED
+    while most > LEAST_TRIED:
+        looks = 0
+        for f in range(sizes.shape[0]):
+            k = min(sizes[f], most)
+            looks += cameras * (k * (k - 1) * (k - 2) // 6)
+        if looks <= LOOKS:
+            break
+        most -= 1
+    return most
+
+
+@kernel
+def choose_triangle(
+    members: FloatArray,
+    lasting: FloatArray,
+    usable: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    face_now: int,
+    triple_now: IntArray,
+) -> tuple[int, IntArray, int]:
+    """Face (-1: across faces), its three markers and the cameras that see them (0: there are none).
+
+    See `choose_face`; the order of the markers is not yet outward. ``lasting`` (f,), ``usable`` (m,).
+    """
+    faces, markers = members.shape
+    best = np.zeros(3, np.int64)
+    best_face, best_count, best_area = -1, 0, 0.0
+    candidates = np.empty(markers, np.int64)
+    most = markers_tried(members, usable, weights.shape[0])
+    # faces first; across faces only where none is seen
+    for f in range(faces + 1):
+        if f == faces and best_count > 0:
+            break
+        found = 0
+        for i in range(markers):
+            if usable[i] > 0.0 and (f == faces or members[f, i] > 0.0):
+                candidates[found] = i
+                found += 1
+        tried = spread_in_images(candidates[:found], pixels, weights, most if f < faces else MOST_TRIED)
+        for a in range(tried.shape[0]):
+            for b in range(a + 1, tried.shape[0]):
+                for c in range(b + 1, tried.shape[0]):
+                    i, j, k = tried[a], tried[b], tried[c]
+                    count, area = triangle_sight(i, j, k, pixels, weights)
+                    if f < faces and lasting[f] > 0.0:
+                        area *= LASTING
+                    if count > best_count or (count == best_count and area > best_area):
+                        best_face, best_count, best_area = (f if f < faces else -1), count, area
+                        best[0], best[1], best[2] = i, j, k
+    if face_now >= -1 and (face_now >= 0 or best_face < 0):
+        good = True
+        for corner in range(3):
+            good = good and usable[triple_now[corner]] > 0.0
+        if good:
+            count, area = triangle_sight(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
+            if face_now >= 0 and lasting[face_now] > 0.0:
+                area *= LASTING
+            if count > 0 and count >= best_count and best_area <= CLEARLY_BETTER * area:
+                return face_now, triple_now.copy(), count
+    return best_face, best, best_count
+
+
+@kernel
+def choose_face_step(
+    triples: IntArray,
+    members: FloatArray,
+    sided: FloatArray,
+    body: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    weights: FloatArray,
+    targets: FloatArray,
+    target_known: FloatArray,
+    camera_centres: FloatArray,
+    face_now: int,
+    triple_now: IntArray,
+) -> tuple[int, IntArray, int, FloatArray]:
+    """`choose_face` on arrays: face, outward triple (3,), cameras and kept (c,)."""
+    faces, markers = members.shape
+    cameras = camera_centres.shape[0]
+    usable = np.zeros(markers)
+    for p in range(markers):
+        height = points[p, 0] + points[p, 1] + points[p, 2] + points[p, 3]
+        if target_known[p] > 0.0 and math.isfinite(height):
+            usable[p] = 1.0
+    lasting = np.zeros(faces)
+    for f in range(faces):
+        plane = minors(targets[triples[f, 0]], targets[triples[f, 1]], targets[triples[f, 2]])
+        for c in range(cameras):
+            if sided[f] > 0.0 and dot(plane, camera_centres[c]) > 0.0:
+                lasting[f] = 1.0
+    face, triple, count = choose_triangle(members, lasting, usable, pixels, weights, face_now, triple_now)
+    kept = np.zeros(cameras)
+    if count == 0:
+        return -2, triple_now.copy(), 0, kept
+    i, j, k = triple
+    side = 0.0
+    if face >= 0 and sided[face] > 0.0:
+        outward = minors(body[triples[face, 0]], body[triples[face, 1]], body[triples[face, 2]])
+        side = dot(outward, minors(body[i], body[j], body[k]))
+    else:  # the side that most cameras see
+        plane = minors(points[i], points[j], points[k])
+        for c in range(cameras):
+            if weights[c, i] > 0.0 and weights[c, j] > 0.0 and weights[c, k] > 0.0:
+                side += 1.0 if dot(plane, camera_centres[c]) > 0.0 else -1.0
+    if side < 0.0:
+        triple[1], triple[2] = k, j
+    now = minors(points[triple[0]], points[triple[1]], points[triple[2]])
+    then = minors(targets[triple[0]], targets[triple[1]], targets[triple[2]])
+    for c in range(cameras):
+        if dot(now, camera_centres[c]) > 0.0 and dot(then, camera_centres[c]) > 0.0:
+            kept[c] = 1.0
+    return face, triple, count, kept

@@ -8,8 +8,7 @@ from typing import Literal
 
 import msgspec
 
-from stereoservo.control.face_choice import FaceChoice
-from stereoservo.control.faces import Faces
+from stereoservo.control.faces import FaceChoice, Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
 from stereoservo.core.block import Block, steps_of_delay
 from stereoservo.core.camera_state import CameraEstimate

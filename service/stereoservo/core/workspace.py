@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.face_choice import FaceChoice
+from stereoservo.control.faces import FaceChoice
 from stereoservo.control.law import Scene, Task
 from stereoservo.core.block import BLOCK, JOINTS, Shapes, packed_type, views
 from stereoservo.core.model_arrays import ModelArrays

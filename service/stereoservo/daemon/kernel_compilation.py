@@ -31,7 +31,7 @@ import msgspec
 import numba
 import numpy as np
 
-from stereoservo.control.face_choice import spread_in_images
+from stereoservo.control.faces import spread_in_images
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.law_warmup import warm_up_incidences, warm_up_laws
 from stereoservo.control.laws.cartesian3 import cartesian_step

@@ -16,8 +16,14 @@ from math import isfinite
 import numpy as np
 
 from stereoservo.control.cartesian_components import FaceTask
-from stereoservo.control.face_choice import MOST_TRIED, spread_in_images
-from stereoservo.control.faces import Faces, find_faces, select_faces, sights_along
+from stereoservo.control.faces import (
+    MOST_TRIED,
+    Faces,
+    find_faces,
+    select_faces,
+    sights_along,
+    spread_in_images,
+)
 from stereoservo.control.laws.cartesian3 import cartesian3_step
 from stereoservo.control.marker_groups import FLAT_PX
 from stereoservo.core.context import RefusalError, StepContext

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from stereoservo.control.face_choice import kept_faces
+from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import (
@@ -85,21 +85,21 @@ def _plan_request(
     keep_outs = limits.keep_outs.copy()
     keep_outs[:, :, 0] -= margin
     keep_outs[:, :, 1] += margin
+    matrices = np.ascontiguousarray(arrays.matrices[used])
+    camera_centres = np.ascontiguousarray(arrays.camera_centres[used])
     kept = (view_of(settings, arrays, points)[1][used] * source.wanted[used]).min(axis=0)
     return PlanRequest(
         operators=chain_at(arrays, joints)[1],
         composition=arrays.composition,
         joints=joints.copy(),
-        matrices=np.ascontiguousarray(arrays.matrices[used]),
-        camera_centres=np.ascontiguousarray(arrays.camera_centres[used]),
+        matrices=matrices,
+        camera_centres=camera_centres,
         points=points.copy(),
         targets=source.target_points.copy(),
         kept=kept,
         centre=centre_of(source, joints + context.state.block.correction, arrays, points),
         centre_target=source.centre_target.copy(),
-        faces=kept_faces(
-            source.faces, points, source.target_points, arrays.matrices[used], arrays.camera_centres[used]
-        ),
+        faces=kept_faces(*source.faces, points, source.target_points, matrices, camera_centres),
         limits=PlanLimits(
             position_min=limits.position_min + margin,
             position_max=limits.position_max - margin,

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.face_choice import spread_in_images
+from stereoservo.control.faces import spread_in_images
 from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.marker_body import (
     LAW_STEPS,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.face_choice import NOT_CHOSEN
+from stereoservo.control.faces import NOT_CHOSEN
 from stereoservo.control.law import JacobianChoice, Law
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.pd import GAIN_MARGIN, largest_gain

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereoservo.control.face_choice import FaceChoice, choose_face, law_scene
+from stereoservo.control.faces import FaceChoice, choose_face, law_scene
 from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene, Task
 from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits

@@ -11,7 +11,7 @@ from math import isfinite
 
 import numpy as np
 
-from stereoservo.control.face_choice import spread_in_images
+from stereoservo.control.faces import spread_in_images
 from stereoservo.control.filters import (
     ClientClock,
     arrived,
