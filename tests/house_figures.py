@@ -99,8 +99,8 @@ def _load(name: str, path: Path) -> ModuleType:
     return module
 
 
-LOADING = "numerics/kernel_cache.py"
-"""Runs where a kernel is loaded, which the service does before its loop."""
+LOADING = ("numerics/kernel_cache.py", "numerics/compilation.py")
+"""Run where a kernel is compiled or loaded, which the service does before its loop."""
 
 
 def servo_paths(law: str, steps: int = 40) -> tuple[CallPath, CallPath]:
