@@ -59,6 +59,7 @@ def test_a_hardware_channel_has_one_lock_whatever_the_cell_is_called(tmp_path: P
     assert hardware_lock_path(tmp_path, "fake", {}) is None
     assert hardware_lock_path(tmp_path, "video", {"source": "set", "episode": 0}) is None
     assert hardware_lock_path(tmp_path, "video", {"source": "set"}) is not None
+    assert hardware_lock_path(tmp_path, "acme", {"channel": "can0", "episode": 0}) is not None
 
 
 HOLD_CHANNEL = """

@@ -151,11 +151,10 @@ def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> P
     simulation, or an episode of a data set, which any number of cameras read). A device has one, whichever of its links
     it is called by.
     """
-    if options.get("episode") is not None:
-        return None
+    episode = options.get("episode") is not None
     for key in CHANNEL_OPTIONS:
         value = options.get(key)
-        if isinstance(value, str | int) and value != "":
+        if isinstance(value, str | int) and value != "" and not (episode and key == "source"):
             if key == "device" and isinstance(value, int):  # OpenCV's number of a camera
                 value = f"/dev/video{value}"
             if isinstance(value, str) and value.startswith("/dev/"):
