@@ -25,8 +25,10 @@ from stereoservo_sim.experiments.cameras.examined_recordings import (
 )
 
 BUMPED, QUIET, LATE, BUMPED_IN_TRIALS, STOP_MISTAKEN, DRIFTED_IN_TRIALS, POSES = 5, 11, 8, 2, 22, 7, 12
-LATE_POSES, DRIFTED_AND_RIPPLED, REFUSED_OTHERWISE = 5004, 5012, 84004
-"""Seeds of cases; of one the fit's refusal names a stop that is wrong by five, of another no camera."""
+LATE_POSES, DRIFTED_AND_RIPPLED, REFUSED_OTHERWISE, LATE_TO_THE_LAST_REST = 5004, 5012, 84004, 101092
+"""Seeds of cases; of one the fit's refusal names a stop that is wrong by five, of another no camera; the last ends at a
+rest, which says nothing of stamps.
+"""
 
 
 @pytest.mark.parametrize(
@@ -39,6 +41,7 @@ LATE_POSES, DRIFTED_AND_RIPPLED, REFUSED_OTHERWISE = 5004, 5012, 84004
         (STOP_MISTAKEN, ["camera_moved"]),
         (REFUSED_OTHERWISE, ["camera_moved"]),
         (LATE_POSES, ["late_stamps"]),
+        (LATE_TO_THE_LAST_REST, ["late_stamps", "dropped_frames"]),
         pytest.param(DRIFTED_AND_RIPPLED, ["joint_zero"], marks=pytest.mark.slow),
         pytest.param(POSES, ["camera_moved"], marks=pytest.mark.slow),
         pytest.param(DRIFTED_IN_TRIALS, ["joint_zero", "dropped_frames"], marks=pytest.mark.slow),

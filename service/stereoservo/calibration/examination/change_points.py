@@ -143,8 +143,18 @@ def _likely_changes(
     candidates = [_first_order(problem, views, one, here, middle) for one in tested]
     price = math.log(here.size)
     order = np.argsort([one.hypothesis.change.size * price - one.gain for one in candidates])[:REFINED]
-    found = [_refined(problem, views, candidates[i]) for i in order.tolist()]
+    found = [_lasting(problem, views, _refined(problem, views, candidates[i]), price) for i in order.tolist()]
     return sorted(found, key=lambda one: one.hypothesis.change.size * price - one.ratio)
+
+
+def _lasting(problem: ExaminedFrames, views: RecordedViews, one: ChangePoint, price: float) -> ChangePoint:
+    """A change of stamps as one that is there throughout, where an onset explains less beside that than its ``price``:
+    frames of a rest say nothing of stamps.
+    """
+    if one.hypothesis.kind != "stamps" or (one.after and one.onset == 0):
+        return one
+    whole = _refined(problem, views, _Candidate(one.hypothesis, True, 0, 0.0))
+    return whole if whole.ratio >= one.ratio - price else one
 
 
 def _score(left: FloatArray, sizes: IntArray, k: int, noise: float, count: int) -> float:
