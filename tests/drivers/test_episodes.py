@@ -170,7 +170,18 @@ def test_options_of_a_camera_that_name_nothing_are_refused(
         VideoCameraDriver(LOOPED | options, context(tmp_path, VirtualClock(), "up", arm)).configure()
 
 
-TABLES = "data/chunk-000/episode_000001.parquet"
+TABLES, STATE = "data/chunk-000/episode_000001.parquet", "observation.state"
+
+
+def pictures_alone(beside: dict[str, Any]) -> dict[str, Any]:
+    """Features of a set with nothing but its pictures and what is ``beside`` them."""
+    shape = {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": None}
+    return {f"observation.images.{name}": shape for name in CAMERAS} | beside
+
+
+def many(count: int) -> dict[str, Any]:
+    """A feature of so many states."""
+    return {"dtype": "float32", "shape": [count], "names": None}
 
 
 @pytest.mark.parametrize(
@@ -179,6 +190,8 @@ TABLES = "data/chunk-000/episode_000001.parquet"
         ("v2.1", lambda f: (f / "meta/info.json").write_text("{"), "info.json"),
         ("v2.1", lambda f: rewritten(f, fps=1e-300), "can be played back"),
         ("v2.1", lambda f: rewritten(f, codebase_version="v1.6"), "v2.0, v2.1, v3.0 are read"),
+        ("v2.1", lambda f: rewritten(f, features=pictures_alone({})), "no feature 'observation.state'"),
+        ("v3.0", lambda f: rewritten(f, features=pictures_alone({STATE: many(10**12)})), "1 to 4096"),
         ("v2.1", lambda f: (f / TABLES).write_bytes(b"no table"), "episode_000001.parquet"),
         ("v2.1", lambda f: (f / TABLES).unlink(), "no episode 1 in data; it has 0"),
         ("v3.0", lambda f: changed(f, "data", "timestamp", [1e300] * 21), "beyond 1e+06 s"),

@@ -35,6 +35,7 @@ UNITS: dict[str, tuple[JointKindName, float]] = {
 """Units of joints: the kind of such a joint, and the unit's size [rad or m]."""
 MOST_COUNTED = 2**40
 """Number of a frame or an episode at most."""
+MOST_STATES = 4096
 LARGEST_STAMP_S = 1e6
 MOST_NAMED = 20
 """Episodes that a refusal names."""
@@ -128,6 +129,10 @@ def state_names(info: Info, folder: Path) -> list[str]:
     feature = info.features.get(STATE)
     if feature is None or len(feature.shape) != 1:
         raise _wrong(folder, f"no feature {STATE!r} of one row a frame; it has {', '.join(info.features)}")
+    if not 1 <= feature.shape[0] <= MOST_STATES:
+        raise _wrong(
+            folder, f"{STATE!r} has {feature.shape[0]} parts in info.json; 1 to {MOST_STATES} are valid"
+        )
     stated = feature.names
     if isinstance(stated, dict) and len(stated) == 1:
         (stated,) = stated.values()
@@ -257,6 +262,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
     """Rows of all episodes, or of that one ``only``. Raises DataSetError."""
+    states = len(state_names(info, folder))
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
     tables = _tables(folder, "data", needed, only)
     with _reading(f"LeRobot data set {folder}: {', '.join(needed)} are to be numbers, as many in each row"):
@@ -265,11 +271,8 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
         )
         state = state.reshape(len(stamp), -1)
         stamp, frame, episode = (values.reshape(len(state)) for values in (stamp, frame, episode))
-    if state.shape[1] != info.features[STATE].shape[0]:
-        raise _wrong(
-            folder,
-            f"{len(stamp)} rows of {state.shape[1]} states; info.json has {info.features[STATE].shape}",
-        )
+    if state.shape[1] != states:
+        raise _wrong(folder, f"{len(stamp)} rows of {state.shape[1]} states; info.json has {states}")
     if not (np.isfinite(state).all() and (np.abs(stamp) <= LARGEST_STAMP_S).all()):
         raise _wrong(folder, f"states that are not finite, or stamps beyond {LARGEST_STAMP_S:g} s")
     counts = np.concatenate([frame, episode])
