@@ -99,9 +99,9 @@ class EpisodeJointDriver:
         self._seq = 0
         folder = context.cell_dir / self._options.dataset
         with refused(str(folder)):
-            info = lerobot.read_info(folder)
-            joints = lerobot.joints_of(lerobot.state_names(info, folder), self._options.units)
             self._episode = episode_of(folder, self._options.episode)
+            states = lerobot.state_names(self._episode.info, folder)
+            joints = lerobot.joints_of(states, self._options.units)
         self._names, self._kinds, scales, columns = joints
         self._positions: FloatArray = self._episode.rows.state[:, columns] * scales
 

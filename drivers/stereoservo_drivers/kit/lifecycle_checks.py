@@ -234,9 +234,8 @@ def agrees_with_its_velocities(bench: JointBench) -> str:
     states = bench.drive(driver, bench.slow(driver), 0.6)
     states = states[len(states) // 2 :]
     seconds = np.diff([state.t_ns for state in states]) * 1e-9
-    led = (
-        seconds < driver.describe().command_timeout_s
-    )  # not where this machine stood still, and the arm, too
+    # Not where this machine stood still, and the arm, too.
+    led = seconds < driver.describe().command_timeout_s
     elapsed = float(seconds[led].sum())
     require(elapsed > 0.0, "stamps stand still while the arm moves")
     travelled = np.diff([state.positions for state in states], axis=0)[led].sum(axis=0) / elapsed

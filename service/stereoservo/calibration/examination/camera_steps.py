@@ -71,14 +71,14 @@ def moved_camera(views: RecordedViews) -> int | None:
 
 
 def step_of_camera(
-    views: RecordedViews, camera: int, frames: BoolArray, marker: int | None = None
+    views: RecordedViews, camera: int, frames: BoolArray | None = None, marker: int | None = None
 ) -> Step | None:
-    """The step that explains most of a camera's pixels in some ``frames`` (f,), of all markers, or of one; None where
-    too few of them show motions of single joints.
+    """The step that explains most of a camera's pixels in all or some ``frames`` (f,), of all markers, or one; None
+    where too few of them show motions of single joints.
     """
     every = np.flatnonzero(views.camera == camera)
     forms, single = _forms(views)
-    mine = every[(frames & single)[every]]
+    mine = every[(single if frames is None else frames & single)[every]]
     tracks = [
         track for i in (range(views.pixels.shape[1]) if marker is None else (marker,))
         if (track := _track(views, mine, i, forms, marker is None)) is not None

@@ -78,8 +78,9 @@ class ChangePoint:
 
     @property
     def throughout(self) -> bool:
-        """Whether it is there from the first frame to the last."""
-        return bool(self.frames.all())
+        """Whether it is there from the first frame to the last, of stamps: of the cameras that it is of."""
+        stamps = self.hypothesis.kind == "stamps"
+        return bool(self.frames.all()) or (stamps and self.after and self.onset == 0)
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ def _lasting(problem: ExaminedFrames, views: RecordedViews, one: ChangePoint, pr
     """A change of stamps as one that is there throughout, where an onset explains less beside that than its ``price``:
     frames of a rest say nothing of stamps.
     """
-    if one.hypothesis.kind != "stamps" or (one.after and one.onset == 0):
+    if one.hypothesis.kind != "stamps" or one.throughout:
         return one
     whole = _refined(problem, views, _Candidate(one.hypothesis, True, 0, 0.0))
     return whole if whole.ratio >= one.ratio - price else one

@@ -214,7 +214,7 @@ def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
     kept = [one for one in kept if one.hypothesis.kind != "stamps" or one.effect_px >= LEAST_PX]
     for early in [one for one in kept if one.hypothesis.kind == "stamps" and not one.after]:
         for k, one in enumerate(kept):
-            if one.hypothesis == early.hypothesis and one.after and one.onset == 0 and _cancel(one, early):
+            if one.hypothesis == early.hypothesis and one.throughout and _cancel(one, early):
                 kept[k] = replace(
                     one, onset=early.onset, span=early.span, frames=one.frames & ~early.frames,
                     rows=one.rows & ~early.rows, effect=one.effect[~early.rows[one.rows]],
@@ -314,7 +314,7 @@ def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> Recor
     one = change.hypothesis
     text = _sentence(model, one, value, deviation)
     onset = None
-    if not change.throughout and not (one.kind == "stamps" and change.onset == 0):
+    if not change.throughout:
         names = [camera.name for camera in views.cameras]
         own = one.kind in ("camera", "stamps") and one.subject
         camera = names.index(one.subject) if own else int(views.camera[change.onset])
@@ -464,7 +464,7 @@ def _refused_from(views: RecordedViews, failed: LearningError, camera: int | Non
     one = views.marker_ids.index(marker) if marker in views.marker_ids else None
     if views.generators is None and (camera is not None or one is not None):
         shown = camera or 0
-        step = step_of_camera(views, shown, np.ones(len(views.camera), dtype=np.bool_), one)
+        step = step_of_camera(views, shown, marker=one)
         if step is not None and step.gain >= CLEAR:
             return _onset(views, step.onset, step.span, shown)
     if not isinstance(stop, int) or not 0 <= stop < len(frames):
@@ -500,7 +500,7 @@ def _by_camera(
             deviation = 1.0 / math.sqrt(max(float(estimate.information[0, 0]), 1e-12))
             known = [
                 one for one in found
-                if one.hypothesis.kind == "stamps" and one.after and one.onset == 0
+                if one.hypothesis.kind == "stamps" and one.throughout
                 and one.hypothesis.subject in ("", camera.name)
             ]  # fmt: skip
             if known:

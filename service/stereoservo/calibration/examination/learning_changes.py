@@ -96,10 +96,7 @@ def _learnt_beside_step(views: RecordedViews) -> ReferenceModel | None:
     First along a homography, then by the camera's motion as the model so learnt tells it.
     """
     camera = moved_camera(views) if views.generators is None else None
-    step = (
-        None if camera is None else step_of_camera(views, camera, np.ones(len(views.camera), dtype=np.bool_))
-    )
-    if camera is None or step is None:
+    if camera is None or (step := step_of_camera(views, camera)) is None:
         return None
     reference = _learnt(without_step(views, camera, step))
     for _ in range(PUT_BACK):
