@@ -75,16 +75,22 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the fast ones before ``-m`` chooses. A test that failed runs again, three times at most, where the machine
-    stalled while it ran, or where it is of several processes in real time, which wait for one another's processor.
+    stalled while it ran, or where it is in real time, and may have waited for another test's processor.
     """
     for item in items:
         if is_fast(item.path) and item.get_closest_marker("slow") is None:
             item.add_marker("fast")
         if item.config.getoption("--hil") is None:
-            processes = item.get_closest_marker("process") is not None
-            condition = True if processes else partial(machine_stalled, item)
-            delay_s = REST_S if processes else 0.0
+            live = in_real_time(item)
+            condition = True if live else partial(machine_stalled, item)
+            delay_s = REST_S if live else 0.0
             item.add_marker(pytest.mark.flaky(reruns=RERUNS, reruns_delay=delay_s, condition=condition))
+
+
+def in_real_time(item: pytest.Item) -> bool:
+    """Whether a test is of real processes, or a driver's contract in real time."""
+    suite = item.cls if isinstance(item, pytest.Function) else None
+    return item.get_closest_marker("process") is not None or getattr(suite, "real_time", False)
 
 
 class LiveFilesInTurn(LoadFileScheduling):
@@ -107,7 +113,7 @@ STALLS = "STEREOSERVO_TESTS_STALLS"
 """Environment variable of the file of this machine's stalls, for the workers of pytest-xdist."""
 RERUNS = 3
 REST_S = 5.0
-"""[s] Before a test of real processes runs again."""
+"""[s] Before a test in real time runs again."""
 STARTED_NS = pytest.StashKey[int]()
 
 
@@ -139,7 +145,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     item.stash[STARTED_NS] = time.monotonic_ns()
-    give_way(item.get_closest_marker("process") is None)
+    give_way(not in_real_time(item))
 
 
 NICENESS = os.getpriority(os.PRIO_PROCESS, 0)
@@ -148,7 +154,7 @@ MAY_RETURN = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_NICE)[0] >=
 
 
 def give_way(yields: bool) -> None:
-    """Set this worker's priority for its next test: real processes keep real time, computations can wait for them."""
+    """Set this worker's priority for its next test: what is in real time keeps it, computations can wait."""
     if MAY_RETURN:
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS + 10 * yields)
 

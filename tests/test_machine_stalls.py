@@ -40,6 +40,23 @@ def test_a_failed_test_runs_again_where_the_machine_stalled(
     assert f"the machine stood still {2 * stalls} times" in result.stdout.str()
 
 
+IN_REAL_TIME = """
+class TestDriver:
+    real_time = True
+    runs = 0
+
+    def test_it(self):
+        TestDriver.runs += 1
+        assert TestDriver.runs > 1
+"""
+
+
+def test_a_failed_test_of_a_driver_in_real_time_runs_again(pytester: pytest.Pytester) -> None:
+    settings_of_the_suite(pytester)
+    pytester.makepyfile(IN_REAL_TIME)
+    pytester.runpytest_subprocess("-p", "no:xdist").assert_outcomes(passed=1)
+
+
 LIVE = """
 import os, time, pytest
 

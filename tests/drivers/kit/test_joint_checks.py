@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import json
 from pathlib import Path
@@ -12,8 +13,8 @@ import typer
 from typer.testing import CliRunner
 
 from stereoservo_drivers.commands.driver_check import driver_check
-from stereoservo_drivers.kit.bench import CheckFailedError, JointBench
-from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, run_check
+from stereoservo_drivers.kit.bench import RUNAWAY_REMEDY, CheckFailedError, JointBench
+from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, TRIES, JointCheck, run_check
 from stereoservo_drivers.kit.watchdog import CommandWatchdog
 
 from .faulty_drivers import (
@@ -309,3 +310,42 @@ def test_a_watchdog_stops_a_device_that_has_none(name, tmp_path):
     setup.driver, setup.real_time, setup.brake_s = Watched, True, 0.2
     (check,) = (check for check in JOINT_CHECKS if check.name == name)
     assert run_check(check, setup, tmp_path).verdict == "passed"
+
+
+STALL_US = 60_000
+
+
+@pytest.mark.parametrize(
+    ("real_time", "stalls", "fails", "remedy", "runs", "verdict"),
+    [
+        pytest.param(True, 1, 1, "", 2, "passed", id="stood still once"),
+        pytest.param(True, 9, 9, "", TRIES, "failed", id="stands still always"),
+        pytest.param(True, 0, 9, "", 1, "failed", id="the driver's fault"),
+        pytest.param(True, 9, 9, RUNAWAY_REMEDY, 1, "failed", id="ran away"),
+        pytest.param(False, 9, 9, "", 1, "failed", id="in virtual time"),
+    ],
+)
+def test_a_check_that_fails_runs_again_where_the_computer_stood_still(
+    real_time, stalls, fails, remedy, runs, verdict, tmp_path
+):
+    done = 0
+
+    def run(bench: JointBench) -> str:
+        nonlocal done
+        done += 1
+        if done <= stalls:
+            ctypes.PyDLL(None).usleep(STALL_US)  # with the interpreter's lock: no thread of this process runs
+        if done <= fails:
+            raise CheckFailedError("joint 1 goes on", remedy)
+        return "stands"
+
+    setup = SmallSetup()
+    setup.real_time = real_time
+    result = run_check(JointCheck("stands", run, "stop it"), setup, tmp_path)
+    assert (done, result.verdict) == (runs, verdict)
+    told = (
+        ("this computer stood still meanwhile, for up to" in result.measured)
+        if verdict == "failed"
+        else False
+    )
+    assert told == (real_time and stalls > 0 and verdict == "failed")

@@ -11,18 +11,17 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
+from stereoservo_drivers.kit.watchdog import StallWatch
 from stereoservo_sim.benchmarks import service_bench
 from stereoservo_sim.benchmarks.faults import disks
 from stereoservo_sim.benchmarks.service_bench import (
@@ -85,32 +84,6 @@ with Client(sys.argv[1]) as client:
     print(client.goal({"j1": end}, speed_scale=0.1, lease_s=1.0).id, flush=True)
     time.sleep(60.0)
 """
-
-
-class StallWatch:
-    """A thread that sleeps and notes by how much it came late at most [s]; a context manager that ends it."""
-
-    def __init__(self) -> None:
-        self.longest_s = 0.0
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="stall-watch", daemon=True)
-
-    def _run(self) -> None:
-        last = time.monotonic()
-        while not self._ended.wait(0.01):
-            now = time.monotonic()
-            self.longest_s = max(self.longest_s, now - last - 0.01)
-            last = now
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ended.set()
-        self._thread.join()
 
 
 @dataclass(frozen=True)
