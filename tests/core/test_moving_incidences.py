@@ -19,6 +19,8 @@ from stereoservo.messages.goals import Feature, Goal, IncidenceSpec, IncidenceTa
 NOISE_PX = 0.1
 PART = tuple(range(8, 14))
 """Markers of the target before cameras that stand."""
+FEW = PART[:3]
+"""Of those, as few as tell how a part whose shape is known has turned."""
 SETTLE_S, JUDGED_S = 2.0, 1.0
 
 Way = Callable[[float], np.ndarray]
@@ -220,22 +222,56 @@ def test_the_goal_ends_where_the_target_stands_and_waits_where_it_is_not_seen(be
     assert kinds[-2:] == ["target_seen", "goal_reached"]
 
 
-def test_where_the_target_was_when_its_features_were_shown_is_taken_as_said(benches: Any) -> None:
+def shown(cell: Cell, displacement: np.ndarray) -> dict[str, dict[int, tuple[float, float]]]:
+    """What the cameras see of the part that is displaced by (4, 4)."""
+    there = (cell.part @ displacement.T)[:, :3]
+    return {
+        name: {i: (float(u), float(v)) for i, (u, v) in zip(PART, image, strict=True) if i in FEW}
+        for name, image in zip(cell.bench.names, cell.images(there), strict=True)
+    }
+
+
+@pytest.mark.parametrize(
+    ("turned", "then"), [(0.0, 0.2), (2.6, -1.8), (3.1, 1.5)], ids=["slid", "turned", "turned about"]
+)
+def test_where_the_target_was_when_its_features_were_shown_is_taken_as_said(
+    benches: Any, turned: float, then: float
+) -> None:
+    """However it has turned since, of a goal by which it is found, and of one to a target that is followed already."""
     cell = Cell(benches(5).ready())
     fixed = cell.bench.truth.points(BASE)[[4]]
-    names = cell.bench.names
-    shown = {
-        name: {i: (float(u), float(v)) for i, (u, v) in zip(PART, image, strict=True)}
-        for name, image in zip(names, cell.images(cell.part[:, :3]), strict=True)
-    }
-    slide = sliding(5, 0.05)
-    cell.set_out(lambda t: slide(1.0))
+    middle = cell.part[:, :3].mean(axis=0)
+    D = sliding(5, 0.05)(1.0) @ turning(fixed[0], np.array([0.1, 0.3, 1.0]), turned)(1.0)
+    cell.set_out(lambda t: D)
     cell.run(0.5)
-    assert cell.send("point-on-point", (4,), fixed, PART, shown).accepted
+    assert cell.send("point-on-point", (4,), fixed, FEW, shown(cell, np.eye(4))).accepted
     cell.run(5.0)
+    V = turning(middle, np.array([1.0, -0.3, 0.2]), then)(1.0)
+    wanted = (D @ np.append(fixed[0], 1.0))[:3]
+    np.testing.assert_allclose(cell.bench.truth.points(cell.bench.q)[4], wanted, atol=2e-3)
     assert cell.bench.events[-1].kind == "goal_reached"
-    there = fixed + slide(1.0)[:3, 3]
-    np.testing.assert_allclose(cell.bench.truth.points(cell.bench.q)[[4]], there, atol=2e-3)
+    nearby = wanted + np.array([0.01, -0.01, 0.02])
+    then_fixed = (V @ np.linalg.inv(D) @ np.append(nearby, 1.0))[None, :3]
+    assert cell.send("point-on-point", (4,), then_fixed, FEW, shown(cell, V)).accepted
+    cell.run(5.0)
+    np.testing.assert_allclose(cell.bench.truth.points(cell.bench.q)[4], nearby, atol=2e-3)
+
+
+def test_another_part_than_was_taught_is_told_and_not_gone_to(benches: Any) -> None:
+    cell = Cell(benches(5).ready())
+    fixed, taught = cell.bench.truth.points(BASE)[[4]], shown(cell, np.eye(4))
+    middle = cell.part.mean(axis=0)
+    cell.part = middle + 1.5 * (cell.part - middle)
+    before = cell.bench.q.copy()
+    assert cell.send("point-on-point", (4,), fixed, FEW, taught).accepted
+    cell.run(1.0)
+    (reason,) = [r for r in cell.bench.log[-1][1].status.reasons if r.code.startswith("TARGET")]
+    assert (reason.code, reason.unit) == ("TARGET_DIFFERS", "px")
+    assert reason.value > reason.threshold
+    np.testing.assert_allclose(cell.bench.q, before, atol=1e-3)
+    cell.part = cell.part + np.array([0.0, 0.0, 50.0, 0.0])  # out of sight
+    cell.run(1.0)
+    assert "TARGET_UNSEEN" in {r.code for r in cell.bench.log[-1][1].status.reasons}
 
 
 def test_its_state_survives_serialisation_bit_for_bit(benches: Any) -> None:

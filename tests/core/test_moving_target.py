@@ -21,6 +21,7 @@ from stereoservo.core.target.motion import (
     after,
     displaced,
     elapse,
+    find_stated,
     fold_frame,
     jumped,
     pixel_rates,
@@ -273,6 +274,32 @@ def test_a_target_that_jumped_is_found_in_one_frame_of_one_camera() -> None:
     np.testing.assert_allclose(transform_points(pose, points), transform_points(there, points), atol=1e-6)
     assert moved_px > 40.0
     assert rest_px < 1e-6
+
+
+@pytest.mark.parametrize("markers", [3, 4, 8])
+def test_a_target_whose_shape_is_known_is_found_however_it_has_turned(markers: int) -> None:
+    """Within six deviations of what the pixels tell, 50 seeds of any turn."""
+    for seed in range(50):
+        basis, cameras, points, carrier = scene(seed)
+        H = np.eye(4) + 0.2 * np.random.default_rng(seed).standard_normal((4, 4))
+        rng = np.random.default_rng([seed, 31])
+        points = np.ascontiguousarray(points[:markers])
+        axis = rng.standard_normal(3)
+        turned = displaced(
+            np.eye(4),
+            basis,
+            np.concatenate([np.zeros(3), rng.uniform(0.0, np.pi) * axis / np.linalg.norm(axis)]),
+        )
+        there = displaced(turned, basis, np.concatenate([rng.uniform(-0.1, 0.1, 3), np.zeros(3)]))
+        truth = transform_points(there, points)
+        sights = project_points(cameras, truth)[0]
+        noisy = sights + NOISE_PX * rng.standard_normal(sights.shape)
+        arrays = SimpleNamespace(matrices=cameras, to_euclidean=H, plane_at_infinity=H[3].copy())
+        scaled, _, _ = scaled_basis(basis, cameras, carrier, points)
+        found, rest_px = find_stated(scaled, cast(Any, arrays), points, noisy, np.ones((2, markers)))
+        off = project_points(cameras, transform_points(found, points))[0] - sights
+        assert rest_px < 2.0 * NOISE_PX, seed
+        assert np.abs(off).max() < 6.0 * NOISE_PX, seed
 
 
 def test_a_frame_is_folded_as_a_kalman_filter_does() -> None:

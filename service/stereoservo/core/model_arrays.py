@@ -39,6 +39,8 @@ class ModelArrays:
     camera_centres: FloatArray
     metric_basis: FloatArray | None
     """Six twists (6, 4, 4) that span all displacements, where the model is metric."""
+    to_euclidean: FloatArray | None
+    """The map (4, 4) from the model's frame to a Euclidean one, where it is metric."""
     marker_ids: tuple[int, ...]
     index: dict[int, int]
     scene_ids: tuple[int, ...]
@@ -158,6 +160,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         plane_at_infinity=np.ascontiguousarray(model.plane_at_infinity, dtype=np.float64),
         camera_centres=with_unit_height(centres, model.plane_at_infinity),
         metric_basis=_metric_basis(model),
+        to_euclidean=model.projective_to_euclidean,
         marker_ids=model.marker_ids,
         index={marker: i for i, marker in enumerate(model.marker_ids)},
         scene_ids=model.scene_ids,

@@ -29,6 +29,8 @@ RESIDUAL_PX = 1.5
 SIGMA_PX = 2.0
 """Set-points that are known no better than this are refused."""
 DEVIATIONS = 6.0
+ALIKE = 3.0
+"""Times what the best explanation leaves, or the deviation of what is observed: explanations within it are as good."""
 MIN_MARKERS = 3
 
 
@@ -73,9 +75,7 @@ def align_points(
     except GeometryError as error:
         raise TransferError(f"{what}: {error}") from error
     worst = float(np.nanmax(residuals))
-    limit = max(
-        RESIDUAL_PX, DEVIATIONS * float(np.nanmax(np.where(np.isfinite(now.sigmas), now.sigmas, np.nan)))
-    )
+    sigma, limit = _allowed(now)
     ids = [common[k] for k in np.flatnonzero(usable)]
     if worst > limit:
         others = np.arange(usable.size)
@@ -86,23 +86,40 @@ def align_points(
         raise TransferError(
             f"{what}: markers {listed(ids)} have not moved as one body: {worst:.1f} px is left at marker "
             f"{ids[int(np.nanargmax(residuals))]}, {limit:.1f} px is allowed"
-            f"{_outlier(fits, limit, 'it has slipped, or is taken for another')}"
+            f"{_outlier(fits, sigma, limit, 'has slipped, or is taken for another')}"
         )
     count = f"{len(ids)} markers ({listed(ids)})"
     return change, f"{what} by {count} as a {family} map, which agree within {worst:.2f} px"
 
 
-def _outlier(fits: Iterable[tuple[str, Callable[[], FloatArray]]], limit: float, why: str) -> str:
+def _allowed(now: MarkerViews) -> tuple[float, float]:
+    """Largest deviation of what is observed, and what a fit may leave [px]."""
+    sigma = float(now.sigmas[np.isfinite(now.sigmas)].max(initial=0.0))
+    return sigma, max(RESIDUAL_PX, DEVIATIONS * sigma)
+
+
+def _outlier(
+    fits: Iterable[tuple[str, Callable[[], FloatArray]]], sigma: float, limit: float, why: str
+) -> str:
     """The single feature, by name, without which what its fit leaves [px] is below ``limit``, and ``why`` that may be;
-    empty where there is none, or too few are left.
+    those that explain it as well as the best; empty where there is none, or too few are left.
     """
-    best = (limit, "")
-    for name, left in fits:
+    left: dict[str, float] = {}
+    for name, fit in fits:
         try:
-            best = min(best, (float(np.nanmax(left(), initial=0.0)), name))
+            left[name] = float(np.nanmax(fit(), initial=0.0))
         except GeometryError:
             continue  # too few are left, or they are coplanar: this one cannot be tested
-    return f"; without {best[1]} the others agree within {best[0]:.2f} px: {why}" if best[1] else ""
+    best = min(left.values(), default=limit)
+    alike = sorted(
+        (px, name) for name, px in left.items() if px < min(limit, max(ALIKE * best, ALIKE * sigma))
+    )
+    if not alike:
+        return ""
+    if len(alike) == 1:
+        return f"; without {alike[0][1]} the others agree within {best:.2f} px: it {why}"
+    each = ", or without ".join(f"{name} (within {px:.2f} px)" for px, name in alike)
+    return f"; without {each} the others agree: one of them {why}, and more features would tell which"
 
 
 def reproject_set_points(
@@ -220,15 +237,14 @@ def align_features(
             for k in lost:
                 left_out.append("{}-{}".format(*features.lines[k]))
                 features = features.without(len(features.points) + k)
-    known = now.sigmas[np.isfinite(now.sigmas)]
-    limit = max(RESIDUAL_PX, DEVIATIONS * float(known.max(initial=0.0)))
+    sigma, limit = _allowed(now)
     worst = float(away.max(initial=0.0))
     if worst > limit:
         fits = [(name, lambda k=k: fit(features.without(k))[1]) for k, name in enumerate(features.names)]
         raise TransferError(
             f"{what}: {_counted(features)} have not moved as one body: {worst:.1f} px is left at "
             f"{features.names[int(away.argmax())]}, {limit:.1f} px is allowed"
-            f"{_outlier(fits, limit, 'it is another one, or was taken for another')}"
+            f"{_outlier(fits, sigma, limit, 'is another one, or was taken for another')}"
         )
     note = f"{what} by {_counted(features)} as a {family} map, which agree within {worst:.2f} px"
     if left_out:

@@ -352,6 +352,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         plane_at_infinity=knowledge.plane_at_infinity,
         camera_centres=knowledge.camera_centres,
         metric_basis=None,
+        to_euclidean=None,
         marker_ids=tuple(range(m)),
         index={i: i for i in range(m)},
         scene_ids=(),

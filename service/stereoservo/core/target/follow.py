@@ -17,9 +17,10 @@ from stereoservo.core.prediction import chain_at
 from stereoservo.core.sources.progress import error_of_run
 from stereoservo.core.state import Followed, FollowedFeatures, FollowedTarget, IncidenceGoal, ServoGoal
 from stereoservo.core.target.motion import (
+    FOUND_REST_PX,
     TargetBody,
-    find_pose,
     find_shape,
+    find_stated,
     generator_of,
     pixel_rates,
     seen_through,
@@ -121,15 +122,16 @@ def start_following(source: Follower, context: StepContext) -> None:
     arrays, state, goal = context.arrays, context.state, source.goal
     assert arrays is not None
     cameras, body = len(context.settings.cameras), state.target
-    reference = IDENTITY.copy()
+    reference, rest_px = IDENTITY.copy(), np.inf
     if _carried(context):
         if body is None or not body.carried:
             state.target = target_body(arrays.ids, arrays.marker_points, cameras, carried=True)
     elif goal.follow_seen:
         ids, points, sights, seen = _stated(goal, context, arrays)
         if body is not None and not body.carried and body.t_ns > 0 and np.array_equal(body.ids, ids):
-            reference, _ = find_pose(body.basis, arrays.matrices, body.points, sights, seen)
-        else:
+            reference, rest_px = find_stated(body.basis, arrays, body.points, sights, seen)
+        if rest_px > FOUND_REST_PX:
+            reference = IDENTITY.copy()
             state.target = target_body(ids, points, cameras, carried=False)
     else:
         ids = np.array(sorted(goal.follow_markers), dtype=np.int64)
@@ -184,7 +186,7 @@ def _brought(source: Follower, context: StepContext) -> Reason | None:
     if isinstance(source, ServoGoal):
         source.rates = np.zeros_like(source.set_points)
     if body is None or body.t_ns == 0:
-        return _unseen(source, "the target is looked for: bring its markers into the view of two cameras")
+        return _not_found(source, body, context)
     unseen_s = (context.now_ns - int(body.seen_ns.max())) * 1e-9
     if unseen_s > context.settings.limits.coast_s:
         return _unseen(
@@ -236,6 +238,20 @@ def _bring_set_points(source: ServoGoal, body: TargetBody, context: StepContext)
     there, _ = project_points(arrays.matrices, followed.target_points)
     source.set_points = here + np.where(source.wanted[..., None] > 0.0, followed.set_points - there, 0.0)
     source.rates = pixel_rates(body.basis, twist, arrays.matrices, IDENTITY, source.target_points)
+
+
+def _not_found(source: Follower, body: TargetBody | None, context: StepContext) -> Reason:
+    since_s = np.inf if body is None else (context.now_ns - int(body.seen_ns.max())) * 1e-9
+    if body is None or body.rest_px <= FOUND_REST_PX or since_s > context.settings.limits.coast_s:
+        return _unseen(source, "the target is looked for: bring its markers into the view of two cameras")
+    ids = ", ".join(str(marker) for marker in source.goal.follow_markers)
+    hint = (
+        f"its markers are seen, but no motion of the part that was taught explains them: {body.rest_px:.1f} px is "
+        f"left, {FOUND_REST_PX:g} px is allowed; it is another part, or one of its markers slipped"
+    )
+    if context.arrays is None or context.arrays.to_euclidean is None:
+        hint += ", or it has turned by 60 degrees and more, which only a metric model tells"
+    return Reason("TARGET_DIFFERS", "hold", ids, body.rest_px, FOUND_REST_PX, "px", hint)
 
 
 def _unseen(source: Follower, hint: str, value: float | None = None, limit: float | None = None) -> Reason:

@@ -15,6 +15,9 @@ import math
 import msgspec
 import numpy as np
 
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.geometry.alignment import similarity_from_points
+from stereoservo.geometry.homogeneous import GeometryError, from_homogeneous, move_points
 from stereoservo.kinematics.kernels import (
     exp_twist,
     image_jacobian,
@@ -54,7 +57,8 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
     the motion did not explain, 0 where a later one was explained; ``told`` (c,): whether its estimate began anew since
     the target was found. ``drift`` (6, 6): how accelerations are spread over the basis. ``odd``: steps in a row with
     such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): sights from which it is found,
-    where it is not yet; ``stated``: ``points`` are known before.
+    where it is not yet; ``stated``: ``points`` are known before; ``rest_px``: what is left of them where none of its
+    poses explained these.
 
     ``mark`` (4, 4): where it was at ``mark_ns``, ``farthest_px`` what its markers moved by since; ``still``: they did
     not in the time before.
@@ -81,6 +85,7 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
     mark_ns: int = 0
     farthest_px: float = 0.0
     still: bool = True
+    rest_px: float = 0.0
 
 
 def target_body(ids: IntArray, points: FloatArray | None, cameras: int, *, carried: bool) -> TargetBody:
@@ -112,7 +117,7 @@ def begin(
     body.drift[:] = drift if metric else np.eye(FREEDOMS)
     body.twist[:], body.rate[:] = 0.0, 0.0
     widen(body, FOUND_PX)
-    body.t_ns, body.odd, body.odd_ns[:], body.told[:] = t_ns, 0, 0, False
+    body.t_ns, body.odd, body.odd_ns[:], body.told[:], body.rest_px = t_ns, 0, 0, False, 0.0
     body.mark[:], body.mark_ns, body.farthest_px, body.still = body.displacement, t_ns, 0.0, False
     return True
 
@@ -419,14 +424,36 @@ FOUND_REST_PX = 3.0
 """What they may leave, rms."""
 
 
+def find_stated(
+    basis: FloatArray, arrays: ModelArrays, points: FloatArray, sights: FloatArray, seen: FloatArray
+) -> tuple[FloatArray, float]:
+    """As `find_pose`, of a target that may have turned anyhow: in a metric frame from where cameras see it together."""
+    start = np.eye(4)
+    if arrays.to_euclidean is not None:
+        there, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
+        both = known > 0.0
+        H = arrays.to_euclidean
+        before, now = (from_homogeneous(move_points(H, M[both])) for M in (points, there))
+        try:
+            start = np.linalg.inv(H) @ similarity_from_points(before, now, scaled=False) @ H
+        except GeometryError:  # too few by two cameras, or on a line: from where it was
+            start = np.eye(4)
+    found: tuple[FloatArray, float] = find_pose(
+        basis, arrays.matrices, np.ascontiguousarray(start), points, sights, seen
+    )
+    return found
+
+
 @kernel
 def find_pose(
-    basis: FloatArray, matrices: FloatArray, points: FloatArray, sights: FloatArray, seen: FloatArray
-) -> tuple[FloatArray, float]:
-    """The displacement (4, 4) of ``points`` (k, 4) that explains ``sights`` (c, k, 2), where ``seen`` (c, k), and what
-    it leaves [px] rms.
+    basis: FloatArray, matrices: FloatArray, start: FloatArray, points: FloatArray, sights: FloatArray,
+    seen: FloatArray,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """The displacement (4, 4) of ``points`` (k, 4) that explains ``sights`` (c, k, 2), where ``seen`` (c, k), from a
+    ``start`` (4, 4) on, and what it leaves [px] rms. Least squares without a start nearby ends in a wrong one: of
+    points that turned by 60 degrees and more.
     """
-    D = np.eye(4)
+    D = start.copy()
     weights = np.repeat(seen.copy().reshape(-1), 2)
     for _ in range(FITS):
         there = transform_points(D, points)
@@ -456,7 +483,7 @@ def jumped(
     before = transform_points(carrier, transform_points(D, points))
     shown = seen.reshape((1, -1))
     moved, rest_px = find_pose(
-        seen_through(basis, carrier), matrix, before, sights.reshape((1, -1, 2)), shown
+        seen_through(basis, carrier), matrix, np.eye(4), before, sights.reshape((1, -1, 2)), shown
     )
     here, _ = project_points(matrix, transform_points(moved, before))
     there, _ = project_points(matrix, before)

@@ -31,8 +31,8 @@ from stereoservo.core.target.motion import (
     begin,
     compare,
     elapse,
-    find_pose,
     find_shape,
+    find_stated,
     fold_frame,
     gate_sights,
     jumped,
@@ -187,8 +187,9 @@ def _find(
         return
     if int((shown.max(axis=0) > 0.0).sum()) < FEWEST:
         return
-    D, rest = find_pose(basis, arrays.matrices, body.points, body.first, shown)
+    D, rest = find_stated(basis, arrays, body.points, body.first, shown)
     if rest > FOUND_REST_PX:
+        body.rest_px = rest
         return
     body.displacement[:] = D
     begin(body, basis, metric, arrays.matrices, carrier, t_ns)
