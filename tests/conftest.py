@@ -2,6 +2,7 @@
 
 import os
 import resource
+import socket
 import subprocess
 import sys
 import tempfile
@@ -132,6 +133,14 @@ def pytest_configure(config: pytest.Config) -> None:
         folder.cleanup()
 
     config.add_cleanup(end)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """A worker asks the first process before each test how often it has run, by two small packets on a socket: without
+    this option the second waits for an acknowledgement of the first, which comes 40 ms later.
+    """
+    if hasattr(session.config, "workerinput"):
+        session.config.failures_db.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
