@@ -91,7 +91,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def in_real_time(item: pytest.Item) -> bool:
     """Whether a test is of real processes, or a driver's contract in real time."""
     suite = item.cls if isinstance(item, pytest.Function) else None
-    return item.get_closest_marker("process") is not None or getattr(suite, "real_time", False)
+    return item.get_closest_marker("process") is not None or bool(getattr(suite, "real_time", False))
 
 
 class LiveFilesInTurn(LoadFileScheduling):
