@@ -170,7 +170,7 @@ def test_pictures_in_lerobots_own_codec_are_read(tmp_path: Path) -> None:
         (
             ["--units", UNITS],
             lambda f: (f / "videos/chunk-000/observation.images.up/episode_000000.mp4").write_bytes(b"no video"),
-            "no picture 0 (episode 0); 0 could be decoded",
+            "episode_000000.mp4: [Errno 1094995529] Invalid data found when processing input",
         ),
     ],
 )  # fmt: skip
