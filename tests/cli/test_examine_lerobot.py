@@ -82,14 +82,16 @@ def short() -> list[Episode]:
     return [episode(cell, cell.held_out(rng, count, 0.3)) for count in (4, 3)]
 
 
+def work(cell, t: np.ndarray) -> np.ndarray:
+    """Joints at times, in motion from the first one on."""
+    phases = t[:, None] * np.linspace(0.6, 1.5, len(cell.home)) + np.arange(len(cell.home))
+    return cell.home + 0.5 * cell.ranges * np.sin(phases)
+
+
 def whole() -> list[Episode]:
     """Motions of single joints, then work, in which a camera is moved."""
     cell = tagged_cell()
-    t = np.arange(60)[:, None] / FPS
-    work = cell.home + 0.5 * cell.ranges * np.sin(
-        t * np.linspace(0.6, 1.5, len(cell.home)) + np.arange(len(cell.home))
-    )
-    return [episode(cell, cell.stops(9)[0]), episode(cell, work, BUMPED_FROM)]
+    return [episode(cell, cell.stops(9)[0]), episode(cell, work(cell, np.arange(60) / FPS), BUMPED_FROM)]
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
@@ -110,9 +112,11 @@ def test_joints_and_pictures_of_every_episode_are_read(version: str, kind: str, 
             assert np.abs(views.at(views.times[mine]) - one.joints).max() < 1e-6
             assert views.seen[mine].mean() > 0.7  # tags that are aslant are not found
             assert np.nanmax(np.abs(views.pixels[mine] - one.corners[c])) < 0.3
-    # Between two episodes the arm is where one ends, then where the next one begins.
-    last = views.times[views.episodes == 0].max()
-    assert np.abs(views.at(np.array([last + 0.1])) - episodes[0].joints[-1]).max() < 1e-6
+    # Between two episodes the arm goes on as one ends, then comes as the next one begins: a frame's time each.
+    last, first = views.times[views.episodes == 0].max(), views.times[views.episodes == 1].min()
+    gone_on = 2.0 * episodes[0].joints[-1] - episodes[0].joints[-2]
+    came = 2.0 * episodes[1].joints[0] - episodes[1].joints[1]
+    assert np.abs(views.at(np.array([last + 0.1, first - 0.1])) - [gone_on, came]).max() < 1e-6
 
 
 def test_a_data_set_is_judged_by_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,6 +133,21 @@ def test_a_data_set_is_judged_by_episode(tmp_path: Path, capsys: pytest.CaptureF
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("  episode 0: ") and "nothing has happened" in line for line in lines)
     assert any(line.startswith("  episode 1: ") and "camera_moved side" in line for line in lines)
+
+
+def test_late_pictures_are_told_where_an_episode_begins_in_motion(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Joints that stood before an episode made its first late picture a second cause, ``unexplained``."""
+    cell, t, late_s = tagged_cell(), np.arange(30) / FPS, 0.06
+    learning, now = episode(cell, cell.stops(9)[0]), episode(cell, work(cell, t))
+    now.pictures[1] = episode(cell, work(cell, t - late_s)).pictures[1]
+    folder = write(tmp_path / "set", "v3.0", [learning, now])
+    code, report = told(capsys, str(folder), "--units", UNITS)
+    assert code == 0
+    (cause,) = report["causes"]
+    assert (cause["kind"], cause["subject"], cause["episodes"]) == ("late_stamps", "side", [1])
+    assert abs(abs(cause["value"]) - late_s) < 2e-3
 
 
 def test_pictures_in_lerobots_own_codec_are_read(tmp_path: Path) -> None:

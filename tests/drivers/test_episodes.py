@@ -225,7 +225,7 @@ def cut(folder: Path) -> None:
         ("v2.1", "video", cut, "episode_000001.mp4"),
         ("v2.1", "video", lambda f: rewritten(f, video_path="{x.y}"), "its parts may be video_key"),
         ("v3.0", "video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/from_timestamp", [0, 9e5]), "no picture"),
-        ("v3.0", "video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/from_timestamp", [0, 9e9]), "valid are 0"),
+        ("v3.0", "video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/from_timestamp", [0, 9e9]), "are 0 to"),
         ("v3.0", "video", lambda f: changed(f, "meta/episodes", "episode_index", [0, 5]), "has no episode 1"),
         ("v3.0", "image", lambda f: changed(f, "data", UP, [{"bytes": b"no picture"}] * 21), "no picture that OpenCV"),
         ("v3.0", "image", lambda f: changed(f, "data", UP, ["up.png"] * 21), "no picture that OpenCV"),

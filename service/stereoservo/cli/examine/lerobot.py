@@ -17,11 +17,11 @@ from stereoservo.cli.examine.folder import (
     stated_detector,
 )
 from stereoservo.cli.output import CommandError, note
-from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import lerobot
 
 BETWEEN_S, HELD_S = 1.0, 0.4
-"""Time put between two episodes, and for which the joints then stand as at their ends."""
+"""Time put between two episodes, and for which the joints then go on as at their ends."""
 MOST_FRAMES = 6000
 """Frames that are examined; of longer data sets every second one, every third, …"""
 COMPRESSED_PX = 0.1
@@ -54,7 +54,7 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     wanted = None if cameras is None else [name.strip() for name in cameras.split(",")]
     keys = lerobot.camera_features(info, folder, wanted)
     rows = lerobot.read_rows(folder, info)
-    stamps, joint_times, source = _one_clock(rows)
+    stamps, joint_times, states = _one_clock(rows)
     every = max(1, -(-len(rows.stamp) * len(keys) // MOST_FRAMES))
     if every > 1:
         note(f"{len(rows.stamp) * len(keys)} pictures: of each camera one in {every} is examined")
@@ -81,21 +81,27 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     counted = bool(np.abs(rows.stamp - rows.frame / info.fps).max() < COUNTED_S)
     if counted:
         note("stamps are the count of frames over the rate: dropped frames cannot be told")
-    positions = rows.state[source][:, columns] * scales
+    positions = states[:, columns] * scales
     return gathered_views(frames, joint_times, names, kinds, positions, None, True, counted)
 
 
-def _one_clock(rows: lerobot.EpisodeRows) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Stamps (r,) [s] of one clock, episodes one after another, and times (j,) of the joints with the rows (j,) that
-    they are of; joints stand for a moment before and after each episode.
+def _one_clock(rows: lerobot.EpisodeRows) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Stamps (r,) [s] of one clock, episodes one after another, and times (j,) and states (j, n) of the joints, which
+    go on for a moment before and after each episode: pictures that are late against them are of there.
     """
     stamps = rows.stamp.copy()
-    times, source, end = [], [], 0.0
+    times, states, end = [], [], 0.0
     for episode in np.unique(rows.episode).tolist():
         mine = np.flatnonzero(rows.episode == episode)
         stamps[mine] += end - stamps[mine[0]]
-        own = stamps[mine]
+        own, state = stamps[mine], rows.state[mine]
         times.append(np.concatenate([[own[0] - HELD_S], own, [own[-1] + HELD_S]]))
-        source.append(np.concatenate([mine[:1], mine, mine[-1:]]))
+        states += [_gone_on(own[1::-1], state[1::-1]), state, _gone_on(own[-2:], state[-2:])]
         end = float(own[-1]) + BETWEEN_S
-    return stamps, np.concatenate(times), np.concatenate(source)
+    return stamps, np.concatenate(times), np.concatenate(states)
+
+
+def _gone_on(times: FloatArray, states: FloatArray) -> FloatArray:
+    """State (1, n) a moment after the last one of two at their ``times``, or before where they go backwards."""
+    elapsed = abs(float(times[-1] - times[0]))
+    return states[-1:] + (states[-1:] - states[:1]) * (HELD_S / elapsed if elapsed > 0.0 else 0.0)
