@@ -16,7 +16,18 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write, write_in_av1
+from lerobot_sets import (
+    CAMERAS,
+    FPS,
+    LEROBOT_PYTHONS,
+    UNITS,
+    Episode,
+    changed,
+    rewritten,
+    write,
+    write_by_lerobot,
+    write_in_av1,
+)
 from stereoservo.cli.examine.lerobot import read_data_set
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
@@ -133,6 +144,19 @@ def test_a_data_set_is_judged_by_episode(tmp_path: Path, capsys: pytest.CaptureF
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("  episode 0: ") and "nothing has happened" in line for line in lines)
     assert any(line.startswith("  episode 1: ") and "camera_moved side" in line for line in lines)
+
+
+@pytest.mark.parametrize("python", LEROBOT_PYTHONS)
+def test_a_data_set_that_lerobot_wrote_is_judged(
+    python: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_by_lerobot(python, tmp_path / "set", whole())
+    code, report = told(capsys, str(folder), "--units", UNITS)
+    assert code == 0
+    (cause,) = report["causes"]
+    assert (cause["kind"], cause["subject"], cause["episodes"]) == ("camera_moved", "side", [1])
+    assert abs(cause["onset"]["in_episode"] - BUMPED_FROM) <= 2
+    assert report["rms_px"] < 0.05  # in AV1; 0.02 px of pictures in tables
 
 
 def test_late_pictures_are_told_where_an_episode_begins_in_motion(
