@@ -264,6 +264,21 @@ def test_tables_that_lie_are_refused_by_name(kind: str, damage: Any, named: str,
         read_data_set(folder, UNITS)
 
 
+def test_a_camera_that_sees_no_marker_is_left_out(tmp_path: Path) -> None:
+    """A third camera without markers left the other two without a model, and nothing was examined."""
+    folder = write(tmp_path / "set", "v3.0", short(), "image")
+    info = json.loads((folder / "meta/info.json").read_text())
+    rewritten(folder, features=info["features"] | {"front": info["features"][UP]})
+    _, count, height, width = np.concatenate([one.pictures for one in short()], axis=1).shape
+    blank = cv2.imencode(".png", np.full((height, width), 90, np.uint8))[1].tobytes()
+    changed(folder, "data", "front", [{"bytes": blank, "path": None}] * count)
+    views = read_data_set(folder, UNITS)
+    assert [camera.name for camera in views.cameras] == list(CAMERAS)
+    assert "camera front shows a marker in none of its 7 pictures" in views.notes[0]
+    with pytest.raises(CommandError, match="no camera shows a marker"):
+        read_data_set(folder, UNITS, "front")
+
+
 def test_units_of_a_data_set_are_refused_for_other_recordings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,31 +59,43 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     every = max(1, -(-len(rows.stamp) * len(keys) // MOST_FRAMES))
     if every > 1:
         note(f"{len(rows.stamp) * len(keys)} pictures: of each camera one in {every} is examined")
-    frames = GatheredFrames({})
+    frames, notes = GatheredFrames({}), []
     for name, key in keys.items():
         look = stated_detector(detector or folder / DETECTOR, name)
         least = COMPRESSED_PX if info.features[key].dtype == "video" else 0.0
-        found = total = 0
+        seen: dict[float, tuple[int, int, dict[int, tuple[float, float, float]]]] = {}
+        size = None
         for row, decoded in lerobot.pictures(folder, info, key, rows, every, gray=True):
             image = decoded()
-            size = (image.shape[1], image.shape[0])
-            if frames.sizes.setdefault(name, size) != size:
+            size, before = (image.shape[1], image.shape[0]), size
+            if before not in (None, size):
                 raise CommandError(
-                    "dataset",
-                    f"LeRobot data set {folder}: {key}: a picture of {size} after {frames.sizes[name]}",
+                    "dataset", f"LeRobot data set {folder}: {key}: a picture of {size} after {before}"
                 )
-            seen = {
+            markers = {
                 marker: (u, v, max(sigma, least))
                 for marker, (u, v, sigma) in detected(look, name, row, image).items()
             }
-            frames.seen[name, float(stamps[row])] = (-1, int(rows.episode[row]), seen)
-            total, found = total + 1, found + bool(seen)
-        note(f"camera {name}: markers in {found} of {total} pictures")
+            seen[float(stamps[row])] = -1, int(rows.episode[row]), markers
+        found = sum(bool(markers) for _, _, markers in seen.values())
+        note(f"camera {name}: markers in {found} of {len(seen)} pictures")
+        if found and size is not None:
+            frames.sizes[name] = size
+            frames.seen |= {(name, stamp): frame for stamp, frame in seen.items()}
+        else:
+            notes.append(f"camera {name} shows a marker in none of its {len(seen)} pictures, and is left out")
+    if not frames.sizes:
+        raise CommandError(
+            "dataset",
+            f"LeRobot data set {folder}: no camera shows a marker that the detector looks for; its cameras are "
+            f"{', '.join(keys) or 'none'}",
+        )
     counted = bool(np.abs(rows.stamp - rows.frame / info.fps).max() < COUNTED_S)
     if counted:
         note("stamps are the count of frames over the rate: dropped frames cannot be told")
     positions = states[:, columns] * scales
-    return gathered_views(frames, joint_times, names, kinds, positions, None, True, counted)
+    views = gathered_views(frames, joint_times, names, kinds, positions, None, True, counted)
+    return replace(views, notes=tuple(notes))
 
 
 def _one_clock(rows: lerobot.EpisodeRows) -> tuple[FloatArray, FloatArray, FloatArray]:
