@@ -254,6 +254,7 @@ UP = "observation.images.up"
         ("video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/from_timestamp", [0.0, np.nan]), "episode 1"),
         ("video", lambda f: changed(f, "meta/episodes", "episode_index", [0, None]), "episode None"),
         ("image", lambda f: changed(f, "data", UP, ["up.png"] * 7), "at frame 0 of episode 0"),
+        ("image", lambda f: changed(f, "data", "frame_index", [[k % 4] for k in range(7)]), "file-000.parquet"),
         ("image", lambda f: changed(f, "data", UP, [{"bytes": "up.png"}] * 7), "at frame 0 of episode 0"),
     ],
 )  # fmt: skip

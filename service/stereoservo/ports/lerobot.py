@@ -438,8 +438,9 @@ def _stored_pictures(
     """Pictures that the tables hold themselves, no more than a group of rows in memory."""
     places: dict[tuple[int, int], tuple[Path, int]] = {}
     for path, table in _tables(folder, "data", ["episode_index", "frame_index"]).items():
-        for position, number in enumerate(zip(table["episode_index"], table["frame_index"], strict=True)):
-            places[number] = path, position
+        with _reading(path):
+            numbered = enumerate(zip(table["episode_index"], table["frame_index"], strict=True))
+            places |= {(int(episode), int(frame)): (path, k) for k, (episode, frame) in numbered}
     numbers = list(zip(rows.episode.tolist(), rows.frame.tolist(), strict=True))
     cells: Iterator[Any] = iter(())
     current, following = Path(), 0
@@ -450,7 +451,7 @@ def _stored_pictures(
         if path != current or position < following:
             cells, following = _cells(folder, path, key, position)
             current = path
-        stored = next(islice(cells, position - following, None))
+        stored = next(islice(cells, position - following, None), None)
         following = position + 1
 
         def take(picture: Any = stored, at: str = at) -> ImageArray:
