@@ -1,8 +1,12 @@
-"""LeRobot data sets as formats 2.0, 2.1 and 3.0 lay them out, written for tests."""
+"""LeRobot data sets as formats 2.0, 2.1 and 3.0 lay them out, written for tests, and such as LeRobot writes itself."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pyarrow as pa
+import pytest
 from pyarrow import parquet
 
 FPS = 10
 CAMERAS = ("up", "side")
 UNITS = "deg,gripper.pos=none"
+DETECTOR = 'detector = "aruco"\n[options]\ntags = [1, 2, 3]\ndictionary = "4x4_50"\n'
 
 
 @dataclass(frozen=True)
@@ -75,10 +81,10 @@ def rows(number: int, one: Episode, kind: str) -> dict[str, pa.Array]:
     return table
 
 
-def write_video(path: Path, pictures: np.ndarray) -> None:
+def write_video(path: Path, pictures: np.ndarray, fps: float = FPS) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     video = cv2.VideoWriter(
-        str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, (pictures.shape[2], pictures.shape[1])
+        str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (pictures.shape[2], pictures.shape[1])
     )
     for image in pictures:
         video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
@@ -131,9 +137,7 @@ def write(folder: Path, version: str, episodes: list[Episode], kind: str = "vide
             for c, camera in enumerate(CAMERAS if kind == "video" else ()):
                 path = f"videos/chunk-000/observation.images.{camera}/episode_{number:06d}.mp4"
                 write_video(folder / path, one.pictures[c])
-    (folder / "detector.toml").write_text(
-        'detector = "aruco"\n[options]\ntags = [1, 2, 3]\ndictionary = "4x4_50"\n'
-    )
+    (folder / "detector.toml").write_text(DETECTOR)
     return folder
 
 
@@ -148,3 +152,55 @@ def changed(folder: Path, part: str, name: str, values: list[Any]) -> None:
     table = parquet.read_table(path)
     columns = {column: table[column].combine_chunks() for column in table.column_names}
     write_table(path, columns | {name: pa.array(values)})
+
+
+# -- by LeRobot itself ----------------------------------------------------------------------------------------
+
+
+def _pythons() -> list[Any]:
+    named = os.environ.get("STEREOSERVO_LEROBOT_PYTHON", "")
+    if not named and importlib.util.find_spec("lerobot"):
+        named = sys.executable
+    if named:
+        return named.split(os.pathsep)
+    missing = "lerobot is not installed, nor named by $STEREOSERVO_LEROBOT_PYTHON"
+    return [pytest.param("", marks=pytest.mark.skip(reason=missing))]
+
+
+LEROBOT_PYTHONS = _pythons()
+"""Interpreters that have LeRobot: those named in ``$STEREOSERVO_LEROBOT_PYTHON`` (``:`` between two), or this one."""
+
+
+def _lerobot(python: str, scratch: Path, *arguments: str | Path) -> None:
+    program = Path(__file__).with_name("lerobot_program.py")
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "HF_HOME": str(scratch / "hf"), "PYTHONPATH": ""}
+    command = [python, program, *arguments]
+    told = subprocess.run(command, check=False, env=environment, capture_output=True, text=True)
+    assert told.returncode == 0, told.stderr
+
+
+def write_by_lerobot(
+    python: str, folder: Path, episodes: list[Episode], kind: str = "video", fps: int = FPS, **more: Any
+) -> Path:
+    """A data set as LeRobot's own writer writes it: joints in degrees beside a gripper, pictures in three colours."""
+    scratch = folder.parent
+    states = [np.hstack([np.degrees(one.joints), np.full((len(one.joints), 1), 37.5)]) for one in episodes]
+    pictures = {}
+    for c, camera in enumerate(CAMERAS):
+        gray = np.concatenate([one.pictures[c] for one in episodes])
+        pictures[camera] = np.stack([gray, gray // 4 * 3, gray // 2], axis=-1)
+    np.savez(scratch / "pictures.npz", state=np.concatenate(states), **pictures)
+    lengths = [len(one.joints) for one in episodes]
+    names = info("v3.0", episodes, kind)["features"]["observation.state"]["names"]
+    order = {"cameras": CAMERAS, "names": names, "lengths": lengths, "videos": kind == "video", "fps": fps}
+    (scratch / "order.json").write_text(json.dumps(order | more))
+    _lerobot(python, scratch, "write", folder, scratch / "pictures.npz", scratch / "order.json")
+    (folder / "detector.toml").write_text(DETECTOR)
+    return folder
+
+
+def read_by_lerobot(python: str, folder: Path) -> dict[str, np.ndarray]:
+    """What LeRobot's own reader returns for each row: stamps, numbers, states, and pictures (r, 3, h, w) of 0 to 1."""
+    answer = folder.parent / "answer.npz"
+    _lerobot(python, folder.parent, "read", folder, answer)
+    return dict(np.load(answer))

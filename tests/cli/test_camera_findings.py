@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from stereoservo.ports.devices import (
     ExaminationFinding,
     Frame,
 )
+from stereoservo_sim.world.synthetic import rotation
 
 RATE = 30.0
 LEFT = np.array([[900.0, 0, 320, 0], [0, 900, 240, 0], [0, 0, 1, 1.0]])
@@ -191,6 +194,25 @@ def test_views_without_a_model_agree_or_name_the_marker_that_does_not() -> None:
     (finding,) = examine_views([left, right], None)
     assert finding.ok is False
     assert "[4]" in finding.message
+
+
+@pytest.mark.parametrize("modelled", [False, True])
+def test_views_of_markers_in_motion_are_not_compared(modelled: bool) -> None:
+    """An episode is played back: means over time of a moving body are of no one place, and markers were said to be
+    mistaken for others.
+    """
+    cameras = (CameraModel("left", LEFT, 640, 480), CameraModel("right", RIGHT, 640, 480))
+    model = SimpleNamespace(cameras=cameras) if modelled else None
+    records = views()
+    for k in range(60):
+        turned = points()
+        turned[:, :3] = turned[:, :3] @ rotation("y", 1.0 * k)[:3, :3].T @ rotation("z", 0.5 * k)[:3, :3].T
+        for one, P in zip(records, (LEFT, RIGHT), strict=True):
+            one.seen[k] = observation(one.description.name, k, project_many(P[None], turned)[0])
+    (finding,) = examine_views(records, model)
+    assert finding.ok is None
+    assert "move" in finding.message
+    assert "px" in finding.message
 
 
 def test_views_by_the_models_cameras() -> None:

@@ -18,6 +18,7 @@ import typer
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.ports import plugins
 from stereoservo.ports.devices import DriverContext, JointDriver
+from stereoservo_drivers.episodes import EpisodeJointDriver
 from stereoservo_drivers.kit.bench import JointDriverSetup
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, CheckResult, run_check
 
@@ -105,6 +106,12 @@ def driver_check(
     setup = _setup(driver, _options(options, loaded), pull, folder)
     if loaded is not None:
         setup.joint_timeout_s = loaded.safety.joint_timeout_s
+    if (hardware or simulated) and getattr(setup, "driver", None) is EpisodeJointDriver:
+        raise DriverCheckError(
+            "playback",
+            "joints of an episode are played back and take no commands: only the checks without --simulated and "
+            "--hardware are for them",
+        )
     if hardware:
         setup.real_time = True
         setup.whole_range = whole_range or bool(setup.whole_range)

@@ -10,6 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,8 @@ from stereoservo.ports.devices import JointKindName
 
 INFO = Path("meta") / "info.json"
 VERSIONS = ("v2.0", "v2.1", "v3.0")
-STATE, IMAGES = "observation.state", "observation.image"
+STATE = "observation.state"
+IMAGES = ("observation.image", "observation.image.", "observation.images.")
 LEFT_OUT = "none"
 """Unit of a state that is no joint of the arm, such as a gripper's."""
 UNITS: dict[str, tuple[JointKindName, float]] = {
@@ -40,7 +42,12 @@ LARGEST_STAMP_S = 1e6
 MOST_NAMED = 20
 """Episodes that a refusal names."""
 
-AV1 = tuple(cv2.VideoWriter.fourcc(*name) for name in ("av01", "AV01"))
+CELLS = 16
+"""Pictures of a table that are read at a time, within a group of rows (LeRobot's: an episode)."""
+NEAR = 0.25
+"""How far a picture may be from its time, in periods of the data set. LeRobot's own reader allows 0.1 ms."""
+MOST_REORDERED = 16
+"""Frames by which decoding may run ahead of the order of pictures, of any codec."""
 
 Picture = Callable[[], ImageArray]
 """Decodes a picture ``(height, width[, 3])``, blue first; to be called before the next one is asked for. Raises
@@ -57,12 +64,15 @@ class DataSetError(Exception):
 
 
 class Feature(msgspec.Struct):
-    """An entry of ``features``: its ``dtype``, ``shape`` and the ``names`` of its parts, as data sets have them."""
+    """An entry of ``features``: its ``dtype``, ``shape`` and the ``names`` of its parts, as data sets have them, and
+    what is known of a video, in ``info`` or, in older sets, ``video_info``.
+    """
 
     dtype: str
     shape: list[int]
     names: Any = None
     info: dict[str, Any] | None = None
+    video_info: dict[str, Any] | None = None
 
 
 class Info(msgspec.Struct):
@@ -85,11 +95,10 @@ class EpisodeRows(NamedTuple):
 
 
 class _Wanted(NamedTuple):
-    """A picture: number ``at`` in the file of its ``episode``, and the ``row`` that it is of."""
+    """A picture of a video: its time in the file, and the ``row`` that it is of."""
 
-    at: int
+    at_s: float
     row: int
-    episode: int
 
 
 def is_data_set(folder: Path) -> bool:
@@ -125,7 +134,9 @@ def read_info(folder: Path) -> Info:
 
 
 def state_names(info: Info, folder: Path) -> list[str]:
-    """Names of the parts of ``observation.state``; ``state0`` and so on where it has none. Raises DataSetError."""
+    """Names of the parts of ``observation.state``; ``state0`` and so on where it has none, or two have one name.
+    Raises DataSetError.
+    """
     feature = info.features.get(STATE)
     if feature is None or len(feature.shape) != 1:
         raise _wrong(folder, f"no feature {STATE!r} of one row a frame; it has {', '.join(info.features)}")
@@ -133,12 +144,22 @@ def state_names(info: Info, folder: Path) -> list[str]:
         raise _wrong(
             folder, f"{STATE!r} has {feature.shape[0]} parts in info.json; 1 to {MOST_STATES} are valid"
         )
-    stated = feature.names
-    if isinstance(stated, dict) and len(stated) == 1:
-        (stated,) = stated.values()
-    if isinstance(stated, list) and len(stated) == feature.shape[0]:
-        return [str(name) for name in stated]
-    return [f"state{k}" for k in range(feature.shape[0])]
+    stated = _flat(feature.names)
+    if len(stated) != feature.shape[0]:
+        stated = [""] * feature.shape[0]
+    count = Counter(stated)
+    return [name if name and count[name] == 1 else f"state{k}" for k, name in enumerate(stated)]
+
+
+def _flat(names: Any, deep: int = 3) -> list[str]:
+    """Names in their order: a list, lists in one, by group (``{"motors": [...]}``), or by name (``{"x": 0}``)."""
+    if isinstance(names, dict) and all(type(value) is int for value in names.values()):
+        return sorted(names, key=lambda name: int(names[name]))
+    if isinstance(names, dict):
+        names = list(names.values())
+    if isinstance(names, list) and deep:
+        return [name for one in names for name in _flat(one, deep - 1)]
+    return [names] if isinstance(names, str) else []
 
 
 def joints_of(
@@ -190,14 +211,16 @@ def _positive(text: str) -> bool:
 
 def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = None) -> dict[str, str]:
     """By name the features of all cameras, or of those ``wanted`` by name or feature. A camera is named by what follows
-    ``observation.images.``; two of which that is the same, by the whole features. Raises DataSetError.
+    ``observation.images.``; others, and two of which that is the same, by the whole features. Raises DataSetError.
     """
     keys = [
         key
         for key, feature in info.features.items()
-        if key.startswith(IMAGES) and feature.dtype in ("video", "image") and not _of_depth(feature)
+        if feature.dtype in ("video", "image") and not _of_depth(feature)
     ]
-    short = [key.removeprefix(IMAGES).removeprefix("s").removeprefix(".") or "image" for key in keys]
+    short = [
+        "image" if key == IMAGES[0] else key.removeprefix(IMAGES[1]).removeprefix(IMAGES[2]) for key in keys
+    ]
     count = Counter([*short, *keys])
     found = {name if count[name] == 1 else key: key for name, key in zip(short, keys, strict=True)}
     if wanted is None:
@@ -212,7 +235,7 @@ def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = Non
 
 
 def _of_depth(feature: Feature) -> bool:
-    info = feature.info or {}
+    info = {**(feature.video_info or {}), **(feature.info or {})}
     return bool(info.get("video.is_depth_map") or info.get("is_depth_map"))
 
 
@@ -221,37 +244,43 @@ def _of_depth(feature: Feature) -> bool:
 
 def _tables(
     folder: Path, part: str, columns: list[str], episode: int | None = None
-) -> list[Mapping[str, Any]]:
+) -> dict[Path, Mapping[str, Any]]:
     """Columns of all parquet files of a part of a data set, or of the rows of one ``episode``, as lists by name.
     Raises DataSetError.
     """
-    from pyarrow import compute, parquet  # an extra of its own: see missing_extra
+    from pyarrow import compute  # an extra of its own: see missing_extra
 
-    found, episodes = [], set()
+    found, episodes = {}, set()
     for path in sorted((folder / part).glob("chunk-*/*.parquet")):
         with _reading(path):
-            if not path.is_file():
-                raise _wrong(folder, f"{path} is no file")
-            file = parquet.ParquetFile(path)
-            there = file.schema_arrow.names
-            lacking = [name for name in columns if name not in there]
-            if lacking:
-                raise _wrong(
-                    folder, f"tables of {part} lack {', '.join(lacking)}; they have {', '.join(there)}"
-                )
+            file = _table(folder, path, columns)
             if episode is not None:
                 index = file.read(columns=["episode_index"])["episode_index"]
                 episodes |= {int(number) for number in index.unique().to_pylist() if number is not None}
                 mine = compute.equal(index, episode)
                 if compute.any(mine).as_py():
-                    found.append(file.read(columns=columns).filter(mine).to_pydict())
+                    found[path] = file.read(columns=columns).filter(mine).to_pydict()
             elif file.metadata.num_rows:
-                found.append(file.read(columns=columns).to_pydict())
+                found[path] = file.read(columns=columns).to_pydict()
     if not found and episodes:
         raise _wrong(folder, f"no episode {episode} in {part}; it has {_listed(sorted(episodes))}")
     if not found:
         raise _wrong(folder, f"no {part}/chunk-*/*.parquet with rows")
     return found
+
+
+def _table(folder: Path, path: Path, columns: list[str]) -> Any:
+    """A parquet file that has these ``columns``, read piece by piece. Raises DataSetError."""
+    from pyarrow import parquet
+
+    if not path.is_file():
+        raise _wrong(folder, f"{path} is no file")
+    file = parquet.ParquetFile(path)
+    there = file.schema_arrow.names
+    lacking = [name for name in columns if name not in there]
+    if lacking:
+        raise _wrong(folder, f"{path} lacks {', '.join(lacking)}; it has {', '.join(there)}")
+    return file
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -264,7 +293,7 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
     """Rows of all episodes, or of that one ``only``. Raises DataSetError."""
     states = len(state_names(info, folder))
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
-    tables = _tables(folder, "data", needed, only)
+    tables = _tables(folder, "data", needed, only).values()
     with _reading(f"LeRobot data set {folder}: {', '.join(needed)} are to be numbers, as many in each row"):
         state, stamp, frame, episode = (
             np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
@@ -300,8 +329,8 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
 def pictures(
     folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False
 ) -> Generator[tuple[int, Picture], None, None]:
-    """Rows, each one of ``every``, and their pictures of one camera, in ``gray`` where that is asked for. A picture
-    that is not called is not decoded, where the codec allows that. Raises DataSetError.
+    """Rows, each one of ``every``, and their pictures of one camera, in ``gray`` where that is asked for. Raises
+    DataSetError.
     """
     kept = range(0, len(rows.stamp), every)
     if info.features[key].dtype == "image":
@@ -310,15 +339,14 @@ def pictures(
     files: dict[Path, list[_Wanted]] = {}
     place = _video_places(folder, info, key)
     for row in kept:
-        episode = int(rows.episode[row])
-        path, begin = place(episode)
-        files.setdefault(path, []).append(_Wanted(begin + int(rows.frame[row]), row, episode))
+        path, begin_s = place(int(rows.episode[row]))
+        files.setdefault(path, []).append(_Wanted(begin_s + int(rows.frame[row]) / info.fps, row))
     for path, wanted in files.items():
-        yield from _decoded(path, sorted(wanted), gray=gray)
+        yield from _decoded(path, sorted(wanted), rows, 1.0 / info.fps, gray=gray)
 
 
-def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[Path, int]]:
-    """Function from an episode to the video file that holds it and the number of its first frame there."""
+def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[Path, float]]:
+    """Function from an episode to the video file that holds it and the time [s] at which it begins there."""
     if info.video_path is None:
         raise _wrong(folder, "info.json has no video_path")
     template = info.video_path
@@ -332,24 +360,27 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
 
     if info.codebase_version != VERSIONS[-1]:
 
-        def own_file(episode: int) -> tuple[Path, int]:
-            return file_of(episode_chunk=episode // info.chunks_size, episode_index=episode), 0
+        def own_file(episode: int) -> tuple[Path, float]:
+            return file_of(episode_chunk=episode // info.chunks_size, episode_index=episode), 0.0
 
         return own_file
     needed = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
     places = {}
-    for table in _tables(folder, "meta/episodes", ["episode_index", *needed]):
+    for table in _tables(folder, "meta/episodes", ["episode_index", *needed]).values():
         for episode, chunk, file, begin in zip(
             *(table[name] for name in ("episode_index", *needed)), strict=True
         ):
             with _reading(
                 f"LeRobot data set {folder}: meta/episodes, episode {episode}, {', '.join(needed)}"
             ):
-                places[int(episode)] = (
-                    file_of(chunk_index=int(chunk), file_index=int(file)), round(float(begin) * info.fps)
-                )  # fmt: skip
+                places[int(episode)] = file_of(chunk_index=int(chunk), file_index=int(file)), float(begin)
+            if not 0.0 <= float(begin) <= LARGEST_STAMP_S:
+                raise _wrong(
+                    folder,
+                    f"meta/episodes, episode {episode}: {needed[-1]} = {begin}; valid are 0 to {LARGEST_STAMP_S:g} s",
+                )
 
-    def shared_file(episode: int) -> tuple[Path, int]:
+    def shared_file(episode: int) -> tuple[Path, float]:
         if episode not in places:
             raise _wrong(folder, f"meta/episodes has no episode {episode}")
         return places[episode]
@@ -357,75 +388,73 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
     return shared_file
 
 
-def _decoded(path: Path, wanted: list[_Wanted], *, gray: bool) -> Iterator[tuple[int, Picture]]:
-    """Pictures of a video in their order. Raises DataSetError where it cannot be decoded, or ends before."""
+def _decoded(
+    path: Path, wanted: list[_Wanted], rows: EpisodeRows, period_s: float, *, gray: bool
+) -> Iterator[tuple[int, Picture]]:
+    """Pictures of a video at their times. Raises DataSetError where it cannot be decoded or has none at one of them."""
     if not os.path.isfile(path):  # also of a name that the system does not take
         raise DataSetError("dataset", f"{path}: no such video")
-    found, number = _all_pictures(path, gray=gray), -1
+    frames = _frames(path, wanted[0].at_s - MOST_REORDERED * period_s)
+    last_s, (now_s, frame) = None, next(frames, (math.inf, None))
     for one in wanted:
-        take: Picture | None = None
-        while number < one.at and (take := next(found, None)) is not None:
-            number += 1
-        if take is None:
+        while now_s < one.at_s - NEAR * period_s:
+            last_s, (now_s, frame) = now_s, next(frames, (math.inf, None))
+        if now_s > one.at_s + NEAR * period_s:
+            near = [f"{at_s:.3f} s" for at_s in (last_s, now_s) if at_s is not None and at_s < math.inf]
             raise DataSetError(
                 "dataset",
-                f"{path}: no picture {one.at} (episode {one.episode}); {number + 1} could be decoded. Has it been "
-                "copied as a whole?",
+                f"{path}: no picture at {one.at_s:.3f} s (frame {rows.frame[one.row]} of episode "
+                f"{rows.episode[one.row]}); the nearest ones: {' and '.join(near) or 'none'}. Has it been copied as a "
+                "whole, and has it the data set's fps?",
             )
+
+        def take(frame: Any = frame) -> ImageArray:
+            with _reading(path):
+                image: ImageArray = frame.to_ndarray(format="gray" if gray else "bgr24")
+                return image
+
         yield one.row, take
 
 
-def _all_pictures(path: Path, *, gray: bool) -> Iterator[Picture]:
-    video = cv2.VideoCapture(str(path))
-
-    def take() -> ImageArray:
-        with _reading(path):
-            whole, image = video.retrieve()
-            if not whole:
-                raise DataSetError("dataset", f"{path}: a picture that cannot be decoded")
-            return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if gray else image)
-
-    try:
-        if int(video.get(cv2.CAP_PROP_FOURCC)) in AV1:
-            # LeRobot's own codec, which the FFmpeg in OpenCV's wheels does not decode.
-            yield from _by_pyav(path, gray=gray)
-            return
-        while video.grab():
-            yield take
-    finally:
-        video.release()
-
-
-def _by_pyav(path: Path, *, gray: bool) -> Iterator[Picture]:
+def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, None]:
+    """Times [s] and frames of a video, from a key frame at ``from_s`` or before on."""
     import av  # of the extra that also brings pyarrow: see missing_extra
 
     with _reading(path), av.open(str(path)) as container:
-        for frame in container.decode(video=0):
-
-            def take(frame: Any = frame) -> ImageArray:
-                with _reading(path):
-                    image: ImageArray = frame.to_ndarray(format="gray" if gray else "bgr24")
-                    return image
-
-            yield take
+        if not container.streams.video:
+            raise DataSetError("dataset", f"{path}: holds no video")
+        stream = container.streams.video[0]
+        if from_s > 0.0:
+            container.seek(math.floor(from_s / stream.time_base), stream=stream)
+        for frame in container.decode(stream):
+            if frame.time is None:
+                raise DataSetError("dataset", f"{path}: pictures without times")
+            yield frame.time, frame
 
 
 def _stored_pictures(
     folder: Path, key: str, rows: EpisodeRows, kept: Sequence[int], *, gray: bool
 ) -> Iterator[tuple[int, Picture]]:
-    """Pictures that the tables hold themselves."""
+    """Pictures that the tables hold themselves, no more than a group of rows in memory."""
+    places: dict[tuple[int, int], tuple[Path, int]] = {}
+    for path, table in _tables(folder, "data", ["episode_index", "frame_index"]).items():
+        with _reading(path):
+            numbered = enumerate(zip(table["episode_index"], table["frame_index"], strict=True))
+            places |= {(int(episode), int(frame)): (path, k) for k, (episode, frame) in numbered}
     numbers = list(zip(rows.episode.tolist(), rows.frame.tolist(), strict=True))
-    only = {episode for episode, _ in numbers}
-    names = [key, "episode_index", "frame_index"]
-    stored: dict[tuple[int, int], Any] = {}
-    for table in _tables(folder, "data", names, only.pop() if len(only) == 1 else None):
-        for picture, *number in zip(*(table[name] for name in names), strict=True):
-            stored[int(number[0]), int(number[1])] = picture
+    cells: Iterator[Any] = iter(())
+    current, following = Path(), 0
     for row in kept:
+        path, position = places[numbers[row]]
         episode, frame = numbers[row]
         at = f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
+        if path != current or position < following:
+            cells, following = _cells(folder, path, key, position)
+            current = path
+        stored = next(islice(cells, position - following, None), None)
+        following = position + 1
 
-        def take(picture: Any = stored[episode, frame], at: str = at) -> ImageArray:
+        def take(picture: Any = stored, at: str = at) -> ImageArray:
             image = None
             with _reading(f"LeRobot data set {folder}: {at}"):
                 data = np.frombuffer((picture or {}).get("bytes") or b"", dtype=np.uint8)
@@ -435,6 +464,24 @@ def _stored_pictures(
             return np.asarray(image)
 
         yield row, take
+
+
+def _cells(folder: Path, path: Path, key: str, position: int) -> tuple[Iterator[Any], int]:
+    """Cells of a column from the group of rows on that has the row ``position``, and the first one's own position."""
+    with _reading(path):
+        file = _table(folder, path, [key])
+        first = begin = 0
+        while begin + file.metadata.row_group(first).num_rows <= position:
+            begin += file.metadata.row_group(first).num_rows
+            first += 1
+
+    def cells() -> Iterator[Any]:
+        with _reading(path):
+            for group in range(first, file.num_row_groups):  # several at once are kept to the last
+                for batch in file.iter_batches(CELLS, row_groups=[group], columns=[key]):
+                    yield from batch.column(0).to_pylist()
+
+    return cells(), begin
 
 
 def _wrong(folder: Path, what: str) -> DataSetError:

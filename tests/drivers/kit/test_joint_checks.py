@@ -220,6 +220,15 @@ def test_hardware_is_moved_only_after_a_yes():
     assert "nothing was done" in str(result.exception)
 
 
+@pytest.mark.parametrize("how", ["--simulated", "--hardware"])
+def test_joints_that_are_played_back_are_not_driven(how):
+    """21 checks failed, each with the advice to look at supply, emergency stop and brakes."""
+    code, error = command("stereoservo_drivers.episodes:EpisodeJointDriver", how)
+    assert code == 1
+    assert error.code == "playback"
+    assert "take no commands" in str(error)
+
+
 @pytest.mark.usefixtures("here")
 def test_the_end_of_the_input_is_no_yes_and_is_told():
     app = typer.Typer()

@@ -190,9 +190,13 @@ def _refused(record: CameraRecord) -> ExaminationFinding:
 
 
 def _scatter(record: CameraRecord) -> str:
-    """Finding on the scatter of the markers over the frames, with the arm at rest, against the detector's stated
-    noise.
-    """
+    """Finding on the scatter of the markers, with the arm at rest, against the detector's stated noise."""
+    scatter_px = marker_scatter(record)
+    return "" if scatter_px is None else f", scatter {scatter_px:.3f} px"
+
+
+def marker_scatter(record: CameraRecord) -> float | None:
+    """Standard deviation [px] of a marker's pixels over the frames, the median of the markers; None of few frames."""
     seen: dict[int, list[FloatArray]] = {}
     for observation in record.seen:
         for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
@@ -200,7 +204,7 @@ def _scatter(record: CameraRecord) -> str:
     deviations = [
         np.var(np.array(pixels), axis=0, ddof=1).mean() for pixels in seen.values() if len(pixels) > 5
     ]
-    return f", scatter {float(np.sqrt(np.median(deviations))):.3f} px" if deviations else ""
+    return float(np.sqrt(np.median(deviations))) if deviations else None
 
 
 def contrast_and_blur(image: ImageArray, pixel: FloatArray) -> tuple[float, float, float] | None:

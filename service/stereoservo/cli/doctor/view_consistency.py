@@ -9,7 +9,7 @@ from itertools import pairwise, permutations, product
 
 import numpy as np
 
-from stereoservo.cli.doctor.camera_findings import CameraRecord, mean_observations
+from stereoservo.cli.doctor.camera_findings import CameraRecord, marker_scatter, mean_observations
 from stereoservo.core.settings import TrialSettings
 from stereoservo.geometry.cameras import project_many, triangulate
 from stereoservo.geometry.distortion import distort, undistort
@@ -24,6 +24,8 @@ FITS_PX = 0.5
 """Root mean square that views of one point may leave before the cameras are reported as moved."""
 MATCHES = 10
 """Markers seen by two cameras that the epipolar constraint needs for a test: 7 are used up."""
+AT_REST_PX = 1.0
+"""Scatter of markers at rest at most: what is compared are means over time."""
 WORKSPACE_SHARE = 0.9
 SAME_PX = 0.5
 """Two cameras that show every marker this close to where the other does are one."""
@@ -33,6 +35,16 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
     """Findings on the simultaneous observations of pairs of cameras."""
     seen = [record for record in records if len(record.seen) >= 2]
     if len(seen) < 2:
+        return
+    moving = {
+        record.name: scatter for record in seen if (scatter := marker_scatter(record) or 0.0) > AT_REST_PX
+    }
+    if moving:
+        told = ", ".join(f"by {scatter:.1f} px in {name}" for name, scatter in moving.items())
+        yield ExaminationFinding(
+            "views " + "-".join(record.name for record in seen), None,
+            f"the markers move meanwhile ({told}): views are compared where the arm stands",
+        )  # fmt: skip
         return
     cameras = [] if model is None else [c for r in seen for c in model.cameras if c.name == r.name]
     if len(cameras) == len(seen):
