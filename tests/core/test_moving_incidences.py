@@ -14,6 +14,8 @@ from scipy.linalg import expm
 from core.conftest import BASE, flange_at, twist
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state_encoding import decode_state, encode_state
+from stereoservo.core.target.track import pose_at
+from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.goals import Feature, Goal, IncidenceSpec, IncidenceTarget, RunGoal
 
 NOISE_PX = 0.1
@@ -174,6 +176,44 @@ def test_without_its_name_the_feature_stands(benches: Any) -> None:
     cell.run(SETTLE_S)
     way = largest_px(cell, (4,), lambda: (np.column_stack([fixed, [1.0]]) @ cell.moved.T)[:, :3])
     assert way > 20.0
+
+
+@pytest.mark.parametrize("late", [0, 1, 2, 3])
+def test_a_target_that_moves_is_found_by_cameras_that_no_trigger_joins(benches: Any, late: int) -> None:
+    """Its shape is taken of one moment: of two 30 ms apart, it was off by 32 px."""
+    bench = benches(0, noise_px=NOISE_PX).ready()
+    cell, slide = Cell(bench), sliding(0, 0.1)
+    bench.shutters_late[1] = late
+    cell.set_out(lambda t: slide(t - 0.6))
+    cell.run(0.3)
+    assert cell.send("point-on-point", (4,), bench.truth.points(BASE)[[4]], PART).accepted
+    cell.run(0.6)
+    matrices, off_px = np.array([camera.matrix for camera in bench.truth.model.cameras]), list[float]()
+    for _ in range(60):
+        cell.step()
+        body = bench.core.state.target
+        followed = transform_points(pose_at(body, bench.now_ns)[0], body.points)
+        found, _ = project_points(matrices, followed)
+        off_px.append(float(np.linalg.norm(found - bench.truth.images_of(bench.truth.static), axis=-1).max()))
+    print(f"shutters {10 * late} ms apart: {max(off_px):.2f} px")
+    assert max(off_px) < 1.0
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_target_is_met_by_what_is_seen_of_it_and_not_by_what_is_expected(benches: Any, seen: bool) -> None:
+    """It turns back while it is hidden, and the arm comes to where it would have been."""
+    cell = Cell(benches(4, noise_px=NOISE_PX).ready())
+    assert cell.send("point-on-point", (4,), cell.bench.truth.points(BASE)[[4]], PART).accepted
+    slide, bench = sliding(4, 0.03), cell.bench
+    cell.set_out(slide)
+    while not 0.5 < bench.core.state.block.numbers.run.newest_px < 0.6:
+        cell.step()
+    assert "target_met" not in [event.kind for event in bench.events]
+    if not seen:
+        turned_s, part = (bench.now_ns - cell.begin_ns) * 1e-9, cell.part
+        cell.way, cell.part = lambda t: slide(2.0 * turned_s - t), part + np.array([0.0, 0.0, 50.0, 0.0])
+    cell.run(0.45)
+    assert ("target_met" in [event.kind for event in bench.events]) == seen
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -49,8 +49,11 @@ FEWEST = 3
 """Markers of a frame that says something of the target."""
 FEWEST_TO_FIND = 5
 """Markers, two cameras together, by which a target beside the body is found."""
-TOGETHER_NS = 40_000_000
-"""Between frames of several cameras from which it is found."""
+TOGETHER_NS = 2_000_000
+"""Between frames of several cameras that count as of one moment."""
+LONGEST_GAP_NS = 250_000_000
+FARTHEST_SHARE = 1.0
+"""Between two frames of a camera on whose way its sights at another moment are taken; of that gap, how far beyond."""
 RECENT_NS = 150_000_000
 SMALL_PX = 0.5
 """rms that needs no explanation: models are not exact."""
@@ -174,24 +177,48 @@ def _find(
     if body.carried:
         begin(body, basis, metric, arrays.matrices, carrier, t_ns)
         return
+    at_ns, there, shown = _at_one_moment(body, camera, t_ns, sights, seen)
     body.first[camera], body.first_seen[camera], body.seen_ns[camera] = sights, seen, t_ns
-    shown = body.first_seen * (np.abs(body.seen_ns - t_ns) <= TOGETHER_NS)[:, None]
     if int((shown.max(axis=1) > 0.0).sum()) < 2:
         return
     if not body.stated:
-        points, known = find_shape(arrays.matrices, body.first, shown, arrays.plane_at_infinity)
+        points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
         if int(known.sum()) < FEWEST_TO_FIND:
             return
         _keep(body, known > 0.0, points)
-        begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+        begin(body, basis, metric, arrays.matrices, carrier, at_ns)
         return
     if int((shown.max(axis=0) > 0.0).sum()) < FEWEST:
         return
-    D, rest = find_pose(basis, arrays.matrices, body.points, body.first, shown)
+    D, rest = find_pose(basis, arrays.matrices, body.points, there, shown)
     if rest > FOUND_REST_PX:
         return
     body.displacement[:] = D
-    begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+    begin(body, basis, metric, arrays.matrices, carrier, at_ns)
+
+
+def _at_one_moment(
+    body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray
+) -> tuple[int, FloatArray, FloatArray]:
+    """When another camera saw the target last, what the cameras show of it then (c, k, 2) and of which markers (c, k)
+    1 or 0: this one on its way from its frame before to this frame, since the target moves between their shutters.
+    """
+    there, shown = body.first.copy(), body.first_seen.copy()
+    others = shown.max(axis=1) > 0.0
+    others[camera] = False
+    at_ns = int(body.seen_ns[others].max()) if others.any() else t_ns
+    shown *= (np.abs(body.seen_ns - at_ns) <= TOGETHER_NS)[:, None]
+    there[camera], shown[camera] = sights, seen
+    if abs(t_ns - at_ns) <= TOGETHER_NS:
+        return at_ns, there, shown
+    before, gap_ns = body.first[camera], t_ns - int(body.seen_ns[camera])
+    share = (at_ns - t_ns) / gap_ns if 0 < gap_ns <= LONGEST_GAP_NS else np.inf
+    if -1.0 - FARTHEST_SHARE <= share <= FARTHEST_SHARE:
+        there[camera] += share * (sights - before)
+        shown[camera] *= body.first_seen[camera]
+    else:
+        shown[camera] = 0.0
+    return at_ns, there, shown
 
 
 def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], points: FloatArray) -> None:
@@ -310,7 +337,7 @@ def _jumps(
     if quick and (named or body.odd < FOUND_ANEW):
         return False
     widen(body, FOUND_PX + 0.1 * moved_px)
-    body.odd, body.told[:] = 0, not quick
+    body.odd, body.told[:] = 0, False
     return True
 
 
