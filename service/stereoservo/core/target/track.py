@@ -291,6 +291,9 @@ def _follow(
             body.odd, body.told[:] = 0, False
         elif lost or not _jumps(body, camera, t_ns, (moved_px, rest_px), since_s, state):
             return
+        if body.carried:  # what the other cameras' newest frames were compared with was not where it is
+            for sighting in state.watching.sightings:
+                sighting.t_ns = 0
         body.displacement[:] = found
         left, J = compare(
             body.basis, body.points, found, arrays.matrices[camera : camera + 1], carrier, sights, seen
