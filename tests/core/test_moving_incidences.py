@@ -14,6 +14,8 @@ from scipy.linalg import expm
 from core.conftest import BASE, flange_at, twist
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state_encoding import decode_state, encode_state
+from stereoservo.core.target import track
+from stereoservo.core.target.motion import compare
 from stereoservo.core.target.track import pose_at
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.goals import Feature, Goal, IncidenceSpec, IncidenceTarget, RunGoal
@@ -197,6 +199,24 @@ def test_a_target_that_moves_is_found_by_cameras_that_no_trigger_joins(benches: 
         off_px.append(float(np.linalg.norm(found - bench.truth.images_of(bench.truth.static), axis=-1).max()))
     print(f"shutters {10 * late} ms apart: {max(off_px):.2f} px")
     assert max(off_px) < 1.0
+
+
+@pytest.mark.parametrize("absent", [(90, 91), tuple(range(20, 256))])
+def test_markers_that_two_cameras_do_not_show_at_first_are_no_part_of_the_target(
+    benches: Any, monkeypatch: pytest.MonkeyPatch, absent: tuple[int, ...]
+) -> None:
+    """The frame that finds it is compared with the markers that are left: kernels look at no bounds."""
+
+    def checked(*given: Any) -> Any:
+        assert len({len(given[k]) for k in (1, 5, 6)}) == 1  # points, sights and which of them are seen
+        return compare(*given)
+
+    monkeypatch.setattr(track, "compare", checked)
+    cell = Cell(benches(7, noise_px=NOISE_PX).ready())
+    assert cell.send("point-on-point", (4,), cell.bench.truth.points(BASE)[[4]], (*PART, *absent)).accepted
+    cell.run(1.0)
+    assert tuple(cell.bench.core.state.target.ids) == PART
+    assert "target_met" in [event.kind for event in cell.bench.events]
 
 
 @pytest.mark.parametrize("seen", [True, False])

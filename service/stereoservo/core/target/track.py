@@ -82,22 +82,31 @@ def take_frame(camera: int, observation: CameraObservation, context: StepContext
     carrier = _carrier(body, t_ns, state, arrays)
     if carrier is None:
         return
-    sights, variances, seen = target_sights(
-        body.ids, observation.ids.astype(np.int64), np.array(observation.pixels, np.float64, order="C"),
-        np.array(observation.covariances, np.float64, order="C"), arrays.lenses[camera],
-    )  # fmt: skip
-    if body.carried:
-        seen = seen * (1.0 - state.watching.masked)
-    if state.reanchoring is None and int(seen.sum()) >= FEWEST:
+    frame = _frame_of(body, camera, observation, context)
+    if state.reanchoring is None and int(frame[2].sum()) >= FEWEST:
         if body.t_ns == 0:
-            _find(body, camera, t_ns, sights, seen, carrier, arrays)
-        if body.t_ns > 0:
-            _follow(body, camera, t_ns, (sights, variances, seen), carrier, context)
+            _find(body, camera, t_ns, frame[0], frame[2], carrier, arrays)
+            frame = _frame_of(body, camera, observation, context)  # it may have fewer markers from here on
+        if body.t_ns > 0 and int(frame[2].sum()) >= FEWEST:
+            _follow(body, camera, t_ns, frame, carrier, context)
     if body.carried and body.t_ns > 0:
         if not body.told[camera]:  # what it said before was of a target that stood
             state.cameras[camera].seen_ns[:] = 0
             body.told[camera] = True
         context.derived.room.arrays["marker_points"][:] = _points(body, t_ns)
+
+
+def _frame_of(
+    body: TargetBody, camera: int, observation: CameraObservation, context: StepContext
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What a frame shows of the target, as `target_sights` has it, without markers of a model's body that slipped."""
+    arrays = context.derived.arrays
+    assert arrays is not None
+    sights, variances, seen = target_sights(
+        body.ids, observation.ids.astype(np.int64), np.array(observation.pixels, np.float64, order="C"),
+        np.array(observation.covariances, np.float64, order="C"), arrays.lenses[camera],
+    )  # fmt: skip
+    return sights, variances, seen * (1.0 - context.state.watching.masked) if body.carried else seen
 
 
 def present_arrays(context: StepContext) -> ModelArrays | None:
