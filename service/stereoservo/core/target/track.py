@@ -290,6 +290,10 @@ def _follow(
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
     lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
+    if lost and not body.carried:  # one camera alone may take a flat one for its mirror image
+        body.t_ns, body.seen_ns[:], body.odd_ns[:], body.first_seen[:] = 0, 0, 0, 0.0
+        _find(body, camera, t_ns, sights, seen, carrier, arrays)
+        return
     used = None if lost else _explained(body, left, J, variances, seen, gate)
     if used is None:
         found, moved_px, rest_px = jumped(
