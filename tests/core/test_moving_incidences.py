@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -230,6 +231,49 @@ def test_a_target_that_moves_is_found_by_cameras_that_no_trigger_joins(benches: 
     off_px = off_target_px(cell, 0.6)
     print(f"shutters {10 * late} ms apart: {off_px:.2f} px")
     assert off_px < 1.0
+
+
+@pytest.mark.parametrize(
+    ("shown_as", "stated", "ids"),
+    [({8: 9, 9: 8}, False, None), ({9: 90}, False, (8, 10, 11, 12, 13)), ({9: 90}, True, PART)],
+)
+def test_sights_whose_rays_do_not_meet_are_no_part_of_the_target(
+    benches: Any, shown_as: dict[int, int], stated: bool, ids: tuple[int, ...] | None
+) -> None:
+    """Markers swapped by a camera's detector, and a reflection of one: a shape of them was followed, and the arm
+    moved.
+    """
+    cell = Cell(benches(7, noise_px=NOISE_PX).ready())
+    bench, begin = cell.bench, cell.bench.q.copy()
+    taken = bench.core.step
+
+    def seen_wrongly(inputs: Any) -> Any:
+        frames = tuple(wrongly(frame) if frame.camera == "left" else frame for frame in inputs.observations)
+        return taken(msgspec.structs.replace(inputs, observations=frames))
+
+    def wrongly(frame: Any) -> Any:
+        seen, pixels = frame.ids.copy(), frame.pixels.copy()
+        for one, other in shown_as.items():
+            if other in frame.ids:
+                seen[frame.ids == one] = other
+            else:
+                pixels[frame.ids == one] = (50.0, 60.0)
+        return msgspec.structs.replace(frame, ids=seen, pixels=pixels)
+
+    images = zip(bench.names, cell.images(cell.part[:, :3]), strict=True)
+    where = {name: dict(zip(PART, map(tuple, image.tolist()), strict=True)) for name, image in images}
+    bench.core.step = seen_wrongly
+    fixed = bench.truth.points(BASE)[[4]]
+    assert cell.send("point-on-point", (4,), fixed, PART, where if stated else None).accepted
+    cell.run(1.0)
+    assert np.abs(bench.q - begin).max() < 1e-2
+    assert ("target_met" in [event.kind for event in bench.events]) == (ids is not None)
+    if ids is None:  # until they are seen rightly
+        bench.core.step = taken
+        cell.run(0.3)
+        assert off_target_px(cell, 0.3) < 1.0
+    else:
+        assert tuple(bench.core.state.target.ids) == ids
 
 
 @pytest.mark.parametrize("absent", [(90, 91), tuple(range(20, 256))])

@@ -190,8 +190,14 @@ def _find(
     body.first[camera], body.first_seen[camera], body.seen_ns[camera] = sights, seen, t_ns
     if int((shown.max(axis=1) > 0.0).sum()) < 2:
         return
+    points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
+    pixels, _ = project_points(arrays.matrices, points)
+    apart = np.sqrt(((pixels - there) ** 2).sum(axis=-1)) * shown
+    wrong = (known > 0.0) & ~(
+        apart.max(axis=0) <= FOUND_REST_PX
+    )  # rays that do not meet: swapped, or a reflection
+    known[wrong], shown[:, wrong] = 0.0, 0.0
     if not body.stated:
-        points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
         if int(known.sum()) < FEWEST_TO_FIND:
             return
         _keep(body, known > 0.0, points)
