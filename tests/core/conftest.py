@@ -214,6 +214,8 @@ class Bench:
     cameras_on: list[bool] = field(default_factory=lambda: [True] * len(CAMERA_NAMES))
     joints_on: bool = True
     frozen_joint: int = -1
+    shutters_late: list[int] = field(default_factory=lambda: [0] * len(CAMERA_NAMES))
+    """Steps by which the shutter of each camera is later than that of one that keeps to every fourth step."""
     marker_mask: np.ndarray = field(default_factory=lambda: np.ones(8, bool))
     bias_px: float | np.ndarray = 0.0
     """Added to all pixels, or (8, 2) to each marker's."""
@@ -273,7 +275,7 @@ class Bench:
         self.events.extend(outputs.events)
         if outputs.driver_request:
             self.active = outputs.driver_request == "activate"
-        if self.seq % 4 == 0:
+        if any((self.seq - late) % 4 == 0 for late in self.shutters_late):
             self._shutter()
         if outputs.command is not None:
             self.commands.append(outputs.command)
@@ -296,7 +298,7 @@ class Bench:
         bias = np.zeros((exact.shape[1], 2))
         bias[:8] = self.bias_px
         for c, name in enumerate(self.names):
-            if not self.cameras_on[c]:
+            if not self.cameras_on[c] or (self.seq - self.shutters_late[c]) % 4:
                 continue
             inside = np.all((exact[c] >= 0) & (exact[c] < (640, 480)), axis=1)
             inside[:8] &= self.marker_mask

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -14,6 +15,10 @@ from scipy.linalg import expm
 from core.conftest import BASE, flange_at, twist
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state_encoding import decode_state, encode_state
+from stereoservo.core.target import track
+from stereoservo.core.target.motion import compare
+from stereoservo.core.target.track import pose_at
+from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.goals import Feature, Goal, IncidenceSpec, IncidenceTarget, RunGoal
 
 NOISE_PX = 0.1
@@ -176,6 +181,136 @@ def test_without_its_name_the_feature_stands(benches: Any) -> None:
     cell.run(SETTLE_S)
     way = largest_px(cell, (4,), lambda: (np.column_stack([fixed, [1.0]]) @ cell.moved.T)[:, :3])
     assert way > 20.0
+
+
+def off_target_px(cell: Cell, seconds: float) -> float:
+    """Largest distance over time between the images of the target as it is followed and as it is."""
+    matrices, off_px = np.array([camera.matrix for camera in cell.bench.truth.model.cameras]), list[float]()
+    for _ in range(round(seconds * cell.bench.settings.rate_hz)):
+        cell.step()
+        body = cell.bench.core.state.target
+        followed = transform_points(pose_at(body, cell.bench.now_ns)[0], body.points)
+        found, _ = project_points(matrices, followed)
+        apart = found - cell.bench.truth.images_of(cell.bench.truth.static)
+        off_px.append(float(np.linalg.norm(apart, axis=-1).max()))
+    return max(off_px)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.1])
+def test_a_flat_part_that_leans_otherwise_is_not_taken_for_its_mirror_image(
+    benches: Any, size: float
+) -> None:
+    """It was, by the one camera that showed it first, and the other camera's pictures were put down to that camera."""
+    cell = Cell(benches(0, noise_px=NOISE_PX).ready())
+    middle = cell.bench.truth.points(BASE).mean(axis=0) + np.array([0.0, 0.06, 0.03])
+    left = cell.bench.truth.cameras[0]
+    normal = -np.linalg.solve(left[:, :3], left[:, 3]) - middle
+    normal /= np.linalg.norm(normal)
+    across = np.cross(normal, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    edges = np.column_stack([across, np.cross(normal, across)])
+    flat = middle + np.random.default_rng([0, 77]).uniform(-size, size, (len(PART), 2)) @ edges.T
+    cell.part = np.column_stack([flat, np.ones(len(PART))]) @ turning(middle, across, 1.0)(np.radians(25.0)).T
+    assert cell.send("point-on-point", (4,), cell.bench.truth.points(BASE)[[4]], PART).accepted
+    cell.run(1.0)
+    part, cell.part = cell.part, cell.part + np.array([0.0, 0.0, 50.0, 0.0])
+    cell.run(0.8)
+    cell.part = part @ turning(middle, across, 1.0)(np.radians(-40.0)).T + np.array([0.0, 0.03, 0.02, 0.0])
+    cell.run(0.4)
+    assert off_target_px(cell, 0.5) < 1.0
+
+
+@pytest.mark.parametrize("late", [0, 1, 2, 3])
+def test_a_target_that_moves_is_found_by_cameras_that_no_trigger_joins(benches: Any, late: int) -> None:
+    """Its shape is taken of one moment: of two 30 ms apart, it was off by 32 px."""
+    bench = benches(0, noise_px=NOISE_PX).ready()
+    cell, slide = Cell(bench), sliding(0, 0.1)
+    bench.shutters_late[1] = late
+    cell.set_out(lambda t: slide(t - 0.6))
+    cell.run(0.3)
+    assert cell.send("point-on-point", (4,), bench.truth.points(BASE)[[4]], PART).accepted
+    cell.run(0.6)
+    off_px = off_target_px(cell, 0.6)
+    print(f"shutters {10 * late} ms apart: {off_px:.2f} px")
+    assert off_px < 1.0
+
+
+@pytest.mark.parametrize(
+    ("shown_as", "stated", "ids"),
+    [({8: 9, 9: 8}, False, None), ({9: 90}, False, (8, 10, 11, 12, 13)), ({9: 90}, True, PART)],
+)
+def test_sights_whose_rays_do_not_meet_are_no_part_of_the_target(
+    benches: Any, shown_as: dict[int, int], stated: bool, ids: tuple[int, ...] | None
+) -> None:
+    """Markers swapped by a camera's detector, and a reflection of one: a shape of them was followed, and the arm
+    moved.
+    """
+    cell = Cell(benches(7, noise_px=NOISE_PX).ready())
+    bench, begin = cell.bench, cell.bench.q.copy()
+    taken = bench.core.step
+
+    def seen_wrongly(inputs: Any) -> Any:
+        frames = tuple(wrongly(frame) if frame.camera == "left" else frame for frame in inputs.observations)
+        return taken(msgspec.structs.replace(inputs, observations=frames))
+
+    def wrongly(frame: Any) -> Any:
+        seen, pixels = frame.ids.copy(), frame.pixels.copy()
+        for one, other in shown_as.items():
+            if other in frame.ids:
+                seen[frame.ids == one] = other
+            else:
+                pixels[frame.ids == one] = (50.0, 60.0)
+        return msgspec.structs.replace(frame, ids=seen, pixels=pixels)
+
+    images = zip(bench.names, cell.images(cell.part[:, :3]), strict=True)
+    where = {name: dict(zip(PART, map(tuple, image.tolist()), strict=True)) for name, image in images}
+    bench.core.step = seen_wrongly
+    fixed = bench.truth.points(BASE)[[4]]
+    assert cell.send("point-on-point", (4,), fixed, PART, where if stated else None).accepted
+    cell.run(1.0)
+    assert np.abs(bench.q - begin).max() < 1e-2
+    assert ("target_met" in [event.kind for event in bench.events]) == (ids is not None)
+    if ids is None:  # until they are seen rightly
+        bench.core.step = taken
+        cell.run(0.3)
+        assert off_target_px(cell, 0.3) < 1.0
+    else:
+        assert tuple(bench.core.state.target.ids) == ids
+
+
+@pytest.mark.parametrize("absent", [(90, 91), tuple(range(20, 256))])
+def test_markers_that_two_cameras_do_not_show_at_first_are_no_part_of_the_target(
+    benches: Any, monkeypatch: pytest.MonkeyPatch, absent: tuple[int, ...]
+) -> None:
+    """The frame that finds it is compared with the markers that are left: kernels look at no bounds."""
+
+    def checked(*given: Any) -> Any:
+        assert len({len(given[k]) for k in (1, 5, 6)}) == 1  # points, sights and which of them are seen
+        return compare(*given)
+
+    monkeypatch.setattr(track, "compare", checked)
+    cell = Cell(benches(7, noise_px=NOISE_PX).ready())
+    assert cell.send("point-on-point", (4,), cell.bench.truth.points(BASE)[[4]], (*PART, *absent)).accepted
+    cell.run(1.0)
+    assert tuple(cell.bench.core.state.target.ids) == PART
+    assert "target_met" in [event.kind for event in cell.bench.events]
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_target_is_met_by_what_is_seen_of_it_and_not_by_what_is_expected(benches: Any, seen: bool) -> None:
+    """It turns back while it is hidden, and the arm comes to where it would have been."""
+    cell = Cell(benches(4, noise_px=NOISE_PX).ready())
+    assert cell.send("point-on-point", (4,), cell.bench.truth.points(BASE)[[4]], PART).accepted
+    slide, bench = sliding(4, 0.03), cell.bench
+    cell.set_out(slide)
+    while not 0.5 < bench.core.state.block.numbers.run.newest_px < 0.6:
+        cell.step()
+    assert "target_met" not in [event.kind for event in bench.events]
+    if not seen:
+        turned_s, part = (bench.now_ns - cell.begin_ns) * 1e-9, cell.part
+        cell.way, cell.part = lambda t: slide(2.0 * turned_s - t), part + np.array([0.0, 0.0, 50.0, 0.0])
+    cell.run(0.45)
+    assert ("target_met" in [event.kind for event in bench.events]) == seen
 
 
 @pytest.mark.parametrize("kind", KINDS)

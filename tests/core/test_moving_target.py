@@ -162,6 +162,31 @@ def test_a_joint_whose_zero_jumps_while_the_target_slides_is_named(benches: Any)
     assert found.reasons[0].subject == "j5"
 
 
+@pytest.mark.parametrize(("amplitude", "hz"), [(0.001, 10.0), (0.002, 10.0), (0.004, 5.0)])
+def test_a_target_that_shakes_is_no_camera_that_moved(benches: Any, amplitude: float, hz: float) -> None:
+    """Of two pictures of one moment the first is compared with where the target was before the second tells it."""
+    bench, _ = following(benches, 0)
+    slide(bench, lambda t: np.array([0.0, 0.005 * t, 0.0]))
+    bench.run(1.0)
+    slide(bench, lambda t: np.array([0.0, 0.005 + amplitude * np.sin(2.0 * np.pi * hz * t), 0.0]))
+    bench.run(2.0)
+    assert verdicts(bench) == set()
+    assert bench.core.state.source.goal.id == "00000001"
+
+
+@pytest.mark.parametrize(("joint", "jump"), [(0, 0.02), (1, 0.02), (2, 0.04), (4, 0.04)])
+def test_after_a_jump_of_a_joint_zero_no_camera_is_blamed(benches: Any, joint: int, jump: float) -> None:
+    """The joint is named, the target is found anew where the pictures have it, and no goal ends by a camera."""
+    bench, wanted = following(benches, 4)
+    slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))
+    bench.run(1.5)
+    bench.zero_offset = bench.zero_offset + jump * np.eye(6)[joint]
+    bench.run(2.0)
+    assert [e.name for e in bench.events if e.kind == "health"] == ["joint_zero", "ok"]
+    assert "goal_aborted" not in {e.kind for e in bench.events}
+    assert largest_px(bench, wanted, 0.5) < 1.5
+
+
 def test_its_state_survives_serialisation_bit_for_bit(benches: Any) -> None:
     bench, _ = following(benches, 5)
     slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))

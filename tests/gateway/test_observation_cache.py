@@ -48,6 +48,29 @@ def test_what_moves_is_where_it_was_seen_last():
     assert not now[1].moves
 
 
+def test_what_moves_is_told_of_one_moment_by_cameras_that_no_trigger_joins():
+    """At 100 px/s; two pictures half a period apart made a point of it that it never was at."""
+    sights, late_ns = ObservationCache({"left": 0.0, "right": 0.0}), PERIOD_NS // 2
+    for k in range(5):
+        one = observation(k, [[100.0 + 100e-9 * k * PERIOD_NS, 50.0]])
+        stamp_ns = one.t_shutter_ns + late_ns
+        other = CameraObservation(
+            "right",
+            k,
+            stamp_ns,
+            stamp_ns,
+            one.ids,
+            one.pixels + 100e-9 * late_ns * np.array([1.0, 0.0]),
+            one.covariances,
+        )
+        sights.add(one)
+        sights.add(other)
+    now = sights.now(5 * PERIOD_NS)
+    assert now["left"][0].pixel == pytest.approx((100.0 + 400e-9 * PERIOD_NS, 50.0))
+    assert now["right"][0].pixel == pytest.approx(now["left"][0].pixel)
+    assert now["right"][0].moves
+
+
 def test_what_is_hidden_or_old_is_not_seen():
     sights = ObservationCache({"left": 0.0})
     sights.add(observation(0, [[1.0, 1.0], [2.0, 2.0]]))

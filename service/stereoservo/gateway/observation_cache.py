@@ -1,4 +1,6 @@
-"""Cache of the newest observations of all markers by camera, averaged over frames while a marker is static."""
+"""Cache of the newest observations of all markers by camera, averaged over frames while a marker is static, and of one
+moment where it moves.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.messages.goals import Pixel
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 
 FRAMES = 10
@@ -46,35 +49,53 @@ class ObservationCache:
 
     def now(self, now_ns: int) -> dict[str, dict[int, MarkerObservation]]:
         """Current observations by camera, from frames received within `FRESH_S`; only markers of the newest frame."""
-        return {camera: self._camera_observations(camera, now_ns) for camera in self._frames}
+        fresh = {
+            camera: [o for o in frames if now_ns - o.t_received_ns <= FRESH_S * 1e9]
+            for camera, frames in self._frames.items()
+        }
+        moment_ns = min((frames[-1].t_shutter_ns for frames in fresh.values() if frames), default=0)
+        return {
+            camera: self._camera_observations(camera, frames, moment_ns) for camera, frames in fresh.items()
+        }
 
-    def _camera_observations(self, camera: str, now_ns: int) -> dict[int, MarkerObservation]:
-        fresh = [o for o in self._frames[camera] if now_ns - o.t_received_ns <= FRESH_S * 1e9]
+    def _camera_observations(
+        self, camera: str, fresh: list[CameraObservation], moment_ns: int
+    ) -> dict[int, MarkerObservation]:
         if not fresh:
             return {}
-        tracks: dict[int, list[tuple[np.ndarray[tuple[int], np.dtype[np.float64]], float]]] = {}
+        tracks: dict[int, list[_Sight]] = {}
         for observation in fresh:
+            since_s = (observation.t_shutter_ns - moment_ns) * 1e-9
             for marker, pixel, covariance in zip(
                 observation.ids, observation.pixels, observation.covariances, strict=True
             ):
-                tracks.setdefault(int(marker), []).append((pixel, 0.5 * float(np.trace(covariance))))
+                tracks.setdefault(int(marker), []).append(
+                    _Sight(since_s, pixel, 0.5 * float(np.trace(covariance)))
+                )
         return {
             int(marker): _average(tracks[int(marker)], self._systematic[camera] ** 2)
             for marker in fresh[-1].ids
         }
 
 
-def _average(
-    track: list[tuple[np.ndarray[tuple[int], np.dtype[np.float64]], float]], systematic: float
-) -> MarkerObservation:
-    """Mean pixel of a static marker, newest pixel of a moving one."""
-    pixels = np.array([pixel for pixel, _ in track])
-    variance = float(np.mean([variance for _, variance in track]))
+class _Sight(NamedTuple):
+    """Where a marker was seen (2,) [px], with its variance [px²], at this time [s] since the moment that counts."""
+
+    since_s: float
+    pixel: FloatArray
+    variance: float
+
+
+def _average(track: list[_Sight], systematic: float) -> MarkerObservation:
+    """Mean pixel of a static marker; of a moving one where it was at the moment that all cameras have seen."""
+    pixels = np.array([sight.pixel for sight in track])
+    variance = float(np.mean([sight.variance for sight in track]))
     mean = pixels.mean(axis=0)
     away = float(np.sqrt(((pixels - mean) ** 2).sum(axis=1)).max())
     if away > STILL_SIGMAS * np.sqrt(variance) + STILL_PX:
-        return MarkerObservation(
-            (float(pixels[-1, 0]), float(pixels[-1, 1])), float(np.sqrt(track[-1][1])), True
-        )
+        times = np.array([sight.since_s for sight in track])
+        order = np.argsort(times, kind="stable")
+        u, v = (float(np.interp(0.0, times[order], pixels[order, axis])) for axis in range(2))
+        return MarkerObservation((u, v), float(np.sqrt(track[-1].variance)), True)
     noise = max(variance - systematic, 0.0) / len(track) + min(systematic, variance)
     return MarkerObservation((float(mean[0]), float(mean[1])), float(np.sqrt(noise)), False)

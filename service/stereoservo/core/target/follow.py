@@ -34,6 +34,8 @@ from stereoservo.numerics.arrays import FloatArray
 
 Follower = ServoGoal | IncidenceGoal
 """Goals that may follow a target."""
+MISSED_FRAMES = 1.5
+"""Periods of the slowest camera by which frames may be newer than the last that showed the target, and still count."""
 
 
 def require_followable(
@@ -158,8 +160,9 @@ def follow_target(source: Follower, context: StepContext) -> Reason | None:
     waits = _brought(source, context)
     followed, run = source.followed, context.state.block.numbers.run
     assert followed is not None
-    if waits is not None:
+    if waits is not None or _missed(context):
         run.held = 0  # what was held, was held on a target that was seen
+    if waits is not None:
         if followed.told in ("target_seen", "target_met"):
             _tell("target_unseen", f"{waits.hint}; the arm waits until it is there again", source, context)
     elif followed.told in ("", "target_unseen"):
@@ -168,6 +171,14 @@ def follow_target(source: Follower, context: StepContext) -> Reason | None:
         message = f"error {run.newest_px:.4f} px on the target as it moves, for {run.held} frames"
         _tell("target_met", message, source, context)
     return waits
+
+
+def _missed(context: StepContext) -> bool:
+    """Whether the cameras go on without the target: the error is then one to where it is expected."""
+    body, slowest_hz = context.state.target, min(camera.rate_hz for camera in context.settings.cameras)
+    assert body is not None
+    newest_ns = max(estimate.accepted_ns + estimate.offset_ns for estimate in context.state.cameras)
+    return (newest_ns - int(body.seen_ns.max())) * 1e-9 > MISSED_FRAMES / slowest_hz
 
 
 def _tell(

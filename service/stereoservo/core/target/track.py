@@ -49,8 +49,11 @@ FEWEST = 3
 """Markers of a frame that says something of the target."""
 FEWEST_TO_FIND = 5
 """Markers, two cameras together, by which a target beside the body is found."""
-TOGETHER_NS = 40_000_000
-"""Between frames of several cameras from which it is found."""
+TOGETHER_NS = 2_000_000
+"""Between frames of several cameras that count as of one moment."""
+LONGEST_GAP_NS = 250_000_000
+FARTHEST_SHARE = 1.0
+"""Between two frames of a camera on whose way its sights at another moment are taken; of that gap, how far beyond."""
 RECENT_NS = 150_000_000
 SMALL_PX = 0.5
 """rms that needs no explanation: models are not exact."""
@@ -79,22 +82,31 @@ def take_frame(camera: int, observation: CameraObservation, context: StepContext
     carrier = _carrier(body, t_ns, state, arrays)
     if carrier is None:
         return
-    sights, variances, seen = target_sights(
-        body.ids, observation.ids.astype(np.int64), np.array(observation.pixels, np.float64, order="C"),
-        np.array(observation.covariances, np.float64, order="C"), arrays.lenses[camera],
-    )  # fmt: skip
-    if body.carried:
-        seen = seen * (1.0 - state.watching.masked)
-    if state.reanchoring is None and int(seen.sum()) >= FEWEST:
+    frame = _frame_of(body, camera, observation, context)
+    if state.reanchoring is None and int(frame[2].sum()) >= FEWEST:
         if body.t_ns == 0:
-            _find(body, camera, t_ns, sights, seen, carrier, arrays)
-        if body.t_ns > 0:
-            _follow(body, camera, t_ns, (sights, variances, seen), carrier, context)
+            _find(body, camera, t_ns, frame[0], frame[2], carrier, arrays)
+            frame = _frame_of(body, camera, observation, context)  # it may have fewer markers from here on
+        if body.t_ns > 0 and int(frame[2].sum()) >= FEWEST:
+            _follow(body, camera, t_ns, frame, carrier, context)
     if body.carried and body.t_ns > 0:
         if not body.told[camera]:  # what it said before was of a target that stood
             state.cameras[camera].seen_ns[:] = 0
             body.told[camera] = True
         context.derived.room.arrays["marker_points"][:] = _points(body, t_ns)
+
+
+def _frame_of(
+    body: TargetBody, camera: int, observation: CameraObservation, context: StepContext
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What a frame shows of the target, as `target_sights` has it, without markers of a model's body that slipped."""
+    arrays = context.derived.arrays
+    assert arrays is not None
+    sights, variances, seen = target_sights(
+        body.ids, observation.ids.astype(np.int64), np.array(observation.pixels, np.float64, order="C"),
+        np.array(observation.covariances, np.float64, order="C"), arrays.lenses[camera],
+    )  # fmt: skip
+    return sights, variances, seen * (1.0 - context.state.watching.masked) if body.carried else seen
 
 
 def present_arrays(context: StepContext) -> ModelArrays | None:
@@ -174,25 +186,55 @@ def _find(
     if body.carried:
         begin(body, basis, metric, arrays.matrices, carrier, t_ns)
         return
+    at_ns, there, shown = _at_one_moment(body, camera, t_ns, sights, seen)
     body.first[camera], body.first_seen[camera], body.seen_ns[camera] = sights, seen, t_ns
-    shown = body.first_seen * (np.abs(body.seen_ns - t_ns) <= TOGETHER_NS)[:, None]
     if int((shown.max(axis=1) > 0.0).sum()) < 2:
         return
+    points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
+    pixels, _ = project_points(arrays.matrices, points)
+    apart = np.sqrt(((pixels - there) ** 2).sum(axis=-1)) * shown
+    wrong = (known > 0.0) & ~(
+        apart.max(axis=0) <= FOUND_REST_PX
+    )  # rays that do not meet: swapped, or a reflection
+    known[wrong], shown[:, wrong] = 0.0, 0.0
     if not body.stated:
-        points, known = find_shape(arrays.matrices, body.first, shown, arrays.plane_at_infinity)
         if int(known.sum()) < FEWEST_TO_FIND:
             return
         _keep(body, known > 0.0, points)
-        begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+        begin(body, basis, metric, arrays.matrices, carrier, at_ns)
         return
     if int((shown.max(axis=0) > 0.0).sum()) < FEWEST:
         return
-    D, rest = find_stated(basis, arrays, body.points, body.first, shown)
+    D, rest = find_stated(basis, arrays, body.points, there, shown)
     if rest > FOUND_REST_PX:
         body.rest_px = rest
         return
     body.displacement[:] = D
-    begin(body, basis, metric, arrays.matrices, carrier, t_ns)
+    begin(body, basis, metric, arrays.matrices, carrier, at_ns)
+
+
+def _at_one_moment(
+    body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray
+) -> tuple[int, FloatArray, FloatArray]:
+    """When another camera saw the target last, what the cameras show of it then (c, k, 2) and of which markers (c, k)
+    1 or 0: this one on its way from its frame before to this frame, since the target moves between their shutters.
+    """
+    there, shown = body.first.copy(), body.first_seen.copy()
+    others = shown.max(axis=1) > 0.0
+    others[camera] = False
+    at_ns = int(body.seen_ns[others].max()) if others.any() else t_ns
+    shown *= (np.abs(body.seen_ns - at_ns) <= TOGETHER_NS)[:, None]
+    there[camera], shown[camera] = sights, seen
+    if abs(t_ns - at_ns) <= TOGETHER_NS:
+        return at_ns, there, shown
+    before, gap_ns = body.first[camera], t_ns - int(body.seen_ns[camera])
+    share = (at_ns - t_ns) / gap_ns if 0 < gap_ns <= LONGEST_GAP_NS else np.inf
+    if -1.0 - FARTHEST_SHARE <= share <= FARTHEST_SHARE:
+        there[camera] += share * (sights - before)
+        shown[camera] *= body.first_seen[camera]
+    else:
+        shown[camera] = 0.0
+    return at_ns, there, shown
 
 
 def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], points: FloatArray) -> None:
@@ -255,6 +297,10 @@ def _follow(
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
     lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
+    if lost and not body.carried:  # one camera alone may take a flat one for its mirror image
+        body.t_ns, body.seen_ns[:], body.odd_ns[:], body.first_seen[:] = 0, 0, 0, 0.0
+        _find(body, camera, t_ns, sights, seen, carrier, arrays)
+        return
     used = None if lost else _explained(body, left, J, variances, seen, gate)
     if used is None:
         found, moved_px, rest_px = jumped(
@@ -265,6 +311,9 @@ def _follow(
             body.odd, body.told[:] = 0, False
         elif lost or not _jumps(body, camera, t_ns, (moved_px, rest_px), since_s, state):
             return
+        if body.carried:  # what the other cameras' newest frames were compared with was not where it is
+            for sighting in state.watching.sightings:
+                sighting.t_ns = 0
         body.displacement[:] = found
         left, J = compare(
             body.basis, body.points, found, arrays.matrices[camera : camera + 1], carrier, sights, seen
@@ -311,7 +360,7 @@ def _jumps(
     if quick and (named or body.odd < FOUND_ANEW):
         return False
     widen(body, FOUND_PX + 0.1 * moved_px)
-    body.odd, body.told[:] = 0, not quick
+    body.odd, body.told[:] = 0, False
     return True
 
 
