@@ -140,6 +140,27 @@ def test_it_is_carried_through_a_drop_out(benches: Any) -> None:
     assert verdicts(bench) == set()
 
 
+@pytest.mark.parametrize("seed", [0, 11, 13, 22, 32, 52])
+def test_a_target_that_is_put_elsewhere_once_it_is_found_is_no_joint_that_is_off_and_has_no_speed(
+    benches: Any, seed: int
+) -> None:
+    """By 15 to 80 px between its first two frames, before anything is known of its speed; then it stands."""
+    bench, _ = following(benches, seed % 8)
+    body = bench.core.state.target
+    body.t_ns, body.seen_ns[:], body.first_seen[:] = 0, 0, 0.0  # as when a model is taken
+    while body.t_ns == 0:
+        bench.step()
+    rng = np.random.default_rng([seed, 79])
+    bench.run(rng.uniform(0.0, 0.03))
+    away = flange_at(BASE)[:3, :3] @ np.array([*rng.uniform(-1.0, 1.0, 2), 0.1 * rng.standard_normal()])
+    away *= rng.uniform(0.03, 0.15) / np.linalg.norm(away)
+    slide(bench, lambda t: away)
+    bench.run(0.12)  # three frames of each camera
+    assert np.linalg.norm(body.twist) < 100.0
+    bench.run(1.0)
+    assert verdicts(bench) == set()
+
+
 def test_a_camera_that_is_bumped_while_the_target_slides_is_named(benches: Any) -> None:
     bench, _ = following(benches, 3)
     slide(bench, lambda t: 0.02 * t * np.array([0.0, 1.0, 0.0]))

@@ -375,8 +375,10 @@ def gate_sights(
 def fold_frame(
     D: FloatArray, basis: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray, left: FloatArray,
     J: FloatArray, variances: FloatArray, used: FloatArray,
-) -> None:  # fmt: skip
-    """Correct the state by a frame, in place: what is ``left`` (k, 2) of the markers ``used`` (k,), as of `compare`."""
+) -> FloatArray:  # fmt: skip
+    """Correct the state by a frame, in place: what is ``left`` (k, 2) of the markers ``used`` (k,), as of `compare`;
+    returns the twist (6,) by which the pose was corrected.
+    """
     n = FREEDOMS
     N, b = np.zeros((n, n)), np.zeros(n)
     for i in range(used.size):
@@ -416,6 +418,7 @@ def fold_frame(
     D[:] = displaced(D, basis, step[:n])
     twist += step[n : 2 * n]
     rate += step[2 * n :]
+    return step[:n].copy()
 
 
 FITS = 40

@@ -55,6 +55,8 @@ LONGEST_GAP_NS = 250_000_000
 FARTHEST_SHARE = 1.0
 """Between two frames of a camera on whose way its sights at another moment are taken; of that gap, how far beyond."""
 RECENT_NS = 150_000_000
+ROUNDS = 4
+"""Of linearisation, for a frame that shows the target elsewhere than expected."""
 SMALL_PX = 0.5
 """rms that needs no explanation: models are not exact."""
 RIGID_PX = 1.0
@@ -286,14 +288,14 @@ def _follow(
     sights, variances, seen = frame
     state, arrays = context.state, context.derived.arrays
     assert arrays is not None
+    stood = pose_at(body, int(body.seen_ns.max()))[0]
     dt_s = min((t_ns - body.t_ns) * 1e-9, LONGEST_S)
     if dt_s > 0.0:
         elapse(body.displacement, body.basis, body.drift, body.twist, body.rate, body.covariance, dt_s)
         body.t_ns = t_ns
     pose = pose_at(body, t_ns)[0]
-    left, J = compare(
-        body.basis, body.points, pose, arrays.matrices[camera : camera + 1], carrier, sights, seen
-    )
+    view = arrays.matrices[camera : camera + 1], carrier, sights, seen
+    left, J = compare(body.basis, body.points, pose, *view)
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
     lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
@@ -302,30 +304,47 @@ def _follow(
         _find(body, camera, t_ns, sights, seen, carrier, arrays)
         return
     used = None if lost else _explained(body, left, J, variances, seen, gate)
+    sudden = used is None or float((left * left)[used > 0.0].sum(axis=-1).mean()) > RIGID_PX**2
     if used is None:
-        found, moved_px, rest_px = jumped(
-            body.basis, body.points, pose, arrays.matrices[camera : camera + 1], carrier, sights, seen
-        )
+        found, moved_px, rest_px = jumped(body.basis, body.points, pose, *view)
+        stops = _apart_px(body, stood, found, *view[:2]) < min(moved_px, SPEED_PX * since_s + SMALL_PX)
         if lost and rest_px <= RIGID_PX:
             widen(body, FOUND_PX)
             body.odd, body.told[:] = 0, False
-        elif lost or not _jumps(body, camera, t_ns, (moved_px, rest_px), since_s, state):
+        elif lost or not _jumps(body, camera, t_ns, (0.0 if stops else moved_px, rest_px), since_s, state):
             return
-        if body.carried:  # what the other cameras' newest frames were compared with was not where it is
-            for sighting in state.watching.sightings:
-                sighting.t_ns = 0
+        if stops:  # as it never went as fast as it seemed to
+            body.twist[:], body.rate[:] = 0.0, 0.0
         body.displacement[:] = found
-        left, J = compare(
-            body.basis, body.points, found, arrays.matrices[camera : camera + 1], carrier, sights, seen
-        )
+        left, J = compare(body.basis, body.points, found, *view)
         used = _explained(body, left, J, variances, seen, gate)
         if used is None:
             return
+    if (
+        sudden and body.carried
+    ):  # what the other cameras' newest frames were compared with was not where it is
+        for sighting in state.watching.sightings:
+            sighting.t_ns = 0
+    _fold(body, left, J, view, variances, used, ROUNDS if sudden else 1)
+    body.seen_ns[camera], body.odd_ns[camera] = t_ns, 0
+    _look_whether_still(body, t_ns, arrays.matrices[camera : camera + 1], carrier)
+
+
+def _fold(
+    body: TargetBody, left: FloatArray, J: FloatArray,
+    view: tuple[FloatArray, FloatArray, FloatArray, FloatArray], variances: FloatArray, used: FloatArray, rounds: int,
+) -> None:  # fmt: skip
+    """Correct the state by a frame, as of `fold_frame`, linearised anew about what comes of it (Bell and Cathey 1993):
+    one large step from far off leaves pixels that nothing explains, and a joint would be blamed for them.
+    """
+    for _ in range(rounds - 1):
+        D, twist, rate = body.displacement.copy(), body.twist.copy(), body.rate.copy()
+        step = fold_frame(D, body.basis, twist, rate, body.covariance.copy(), left, J, variances, used)
+        left, J = compare(body.basis, body.points, D, *view)
+        left = left + J @ step
     fold_frame(
         body.displacement, body.basis, body.twist, body.rate, body.covariance, left, J, variances, used
     )
-    body.seen_ns[camera], body.odd_ns[camera] = t_ns, 0
-    _look_whether_still(body, t_ns, arrays.matrices[camera : camera + 1], carrier)
 
 
 def _explained(
@@ -364,12 +383,19 @@ def _jumps(
     return True
 
 
-def _look_whether_still(body: TargetBody, t_ns: int, matrix: FloatArray, carrier: FloatArray) -> None:
-    here, _ = project_points(
-        matrix, transform_points(carrier, transform_points(body.displacement, body.points))
+def _apart_px(
+    body: TargetBody, one: FloatArray, other: FloatArray, matrix: FloatArray, carrier: FloatArray
+) -> float:
+    """How far the images of its markers are apart at two displacements (4, 4), rms [px]."""
+    here, there = (
+        project_points(matrix, transform_points(carrier, transform_points(D, body.points)))[0]
+        for D in (one, other)
     )
-    there, _ = project_points(matrix, transform_points(carrier, transform_points(body.mark, body.points)))
-    moved_px = float(np.sqrt(((here - there) ** 2).sum(axis=-1).mean()))
+    return float(np.sqrt(((here - there) ** 2).sum(axis=-1).mean()))
+
+
+def _look_whether_still(body: TargetBody, t_ns: int, matrix: FloatArray, carrier: FloatArray) -> None:
+    moved_px = _apart_px(body, body.displacement, body.mark, matrix, carrier)
     body.farthest_px = max(body.farthest_px, moved_px)
     if body.farthest_px > STILL_PX:
         body.still = False
