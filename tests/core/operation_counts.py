@@ -42,6 +42,16 @@ def mark_kernels() -> None:
     compilation._compile = marked
 
 
+def part_by_attribute(core: Any) -> None:
+    """Let kernels as Python have the records of a core's block and workspace as compiled ones do."""
+    block, room = core.state.block, core._derived.room
+    vars(block)["record"], vars(room)["record"] = (
+        block.record.view(np.recarray),
+        room.record.view(np.recarray),
+    )
+    room.spare = room.spare.view(np.recarray)
+
+
 def recorded(path: Path, kinds: tuple[str, ...] = ()) -> list[str]:
     """Write the first step of every kind, or of these ``kinds``, of a run in the largest cell into a file; their kinds.
 
@@ -119,11 +129,7 @@ def counts(path: Path) -> dict[str, tuple[int, int]]:
         settings = msgspec.msgpack.decode(step.settings, type=CoreSettings, dec_hook=decode_array)
         inputs = msgspec.msgpack.decode(step.inputs, type=StepInputs, dec_hook=decode_array)
         core = ServoCore(settings, decode_state(step.state))
-        for owner in (
-            core.state.block,
-            core._derived.room,
-        ):  # whose elements kernels as Python part by attribute
-            vars(owner)["record"] = owner.record.view(np.recarray)
+        part_by_attribute(core)
         lines = [0, 0]
 
         def line(frame: FrameType, event: str, argument: Any, lines: list[int] = lines) -> Any:

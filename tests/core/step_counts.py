@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 import stereoservo
+from core.operation_counts import part_by_attribute
 from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.kinematics.model import load_model
@@ -47,6 +48,8 @@ class CountedCore(ServoCore):
         super().__init__(core.settings, core.state)
         self.measure, self.lines, self.name = measure, 0, ""
         self.most: dict[str, int] = {}
+        if measure == "lines":
+            part_by_attribute(self)
 
     def step(self, inputs: StepInputs) -> StepOutputs:
         self.lines = 0

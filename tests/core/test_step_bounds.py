@@ -26,6 +26,10 @@ from stereoservo_sim.world.exact_model import exact_model
 from .operation_counts import recorded
 from .step_counts import counts
 
+TESTS = str(Path(__file__).parents[1])
+KERNELS_AS_PYTHON = {
+    **os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join((TESTS, os.environ.get("PYTHONPATH", ""))),
+}  # fmt: skip
 SIZES = (4, 16, 64, 256)
 GROWTH = 1.5
 """By how much the work of a marker may grow from one size to the next, four times as large: m log m, and no m²."""
@@ -43,7 +47,7 @@ def of_lines(model: Path, markers: int) -> dict[str, int]:
     script = Path(__file__).with_name("step_counts.py")
     done = subprocess.run(
         [sys.executable, str(script), str(model), str(markers)],
-        capture_output=True, text=True, check=False, env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True, text=True, check=False, env=KERNELS_AS_PYTHON,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     found: dict[str, int] = json.loads(done.stdout)
@@ -90,7 +94,7 @@ def test_no_step_in_the_largest_cell_does_more_than_is_stated(kinds: tuple[str, 
     script = Path(__file__).with_name("operation_counts.py")
     run = subprocess.run(
         [sys.executable, str(script), str(path)],
-        capture_output=True, text=True, check=False, env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True, text=True, check=False, env=KERNELS_AS_PYTHON,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     found: dict[str, tuple[int, int]] = json.loads(run.stdout)

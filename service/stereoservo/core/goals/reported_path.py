@@ -33,7 +33,7 @@ def reported_pixels(arrays: ModelArrays, displacements: FloatArray, points: Floa
 
     Markers that a lens does not image at all of them are left out.
     """
-    pixels = len(displacements) * arrays.sights
+    pixels = max(len(displacements), 2) * arrays.sights  # a way to where the arm is has one sample
     every = 1 if pixels <= REPORTED_PIXELS else math.ceil(pixels / REPORTED_OF_LARGE)
     told = np.ascontiguousarray(points[::every])
     paths = _raw_paths(arrays.matrices, arrays.lenses, displacements, told)
