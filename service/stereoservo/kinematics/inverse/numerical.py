@@ -23,6 +23,9 @@ HITS = 8
 """Starts that have to come to each solution before a search ends: what was found once may have unseen company."""
 TWINS = np.array([0.05, 0.2, 0.6])
 """Steps [rad] from a solution along its weakest direction, where the other one of a close pair lies."""
+POLISH = 1e-9
+"""Damping of the refinement of a candidate: next to none."""
+REFINEMENTS = 8
 CLOSE = 1e-5
 """Largest difference of joints [rad or m] of two descents that came to one solution."""
 
@@ -67,7 +70,7 @@ def all_solutions(
     The search ends when every solution has been come to from ``HITS`` starts; a pair that is close to merging is
     looked for from its one half. That all are found is likely, not certain.
     """
-    known = _Known(chain, tolerance)
+    known = _Known(chain, points, targets, tolerance)
     best, least = seed, np.inf
     tried = 0
     while tried < MOST:
@@ -89,8 +92,10 @@ def all_solutions(
 class _Known:
     """Solutions found so far, and how many starts converged to each."""
 
-    def __init__(self, chain: ProjectiveChain, tolerance: float) -> None:
-        self.kinds, self.tolerance = chain.kinds, tolerance
+    def __init__(
+        self, chain: ProjectiveChain, points: FloatArray, targets: FloatArray, tolerance: float
+    ) -> None:
+        self.chain, self.points, self.targets, self.tolerance = chain, points, targets, tolerance
         self.joints: list[FloatArray] = []
         self.residuals: list[float] = []
         self.hits: list[int] = []
@@ -104,22 +109,41 @@ class _Known:
             # All descents that came to where the best of those left did; a pair of solutions is farther apart.
             best = int(np.argmin(left))
             here = self._near(ends, ends[best])
-            known = self._near(np.array(self.joints).reshape(-1, ends.shape[1]), ends[best])
-            if known.any():
-                i = int(np.argmax(known))
-                self.hits[i] += count * int(here.sum())
-                if left[best] < self.residuals[i]:
-                    self.joints[i], self.residuals[i] = ends[best], float(left[best])
-            else:
+            q, residual = ends[best], float(left[best])
+            i = self._index(q)
+            if i is None:
+                q, residual = self._refined(q)
+                i = self._index(q)
+            if i is None:
                 fresh.append(len(self.joints))
-                self.joints.append(ends[best])
-                self.residuals.append(float(left[best]))
+                self.joints.append(q)
+                self.residuals.append(residual)
                 self.hits.append(count * int(here.sum()))
+            else:
+                self.hits[i] += count * int(here.sum())
+                if residual < self.residuals[i]:
+                    self.joints[i], self.residuals[i] = q, residual
             ends, left = ends[~here], left[~here]
         return fresh
 
+    def _refined(self, q: FloatArray) -> tuple[FloatArray, float]:
+        """The end ``q`` (n,) of a descent refined until it stays, and its residual: where a solution is nearly a double
+        one, damped steps gain so little that a descent ends on its way there.
+        """
+        for _ in range(REFINEMENTS):
+            before = q
+            ends, left = descended(self.chain, self.points, self.targets, q[None], damping=POLISH)
+            q = ends[0]
+            if np.abs(q - before).max() <= 0.1 * CLOSE:
+                break
+        return q, float(left[0])
+
+    def _index(self, q: FloatArray) -> int | None:
+        known = self._near(np.array(self.joints).reshape(-1, len(q)), q)
+        return int(np.argmax(known)) if known.any() else None
+
     def _near(self, rows: FloatArray, q: FloatArray) -> npt.NDArray[np.bool_]:
-        difference = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
+        difference = nearest_turns(self.chain.kinds, rows - q, np.zeros(len(q)))
         return np.asarray(np.abs(difference).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
 
 
