@@ -148,6 +148,21 @@ def test_two_solutions_that_nearly_coincide_are_found_once_each(seed):
     assert differences(STRETCHED, right, found.joints - arm.chain.zero).max() < 1e-6
 
 
+NEARLY_ALIGNED = offset_arm(0.4180984022, 0.4583458334, 0.08295815394, 0.1262323843, 0.1161110323)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_solutions_beside_a_nearly_aligned_wrist_are_found(seed):
+    """0.3 mrad from it few descents end at them, most on the curve of joints that keeps the goal to 1e-6."""
+    q = np.array([0.720814867, 2.3204857436, 2.894044572, -1.240471081, 3.1413159867, -2.901612091])
+    goal = NEARLY_ALIGNED.displacements(q[None])
+    right = three_parallel(NEARLY_ALIGNED, goal)[0]
+    arm = hide(NEARLY_ALIGNED, np.random.default_rng(seed))
+    found = arm.solve(goal[0], None)
+    assert len(found.joints) == len(right) == 8
+    assert differences(NEARLY_ALIGNED, right, found.joints - arm.chain.zero).max() < 1e-6
+
+
 STRETCHED_AND_NEARLY_ALIGNED = np.array(
     [3.025177518764, 2.201887272465, -1.523818410447, 2.397444754533, 3.14108429955, -0.100496312107]
 )

@@ -26,6 +26,9 @@ TWINS = np.array([0.05, 0.2, 0.6])
 POLISH = 1e-9
 """Damping of the refinement of a candidate: next to none."""
 REFINEMENTS = 8
+VALLEY = 1e-5
+"""Residual up to which the end of a descent that solves nothing is taken for one in a valley."""
+VALLEY_ROUNDS, VALLEY_STEPS, UNDAMPED = 4, 500, 1e-15
 CLOSE = 1e-5
 """Largest difference of joints [rad or m] of two descents that came to one solution."""
 
@@ -77,7 +80,7 @@ def all_solutions(
         starts = even_starts(chain, limits, BATCH, tried)
         if tried == 0:
             starts[0] = seed
-        ends, left = descended(chain, points, targets, starts)
+        ends, left = _along_valleys(chain, points, targets, starts, tolerance)
         tried += BATCH
         if left.min() < least:
             best, least = ends[int(np.argmin(left))], float(left.min())
@@ -87,6 +90,25 @@ def all_solutions(
         if tried >= FEWEST and min(known.hits, default=HITS) >= HITS:
             break
     return np.array(known.joints).reshape(-1, chain.joints), np.array(known.residuals), best
+
+
+def _along_valleys(
+    chain: ProjectiveChain, points: FloatArray, targets: FloatArray, starts: FloatArray, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Ends (s, n) and residuals (s,) of descents, those that ended in a valley followed to its lowest place: near a
+    singular configuration a curve of joints nearly keeps the goal, and steps along it are short.
+    """
+    ends, left = descended(chain, points, targets, starts)
+    slow = (left > tolerance) & (left <= VALLEY)
+    for _ in range(VALLEY_ROUNDS):
+        if not slow.any():
+            break
+        before = ends[slow]
+        ends[slow], left[slow] = descended(
+            chain, points, targets, before, iterations=VALLEY_STEPS, damping=UNDAMPED
+        )
+        slow[slow] = (left[slow] > tolerance) & (np.abs(ends[slow] - before).max(axis=1) > CLOSE)
+    return ends, left
 
 
 class _Known:
@@ -112,8 +134,11 @@ class _Known:
             q, residual = ends[best], float(left[best])
             i = self._index(q)
             if i is None:
-                q, residual = self._refined(q)
+                q, residual, stays = self._refined(q)
                 i = self._index(q)
+                if i is None and not stays and self.joints:
+                    ends, left = ends[~here], left[~here]
+                    continue
             if i is None:
                 fresh.append(len(self.joints))
                 self.joints.append(q)
@@ -126,17 +151,19 @@ class _Known:
             ends, left = ends[~here], left[~here]
         return fresh
 
-    def _refined(self, q: FloatArray) -> tuple[FloatArray, float]:
-        """The end ``q`` (n,) of a descent refined until it stays, and its residual: where a solution is nearly a double
-        one, damped steps gain so little that a descent ends on its way there.
+    def _refined(self, q: FloatArray) -> tuple[FloatArray, float, bool]:
+        """The end ``q`` (n,) of a descent refined until it stays, its residual, and whether it does: where a solution
+        is nearly a double one, damped steps gain so little that a descent ends on its way there.
         """
+        stays = False
         for _ in range(REFINEMENTS):
             before = q
             ends, left = descended(self.chain, self.points, self.targets, q[None], damping=POLISH)
             q = ends[0]
-            if np.abs(q - before).max() <= 0.1 * CLOSE:
+            stays = bool(np.abs(q - before).max() <= 0.1 * CLOSE)
+            if stays:
                 break
-        return q, float(left[0])
+        return q, float(left[0]), stays
 
     def _index(self, q: FloatArray) -> int | None:
         known = self._near(np.array(self.joints).reshape(-1, len(q)), q)
