@@ -8,11 +8,18 @@ import pytest
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.inverse.goals import fixed_planes
 from stereoservo.kinematics.inverse.recognition import chain_of, recognise
+from stereoservo.kinematics.inverse.self_motion import null_directions
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
 from stereoservo_sim.experiments.arms import arm_families
 from stereoservo_sim.experiments.arms.arm_families import PUMA_ROWS, aligned_wrist, from_rows
-from stereoservo_sim.experiments.arms.inverse_kinematics import differences, hide
+from stereoservo_sim.experiments.arms.euclidean_inverse import crossing, three_parallel
+from stereoservo_sim.experiments.arms.inverse_kinematics import (
+    differences,
+    hide,
+    kept_along,
+    singular_handled,
+)
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SEVEN_ROWS
@@ -118,6 +125,74 @@ def test_near_a_singular_wrist_the_goal_is_still_reached(puma, bend):
     if bend >= 1e-5:
         # Rounding of the goal, over the bend.
         assert differences(puma.axes, q[None], found.joints - puma.chain.zero)[0] < 1e-12 / bend
+
+
+def offset_arm(a2, a3, d2, d4, d5):
+    return from_rows(((0, -90, 0.3), (a2, 0, d2), (a3, 0, 0), (0, -90, d4), (0, 90, d5), (0, 0, 0.1)))
+
+
+STRETCHED = offset_arm(0.43474537, 0.44744545, 0.0777268, 0.1207119, 0.10501307)
+"""Its descents to the elbow nearly stretched (0.7 mrad) ended 0.02 to 2 mrad before the two solutions."""
+NEAR_DOUBLE = np.array([0.8869, 1.6168, 0.00066204, -0.6259, 0.0039911, 0.0626249])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_solutions_that_nearly_coincide_are_found_once_each(seed):
+    goal = STRETCHED.displacements(NEAR_DOUBLE[None])
+    right = three_parallel(STRETCHED, goal)[0]
+    right = right[~np.isnan(right).any(axis=1)]
+    arm = hide(STRETCHED, np.random.default_rng(seed))
+    found = arm.solve(goal[0], None)
+    assert len(found.joints) == len(right) == 4
+    assert found.residuals.max() < 1e-12
+    assert differences(STRETCHED, right, found.joints - arm.chain.zero).max() < 1e-6
+
+
+NEARLY_ALIGNED = offset_arm(0.4180984022, 0.4583458334, 0.08295815394, 0.1262323843, 0.1161110323)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_solutions_beside_a_nearly_aligned_wrist_are_found(seed):
+    """0.3 mrad from it few descents end at them, most on the curve of joints that keeps the goal to 1e-6."""
+    q = np.array([0.720814867, 2.3204857436, 2.894044572, -1.240471081, 3.1413159867, -2.901612091])
+    goal = NEARLY_ALIGNED.displacements(q[None])
+    right = three_parallel(NEARLY_ALIGNED, goal)[0]
+    arm = hide(NEARLY_ALIGNED, np.random.default_rng(seed))
+    found = arm.solve(goal[0], None)
+    assert len(found.joints) == len(right) == 8
+    assert differences(NEARLY_ALIGNED, right, found.joints - arm.chain.zero).max() < 1e-6
+
+
+STRETCHED_AND_NEARLY_ALIGNED = np.array(
+    [3.025177518764, 2.201887272465, -1.523818410447, 2.397444754533, 3.14108429955, -0.100496312107]
+)
+"""PUMA: the elbow stretched, the wrist 0.5 mrad from aligned."""
+
+
+def at_stretched_elbow(puma, q):
+    q = arm_families.stretched(puma.axes, crossing(puma.axes, 3, 4), 1, q, 1.0)
+    return arm_families.SingularPose(q, None, None), puma.axes.displacements(q[None])[0]
+
+
+def test_a_stretched_elbow_behind_a_wrist_that_is_nearly_aligned_is_a_continuum_to_within_the_tolerance(puma):
+    """The elbow moves by some 0.5 mrad x 0.05 rad, the goal by some (25 urad)², 6e-10: metric kinematics agrees."""
+    pose, goal = at_stretched_elbow(puma, STRETCHED_AND_NEARLY_ALIGNED)
+    found = puma.solve(goal, None)
+    assert found.outcome == "continuum"
+    assert kept_along(puma, found, goal, None)
+    assert singular_handled(pose, puma)
+
+
+def test_a_stretched_elbow_is_no_continuum_and_the_judge_takes_none_for_it(puma):
+    bent = STRETCHED_AND_NEARLY_ALIGNED - 0.3 * np.eye(6)[4]
+    pose, goal = at_stretched_elbow(puma, bent)
+    found = puma.solve(goal, None)
+    assert found.outcome == "isolated"
+    assert singular_handled(pose, puma)
+    directions = tuple(null_directions(puma.chain, np.eye(4), q) for q in found.joints)
+    assert any(map(len, directions))
+    assert not kept_along(puma, dataclasses.replace(found, self_motions=directions), goal, None)
+    assert not kept_along(puma, found, goal, None)
 
 
 def test_out_of_reach_says_which_joint_and_by_how_much():

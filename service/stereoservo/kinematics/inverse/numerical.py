@@ -23,6 +23,12 @@ HITS = 8
 """Starts that have to come to each solution before a search ends: what was found once may have unseen company."""
 TWINS = np.array([0.05, 0.2, 0.6])
 """Steps [rad] from a solution along its weakest direction, where the other one of a close pair lies."""
+POLISH = 1e-9
+"""Damping of the refinement of a candidate: next to none."""
+REFINEMENTS = 8
+VALLEY = 1e-5
+"""Residual up to which the end of a descent that solves nothing is taken for one in a valley."""
+VALLEY_ROUNDS, VALLEY_STEPS, UNDAMPED = 4, 500, 1e-15
 CLOSE = 1e-5
 """Largest difference of joints [rad or m] of two descents that came to one solution."""
 
@@ -67,14 +73,14 @@ def all_solutions(
     The search ends when every solution has been come to from ``HITS`` starts; a pair that is close to merging is
     looked for from its one half. That all are found is likely, not certain.
     """
-    known = _Known(chain, tolerance)
+    known = _Known(chain, points, targets, tolerance)
     best, least = seed, np.inf
     tried = 0
     while tried < MOST:
         starts = even_starts(chain, limits, BATCH, tried)
         if tried == 0:
             starts[0] = seed
-        ends, left = descended(chain, points, targets, starts)
+        ends, left = _along_valleys(chain, points, targets, starts, tolerance)
         tried += BATCH
         if left.min() < least:
             best, least = ends[int(np.argmin(left))], float(left.min())
@@ -86,11 +92,32 @@ def all_solutions(
     return np.array(known.joints).reshape(-1, chain.joints), np.array(known.residuals), best
 
 
+def _along_valleys(
+    chain: ProjectiveChain, points: FloatArray, targets: FloatArray, starts: FloatArray, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Ends (s, n) and residuals (s,) of descents, those that ended in a valley followed to its lowest place: near a
+    singular configuration a curve of joints nearly keeps the goal, and steps along it are short.
+    """
+    ends, left = descended(chain, points, targets, starts)
+    slow = (left > tolerance) & (left <= VALLEY)
+    for _ in range(VALLEY_ROUNDS):
+        if not slow.any():
+            break
+        before = ends[slow]
+        ends[slow], left[slow] = descended(
+            chain, points, targets, before, iterations=VALLEY_STEPS, damping=UNDAMPED
+        )
+        slow[slow] = (left[slow] > tolerance) & (np.abs(ends[slow] - before).max(axis=1) > CLOSE)
+    return ends, left
+
+
 class _Known:
     """Solutions found so far, and how many starts converged to each."""
 
-    def __init__(self, chain: ProjectiveChain, tolerance: float) -> None:
-        self.kinds, self.tolerance = chain.kinds, tolerance
+    def __init__(
+        self, chain: ProjectiveChain, points: FloatArray, targets: FloatArray, tolerance: float
+    ) -> None:
+        self.chain, self.points, self.targets, self.tolerance = chain, points, targets, tolerance
         self.joints: list[FloatArray] = []
         self.residuals: list[float] = []
         self.hits: list[int] = []
@@ -104,22 +131,46 @@ class _Known:
             # All descents that came to where the best of those left did; a pair of solutions is farther apart.
             best = int(np.argmin(left))
             here = self._near(ends, ends[best])
-            known = self._near(np.array(self.joints).reshape(-1, ends.shape[1]), ends[best])
-            if known.any():
-                i = int(np.argmax(known))
-                self.hits[i] += count * int(here.sum())
-                if left[best] < self.residuals[i]:
-                    self.joints[i], self.residuals[i] = ends[best], float(left[best])
-            else:
+            q, residual = ends[best], float(left[best])
+            i = self._index(q)
+            if i is None:
+                q, residual, stays = self._refined(q)
+                i = self._index(q)
+                if i is None and not stays and self.joints:
+                    ends, left = ends[~here], left[~here]
+                    continue
+            if i is None:
                 fresh.append(len(self.joints))
-                self.joints.append(ends[best])
-                self.residuals.append(float(left[best]))
+                self.joints.append(q)
+                self.residuals.append(residual)
                 self.hits.append(count * int(here.sum()))
+            else:
+                self.hits[i] += count * int(here.sum())
+                if residual < self.residuals[i]:
+                    self.joints[i], self.residuals[i] = q, residual
             ends, left = ends[~here], left[~here]
         return fresh
 
+    def _refined(self, q: FloatArray) -> tuple[FloatArray, float, bool]:
+        """The end ``q`` (n,) of a descent refined until it stays, its residual, and whether it does: where a solution
+        is nearly a double one, damped steps gain so little that a descent ends on its way there.
+        """
+        stays = False
+        for _ in range(REFINEMENTS):
+            before = q
+            ends, left = descended(self.chain, self.points, self.targets, q[None], damping=POLISH)
+            q = ends[0]
+            stays = bool(np.abs(q - before).max() <= 0.1 * CLOSE)
+            if stays:
+                break
+        return q, float(left[0]), stays
+
+    def _index(self, q: FloatArray) -> int | None:
+        known = self._near(np.array(self.joints).reshape(-1, len(q)), q)
+        return int(np.argmax(known)) if known.any() else None
+
     def _near(self, rows: FloatArray, q: FloatArray) -> npt.NDArray[np.bool_]:
-        difference = nearest_turns(self.kinds, rows - q, np.zeros(len(q)))
+        difference = nearest_turns(self.chain.kinds, rows - q, np.zeros(len(q)))
         return np.asarray(np.abs(difference).max(axis=1, initial=0.0) <= CLOSE, dtype=bool)
 
 

@@ -25,7 +25,7 @@ from stereoservo.kinematics.inverse.closed_forms import (
     two_parallel,
     wrist,
 )
-from stereoservo.kinematics.inverse.numerical import descended, equivalent_points, linearised
+from stereoservo.kinematics.inverse.numerical import POLISH, descended, equivalent_points, linearised
 from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
 from stereoservo.kinematics.inverse.self_motion import (
     NO_MOTION,
@@ -48,8 +48,6 @@ TOLERANCE = 1e-8
 """Residual up to which a goal counts as reached: rounding, for goals that are exact."""
 WITNESSES = 4
 """Points of a goal that are tried in the cases that work on a single one."""
-POLISH = 1e-9
-"""Damping of the refinement of a candidate: next to none."""
 RIGID = 3
 """Number of points from which a goal shows whether it is a rigid motion."""
 ROUNDING = 1e-9

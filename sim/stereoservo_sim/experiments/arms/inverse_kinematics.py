@@ -38,6 +38,9 @@ LEAST_DRAWN = 1e-17
 WALK = 0.3
 """Motion [rad] along a self-motion that has to leave the goal reached."""
 
+KEPT = 0.05
+"""Motion [rad] along a self-motion of a singular pose that has to leave the goal reached."""
+
 THESIS = "chapter 6 derives the solutions and prints no figure of their accuracy"
 
 
@@ -186,7 +189,12 @@ def differences(axes: EuclideanAxes, right: FloatArray, joints: FloatArray) -> F
 
 
 def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
-    """Whether the result at a singular pose reaches it and reports the free joint, or is the isolated solution."""
+    """Whether the result at a singular pose reaches it and reports the free joint, or is the isolated solution.
+
+    Where a wrist is nearly aligned (``w`` rad from it) before a stretched elbow, the elbow has to move in proportion to
+    ``w`` times the wrist's turn, and the goal is left by the order of the square of that: a continuum to within the
+    tolerance, if metric kinematics confirms it.
+    """
     goal = hidden.axes.displacements(pose.joints[None])[0]
     answer = hidden.solve(goal, pose.point)
     if not answer.reached or answer.residuals.max() > SOLVED:
@@ -194,7 +202,27 @@ def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
     if pose.free is not None:
         return answer.outcome == "continuum" and any(pose.free in free for free in answer.free_joints)
     apart = differences(hidden.axes, pose.joints[None], answer.joints - hidden.chain.zero)
-    return bool(apart[0] <= 1e-3 and answer.outcome == "isolated")
+    return bool(apart[0] <= 1e-3) and (
+        answer.outcome == "isolated" or kept_along(hidden, answer, goal, pose.point)
+    )
+
+
+def kept_along(hidden: Hidden, answer: InverseSolutions, goal: FloatArray, point: FloatArray | None) -> bool:
+    """Whether metric forward kinematics is at the ``goal`` (4, 4), or at what it does to ``point`` (3,), all along the
+    self-motions of ``answer``, over `KEPT` either way; False where it has none.
+    """
+    back = np.linalg.inv(hidden.frame)
+    points = np.eye(4) if point is None else (hidden.frame @ np.append(point, 1.0))[None]
+    targets = points @ (hidden.frame @ goal @ back).T
+    kept = []
+    for q, motions in zip(answer.joints, answer.self_motions, strict=True):
+        for motion in (sense * motion for motion in motions for sense in (1.0, -1.0)):
+            ahead = corrected(hidden.chain, points, targets, q + KEPT * motion, SOLVED)[0]
+            pose = hidden.axes.displacements((ahead - hidden.chain.zero)[None])[0]
+            left = points @ (hidden.frame @ pose @ back).T - targets
+            reached = np.linalg.norm(left) <= SOLVED * np.linalg.norm(targets)
+            kept.append(bool(reached and (ahead - q) @ motion > 0.5 * KEPT))
+    return bool(kept) and all(kept)
 
 
 def unreachable_handled(hidden: Hidden, family: ArmFamily, rng: np.random.Generator) -> bool:
