@@ -84,7 +84,9 @@ class TagOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refinement: Refinement = "pattern"
     """How corners are made exact: ``pattern`` fits the whole printed tag; the others are OpenCV's."""
     floor_px: Annotated[float, Meta(ge=0)] | None = None
-    """Systematic standard deviation [px], part of every covariance. Default: that of the refinement."""
+    """Systematic standard deviation [px], part of every covariance: where residuals of ``pattern`` tell of misfit, that
+    counts as part of it. Default: that of the refinement.
+    """
     image_size: tuple[int, int] | None = None
     """(width, height) [px] that frames must have; default: that of the first frame."""
     max_prior_age_s: Annotated[float, Meta(gt=0)] = 0.25
@@ -261,15 +263,16 @@ class TagDetector:
     def _measured(
         self, image: ImageArray, tag: int, quad: FloatArray, blur_px: float = FIRST_BLUR_PX
     ) -> _Found | None:
-        floor = self._floor_px**2 * np.eye(2)
+        variance = self._floor_px**2
         if self.options.refinement == "pattern":
             fit = register_tag(image, quad, self._cells[tag], blur_px)
             if fit is None or fit.contrast < self.options.min_contrast:
                 return None
-            return _Found(fit.corners, fit.covariances + floor)
+            # of misfit that the fit has seen, only what is less than the floor is added again
+            return _Found(fit.corners, fit.covariances + max(variance - fit.misfit, 0.0) * np.eye(2))
         if self.options.refinement == "apriltag":
             quad = quad - APRILTAG_OFFSET
-        return _Found(quad, np.tile(floor, (4, 1, 1)))
+        return _Found(quad, np.tile(variance * np.eye(2), (4, 1, 1)))
 
     def _observation(self, frame: Frame, found: Mapping[int, _Found]) -> CameraObservation:
         ids = np.array([marker for tag in found for marker in self._ids[tag]], dtype=np.int64)

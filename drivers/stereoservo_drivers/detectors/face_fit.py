@@ -119,12 +119,26 @@ def _remove_shift(pattern, radius, raw, used, H, dots):
 
 
 @kernel
+def _deviation(dots, used, dark, bright):
+    """Standard deviation [px] of a dot that is ``used`` (n,), in the mean, for noise variances on black and white."""
+    variance, count = 0.0, 0
+    for i in range(used.size):
+        if used[i]:
+            own, light = dots[i, CXX] + dots[i, CYY], dots[i, BXX] + dots[i, BYY]
+            variance += 0.5 * (dark * (own - light) + bright * light + dots[i, EXX] + dots[i, EYY])
+            count += 1
+    return np.sqrt(max(variance, 0.0) / max(count, 1))
+
+
+@kernel
 def settle_face(pattern, radius, dots, used, tolerance, least):
     """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to
     the dots' own.
 
-    Uneven light is taken back. Rows of ``used`` that do not fit the others are cleared (of five or more; four are
-    taken as they are); all are, where fewer than ``least`` remain. The picture of a circle's centre is not the centre
+    Uneven light is taken back. A dot whose light differs from the others' by so much that it may be off by more than
+    ``tolerance`` [px], half hidden or run into by something, is left out: nothing could tell whether it fits. Rows of
+    ``used`` that do not fit the others are cleared (of five or more; four are taken as they are); all are, where fewer
+    than ``least`` remain beside the one left out. The picture of a circle's centre is not the centre
     of its picture; the face's homography tells the difference, no camera needed. Returns the number that remains.
     """
     n = pattern.shape[0]
@@ -152,15 +166,16 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
     inside = max(median(dots[:, BRIGHT], used), dark)
     bright = max(inside - tolerance_inside * tolerance_inside, dark)
     # slopes inside have that misfit, too
-    flat_field(areas, used, dark, inside, dots, raw)
-    variance = 0.0
+    unlike = flat_field(areas, used, dark, inside, dots, raw)
+    if unlike >= 0 and min(dots[unlike, EXX], dots[unlike, EYY]) > tolerance * tolerance:
+        used[unlike] = False
+        count -= 1
+        least = min(least, count)
     for i in range(n):
         if used[i]:
-            own, light = dots[i, CXX] + dots[i, CYY], dots[i, BXX] + dots[i, BYY]
-            variance += 0.5 * (dark * (own - light) + bright * light + dots[i, EXX] + dots[i, EYY])
             dots[i, 0] = raw[i, 0]
             dots[i, 1] = raw[i, 1]
-    sigma = np.sqrt(max(variance, 0.0) / count)
+    sigma = _deviation(dots, used, dark, bright)
     # twice: a first shift under the homography of the ellipses' centres, which hardly differs, then the
     # checked one
     for step in range(2):

@@ -237,7 +237,8 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
     """Correct the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) for uneven light.
 
     ``areas`` (n,) [px²] as the face's homography predicts them. Adds to EXX .. EYY what remains uncertain: the slopes,
-    and for a dot whose light does not fit the others' as much as the missing part of its rim would move it.
+    and for a dot whose light does not fit the others' as much as the missing part of its rim would move it. Returns
+    that dot's row, -1 where there is none.
     """
     n = used.size
     values = np.zeros(n)
@@ -252,7 +253,7 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
             flux_noise += (dots[i, FLUX_NOISE] / dots[i, FLUX]) ** 2
             count += 1
     if count == 0 or total <= 0.0:
-        return
+        return -1
     for i in range(n):
         values[i] *= count / total
     outlier = _known(dots, values, used, dark_noise * flux_noise / count, PRINT_CONTRAST, plane, slope)
@@ -273,7 +274,7 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
             dots[outlier, EYY] += away
         if bend > 0.0:
             # light that bends within a dot's size does so on black as on white
-            return
+            return max(outlier, -1)
     for i in range(n):
         values[i] = dots[i, BACKGROUND]
     # the level of some sixty pixels
@@ -286,3 +287,4 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
                 _add_covariance(
                     dot, dot[DARK], dot[DARK + 1], dot[DARK + 2], dot[DARK + 3], slope[2], slope[3], slope[4]
                 )  # fmt: skip
+    return max(outlier, -1)

@@ -458,8 +458,8 @@ def _clustered(grey, us, vs, cells, p, huber, B):
 @kernel
 def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
     """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
-    where the gradient's covariance ``B`` (13, 13) is more than that of such noise; False: the normal equations are
-    singular.
+    where the gradient's covariance ``B`` (13, 13) is more than that of such noise. Returns the variance [px²] that this
+    adds, in the mean over the coordinates; -1 where the normal equations are singular.
     """
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)
     N, C = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
@@ -472,7 +472,7 @@ def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
         e[a] = 1.0
         if a == 0:
             if not cholesky_solve(N, e, column) > 0.0:
-                return False
+                return -1.0
         else:
             factor_solve(N, e, column)
         for c in range(PARAMETERS):
@@ -486,7 +486,7 @@ def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
         for c in range(8):
             for k in range(PARAMETERS):
                 M[a, c] += half[a, k] * C[k, c]
-    seen = 0.0
+    seen, mean = 0.0, 0.0
     back = np.zeros((2, 8))
     for k in range(4):
         x, y = SQUARE[k, 0], SQUARE[k, 1]
@@ -497,7 +497,7 @@ def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
         a, b, c, d = h[0] - x * h[6], h[1] - x * h[7], h[3] - y * h[6], h[4] - y * h[7]
         determinant = a * d - b * c
         if not abs(determinant) > 1e-12:
-            return False
+            return -1.0
         for i in range(3):
             local = u if i == 0 else (v if i == 1 else 1.0)
             back[0, i], back[1, i] = d * local / determinant, -c * local / determinant
@@ -514,16 +514,18 @@ def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
                         real += back[i, s] * M[s, t] * back[j, t]
                 covariances[k, i, j] = total * variance * side * side
                 if i == j:
+                    mean += 0.125 * covariances[k, i, j]
                     seen += 0.125 * real / max(total * variance, 1e-30)
-    covariances *= max(seen, 1.0)
-    return True
+    more = max(seen - 1.0, 0.0)
+    covariances *= 1.0 + more
+    return more * mean
 
 
 @kernel
 def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     """Fit the pattern of ``cells`` (n, n) to an image (h, w) about ``start`` (4, 2) [px], with a blur of ``blur_px`` at
-    first: ``corners`` (4, 2), ``covariances`` (4, 2, 2), and in ``told`` (4,) noise variance, contrast, blur and
-    correlation.
+    first: ``corners`` (4, 2), ``covariances`` (4, 2, 2), and in ``told`` (5,) noise variance, contrast, blur,
+    correlation, and the part of the covariances [px²] that is misfit.
 
     False where the fit cannot be believed.
     """
@@ -573,7 +575,10 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     B = np.empty((PARAMETERS, PARAMETERS))
     _clustered(grey[:m], us[:m], vs[:m], cells, p, huber, B)
     h[:8] = p[:8]
-    if not inverse_of(h, g) or not _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
+    if not inverse_of(h, g):
+        return False
+    told[4] = _corners(h, g, A, B, variance, u0, v0, side, corners, covariances)
+    if not told[4] >= 0.0:
         return False
     shift = 0.0
     for k in range(4):

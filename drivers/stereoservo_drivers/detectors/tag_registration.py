@@ -28,7 +28,8 @@ class Registered:
     """A tag found in its place: ``corners`` (4, 2) [px] and their ``covariances`` (4, 2, 2) [px²], those of the noise.
 
     ``noise_variance`` [levels²] of the fit's residuals, ``contrast`` [levels] between white and black at the middle,
-    ``blur`` [px], ``correlation`` of pattern and image.
+    ``blur`` [px], ``correlation`` of pattern and image; ``misfit`` [px²]: what residuals that are alike within a cell
+    add to the covariances.
     """
 
     corners: FloatArray
@@ -37,6 +38,7 @@ class Registered:
     contrast: float
     blur: float
     correlation: float
+    misfit: float
 
 
 def register_tag(
@@ -47,7 +49,7 @@ def register_tag(
     None where the fit cannot be believed: the grey values do not follow the pattern, a cell is not what the code
     says, a corner moved by more than a cell.
     """
-    corners, covariances, told = np.empty((4, 2)), np.empty((4, 2, 2)), np.empty(4)
+    corners, covariances, told = np.empty((4, 2)), np.empty((4, 2, 2)), np.empty(5)
     start = np.ascontiguousarray(start, dtype=np.float64)
     if not fit_tag(np.ascontiguousarray(image), start, cells, blur_px, corners, covariances, told):
         return None

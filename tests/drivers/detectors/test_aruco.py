@@ -11,7 +11,7 @@ from stereoservo.ports.devices import DriverContext, DriverError, Prior
 from stereoservo_drivers.detectors.aruco import TagDetector
 from stereoservo_drivers.detectors.tag_registration import DICTIONARIES, size_of, tag_cells
 
-from .rendering import project
+from .rendering import digitise, project
 from .scenes import Still, as_frame, normalised, rms
 from .tag_rendering import CORNERS, TagScene, printed, tag_view
 
@@ -118,6 +118,24 @@ def test_covariances_are_the_scatter_of_a_thousand(noise):
     _, squares = measured(np.random.default_rng(3), n, noise=noise)
     total = squares.reshape(n, 4).sum(axis=1)
     assert abs(total.mean() - 8.0) < 4 * np.sqrt(128.0 / n) + 0.8
+
+
+def test_misfit_that_the_residuals_tell_is_not_stated_twice():
+    """A shadow's soft edge over the tag, which no plane of light is, adds more than the floor, which stands for misfit
+    that is not seen; in even light the floor is added, but for what the scatter of the residuals is beyond one by
+    chance.
+    """
+    rng = np.random.default_rng(31)
+    clean = TagScene([(print_of(2), tag_view(80, 30, 1.0, 0.4, (320, 240)))]).clean()
+    shadow = 1.0 - 0.35 / (1.0 + np.exp((320.0 - np.arange(640)) / 3.0))
+    bare, floored = make_detector(tags=[2], floor_px=0.0), make_detector(tags=[2], floor_px=0.02)
+    for light, more in ((shadow, 0.0), (np.ones(640), 0.02**2)):
+        frame = as_frame(digitise(clean * light, 2.0, rng))
+        without, with_floor = (detector.detect(frame, None) for detector in (bare, floored))
+        assert without.ids.tolist() == [8, 9, 10, 11]
+        np.testing.assert_array_equal(without.pixels, with_floor.pixels)
+        added = with_floor.covariances - without.covariances
+        np.testing.assert_allclose(added, np.tile(more * np.eye(2), (4, 1, 1)), atol=0.1 * 0.02**2)
 
 
 # Identity
