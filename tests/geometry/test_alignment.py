@@ -17,7 +17,6 @@ from stereoservo.geometry.alignment import (
     family_between,
     point_residuals,
     reprojected,
-    similarity_from_points,
 )
 from stereoservo.geometry.cameras import (
     pixel_normaliser,
@@ -25,6 +24,7 @@ from stereoservo.geometry.cameras import (
     triangulate,
     triangulation_covariance,
 )
+from stereoservo.geometry.displacements import similarity_from_points
 from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import carried_point_covariance
 from stereoservo.geometry.strata import euclidean_to_projective

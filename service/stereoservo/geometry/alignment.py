@@ -23,6 +23,7 @@ from stereoservo.geometry.cameras import (
     triangulate,
     triangulation_covariance,
 )
+from stereoservo.geometry.displacements import similarity_from_points
 from stereoservo.geometry.homogeneous import GeometryError, move_points, to_homogeneous, whitener
 from stereoservo.geometry.homography import linear_homography, pixel_whitening, unit_determinant
 from stereoservo.geometry.moved_cameras import (
@@ -40,8 +41,6 @@ ITERATIONS = 30
 HALVINGS = 8
 CONVERGED = 1e-9
 """Step, in units of the points' spread, at which the fit ends."""
-STRAIGHT = 1e-6
-"""Second singular value of points on one line, relative to the first."""
 
 
 @dataclass(frozen=True)
@@ -89,30 +88,6 @@ def upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[
     if found[0] is None or found[1] is None:
         raise GeometryError("stratum", f"a {family} map needs two frames whose {pairs[family]} is known")
     return found[0], found[1]
-
-
-def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> FloatArray:
-    """``T`` (4, 4), proper, of least squares from points ``(n, 3)`` to ``(n, 3)``; ``scaled``: its scale is free.
-
-    Raises GeometryError for fewer than three points and points on one line.
-    """
-    if len(X) < 3:
-        raise GeometryError("too_few", f"{len(X)} points; a rigid motion needs at least 3", points=len(X))
-    middle_X, middle_Y = X.mean(axis=0), Y.mean(axis=0)
-    x, y = X - middle_X, Y - middle_Y
-    for name, centred in (("first", x), ("second", y)):
-        singular = np.linalg.svd(centred, compute_uv=False)
-        if not singular[1] > STRAIGHT * singular[0]:
-            raise GeometryError(
-                "degenerate", f"the {name} points lie on one line: a turn about it stays open"
-            )
-    U, singular, Vt = np.linalg.svd(y.T @ x)
-    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    T = np.eye(4)
-    scale = float(np.sum(singular * proper) / np.sum(x * x)) if scaled else 1.0
-    T[:3, :3] = scale * (U * proper) @ Vt
-    T[:3, 3] = middle_Y - T[:3, :3] @ middle_X
-    return T
 
 
 def affinity_from_points(X: FloatArray, Y: FloatArray) -> FloatArray:

@@ -1,5 +1,5 @@
 """Projective displacements of revolute and prismatic joints: exponentials of their generators in closed form, the
-exact generator nearest to a measured matrix, change of frame (thesis 3, 4).
+exact generator nearest to a measured matrix, change of frame (thesis 3, 4); and the Euclidean one of points.
 
 A revolute generator ``Ĥ`` (4, 4) has eigenvalues (0, 0, i, −i): ``Ĥ³ = −Ĥ``. A prismatic one is nilpotent:
 ``Ĥ² = 0``. Displacements act on points from the left; conjugates in a projective frame of Euclidean ones.
@@ -119,3 +119,31 @@ def conjugate(H: FloatArray, G: FloatArray) -> FloatArray:
     """
     moved: FloatArray = H @ G @ np.linalg.inv(H)
     return moved
+
+
+STRAIGHT = 1e-6
+"""Second singular value of points on one line, relative to the first."""
+
+
+def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> FloatArray:
+    """``T`` (4, 4), proper, of least squares from points ``(n, 3)`` to ``(n, 3)``; ``scaled``: its scale is free.
+
+    Raises GeometryError for fewer than three points and points on one line.
+    """
+    if len(X) < 3:
+        raise GeometryError("too_few", f"{len(X)} points; a rigid motion needs at least 3", points=len(X))
+    middle_X, middle_Y = X.mean(axis=0), Y.mean(axis=0)
+    x, y = X - middle_X, Y - middle_Y
+    for name, centred in (("first", x), ("second", y)):
+        singular = np.linalg.svd(centred, compute_uv=False)
+        if not singular[1] > STRAIGHT * singular[0]:
+            raise GeometryError(
+                "degenerate", f"the {name} points lie on one line: a turn about it stays open"
+            )
+    U, singular, Vt = np.linalg.svd(y.T @ x)
+    proper = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    T = np.eye(4)
+    scale = float(np.sum(singular * proper) / np.sum(x * x)) if scaled else 1.0
+    T[:3, :3] = scale * (U * proper) @ Vt
+    T[:3, 3] = middle_Y - T[:3, :3] @ middle_X
+    return T

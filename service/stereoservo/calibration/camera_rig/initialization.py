@@ -21,8 +21,8 @@ from stereoservo.calibration.stratum_upgrade import (
     scaled_plane,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.geometry.alignment import similarity_from_points
 from stereoservo.geometry.cameras import pixel_normaliser
+from stereoservo.geometry.displacements import similarity_from_points
 from stereoservo.geometry.distortion import lens_from_lines, straight_lens, undistort
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.homography import homography_from_points, plane_homography

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.geometry.alignment import similarity_from_points
+from stereoservo.geometry.displacements import similarity_from_points
 from stereoservo.geometry.homogeneous import GeometryError, from_homogeneous, move_points
 from stereoservo.kinematics.kernels import (
     exp_twist,
@@ -434,9 +434,10 @@ def find_stated(
     start = np.eye(4)
     if arrays.to_euclidean is not None:
         there, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
-        both = known > 0.0
         H = arrays.to_euclidean
-        before, now = (from_homogeneous(move_points(H, M[both])) for M in (points, there))
+        before, now = (from_homogeneous(move_points(H, M)) for M in (points, there))
+        both = (known > 0.0) & np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
+        before, now = before[both], now[both]
         try:
             start = np.linalg.inv(H) @ similarity_from_points(before, now, scaled=False) @ H
         except GeometryError:  # too few by two cameras, or on a line: from where it was
