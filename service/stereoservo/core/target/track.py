@@ -195,9 +195,8 @@ def _find(
     points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
     pixels, _ = project_points(arrays.matrices, points)
     apart = np.sqrt(((pixels - there) ** 2).sum(axis=-1)) * shown
-    wrong = (known > 0.0) & ~(
-        apart.max(axis=0) <= FOUND_REST_PX
-    )  # rays that do not meet: swapped, or a reflection
+    # Rays that do not meet: markers that were swapped, or a reflection.
+    wrong = (known > 0.0) & ~(apart.max(axis=0) <= FOUND_REST_PX)
     known[wrong], shown[:, wrong] = 0.0, 0.0
     if not body.stated:
         if int(known.sum()) < FEWEST_TO_FIND:
@@ -320,9 +319,8 @@ def _follow(
         used = _explained(body, left, J, variances, seen, gate)
         if used is None:
             return
-    if (
-        sudden and body.carried
-    ):  # what the other cameras' newest frames were compared with was not where it is
+    if sudden and body.carried:
+        # What the other cameras' newest frames were compared with was not where it is.
         for sighting in state.watching.sightings:
             sighting.t_ns = 0
     _fold(body, left, J, view, variances, used, ROUNDS if sudden else 1)

@@ -136,15 +136,12 @@ class _Known:
             if i is None:
                 q, residual, stays = self._refined(q)
                 i = self._index(q)
-                if i is None and not stays and self.joints:
-                    ends, left = ends[~here], left[~here]
-                    continue
-            if i is None:
-                fresh.append(len(self.joints))
-                self.joints.append(q)
-                self.residuals.append(residual)
-                self.hits.append(count * int(here.sum()))
-            else:
+                if i is None and (stays or not self.joints):
+                    fresh.append(len(self.joints))
+                    self.joints.append(q)
+                    self.residuals.append(residual)
+                    self.hits.append(count * int(here.sum()))
+            if i is not None:
                 self.hits[i] += count * int(here.sum())
                 if residual < self.residuals[i]:
                     self.joints[i], self.residuals[i] = q, residual
