@@ -100,6 +100,7 @@ class Numbers(ctypes.Structure):
     tells_efforts: int
     tells_following: int
     rows: int
+    round_due: int
     run: RunProgress
     _fields_ = [
         (name, {"float": ctypes.c_double, "RunProgress": RunProgress}.get(kind, ctypes.c_int64))
@@ -172,12 +173,6 @@ def views(record: np.ndarray[Any, Any], arrays: Shapes, counts: Mapping[str, int
 BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, {part: kind for part, (kind, _) in CAMERAS.items()})
 
 
-def head_of(record: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """The bytes (k,) of a ``record`` (1,) before its large arrays, from ``history_ns`` on, as a view."""
-    assert BLOCK.fields is not None
-    return record.view(np.uint8)[: BLOCK.fields["history_ns"][1]]
-
-
 class Block:
     """What is remembered; ``record`` (1,) of type `BLOCK` is all of it, and what kernels take.
 
@@ -202,7 +197,8 @@ class Block:
     ``leave_s`` of motion. ``efforts``, ``following_errors`` (n,) of the sample at ``loads_ns``, where it tells
     them.
 
-    Cameras: ``estimates`` and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns``
+    Cameras: ``round_due``: one has given two frames since the last round, the others are not waited for; ``estimates``
+    and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns``
     (c, m), and ``frame_…`` (c, k, …) for the newest frames, have the arrays, a row a camera.
     """
 

@@ -13,15 +13,12 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law import Law
-from stereoservo.core.camera_state import CameraEstimate
-from stereoservo.core.cycle import StepInputs
+from stereoservo.core.cycle import Event, StepInputs
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.prediction import Prediction
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.core.workspace import Workspace
-from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Health
@@ -56,14 +53,6 @@ class Derived:
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
     """What the status last said of the model's health, and of what."""
-    seen: tuple[list[CameraEstimate], dict[str, float], dict[str, int]] | None = None
-    """What the status last said of each camera, by name: of which estimates, their innovation, the markers visible."""
-    friction_bounds: tuple[CellModel | None, FloatArray, FloatArray] | None = None
-    """Largest compensation and least travel of the joints (n,), as of `core.move`, and the model by which they are."""
-    monitors: tuple[tuple[Any, ...], bool] | None = None
-    """`core.monitor.MONITORS` as they last were, and whether `core.fast_path` knows them all."""
-    model_health: tuple[tuple[object, ...], bytes, tuple[ModelDiagnosis, Health]] | None = None
-    """The diagnosis and the health that the status last showed: of what, and with which markers left out."""
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""
@@ -88,37 +77,67 @@ class Ingested(msgspec.Struct, frozen=True, eq=False):
     stops: tuple[Reason, ...]
 
 
-class StepContext(msgspec.Struct, eq=False):
-    """One step as its stages and the motion sources see it.
+NOTHING = Ingested(None, (), 0.0, None, (), None, ())
 
-    `ingest` sets ``ingested`` and the measured joints ``q`` (n,); `estimate` the rest, of which ``prediction``,
-    ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) need a model. `move` sets ``paused``: the active source had
-    to wait, and ``outermost`` (n,): where joints are, or with late drives will be, farthest towards where they go.
-    `core.fast_path` has ``looked`` at the step, which was ``plain``: nothing stands that is to be told in every step.
-    ``features_ns``: shutter time of the newest frame with accepted markers, 0 before the first.
-    ``goals_read``: ids of the goals that were looked at in this step: one at most, for it is work.
+
+class StepContext:
+    """A step as Python sees it: its inputs, the state, and views of what kernels have found so far. One object serves
+    all steps of a core; what a goal is to keep of a step, it copies. ``ingested``: what of the inputs has passed, in
+    steps in which Python looks at them.
+
+    `core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) of the
+    markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at most, for it
+    is work. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing
+    did. ``moved_arrays``: the model with a body that is a target where it is now.
     """
 
-    inputs: StepInputs
-    now_ns: int
-    dt_s: float
-    state: CoreState
-    settings: CoreSettings
-    derived: Derived
-    emit: Emit
-    q: FloatArray
-    ingested: Ingested
-    observations: tuple[CameraObservation, ...] = ()
-    arrays: ModelArrays | None = None
-    prediction: Prediction | None = None
-    weights: FloatArray | None = None
-    pixels: FloatArray | None = None
-    paused: bool = False
-    looked: bool = False
-    plain: bool = False
-    outermost: FloatArray | None = None
-    features_ns: int = 0
-    goals_read: list[str] = []
+    def __init__(
+        self, state: CoreState, settings: CoreSettings, derived: Derived, inputs: StepInputs
+    ) -> None:
+        self.state, self.settings, self.derived = state, settings, derived
+        self.events: list[Event] = []
+        self.goals_read: list[str] = []
+        self.begin(inputs)
+
+    def begin(self, inputs: StepInputs) -> None:
+        """Nothing is known yet of a step but its inputs."""
+        self.inputs, self.now_ns = inputs, inputs.now_ns
+        # Whatever the last period was, a command may change by one step of the next.
+        self.dt_s = min(inputs.period_ns, self.derived.nominal_period_ns) * 1e-9
+        self._q: FloatArray | None = None
+        self.ingested = NOTHING
+        self.arrays: ModelArrays | None = None
+        self.moved_arrays: ModelArrays | None = None
+        self.prediction: Prediction | None = None
+        self.weights: FloatArray | None = None
+        self.pixels: FloatArray | None = None
+        self.output: SourceOutput | None = None
+        if self.goals_read:
+            self.goals_read = []
+        if self.events:
+            self.events = []
+
+    def emit(self, kind: str, **fields: Any) -> None:
+        """Append an event to the step's outputs: its kind, and the event's other fields by keyword."""
+        self.state.event_seq += 1
+        self.events.append(Event(self.state.event_seq, self.now_ns, kind, **fields))  # type: ignore[arg-type]
+
+    @property
+    def q(self) -> FloatArray:
+        """The measured joints (n,), of this step alone."""
+        if self._q is None:
+            self._q = self.derived.room.q.copy()
+        return self._q
+
+    @property
+    def observations(self) -> tuple[CameraObservation, ...]:
+        """The frames that have passed, where Python looks at the step's inputs."""
+        return tuple([observation for _, observation in self.ingested.observations])
+
+    @property
+    def paused(self) -> bool:
+        """Whether the active source has to wait in this step."""
+        return bool(self.derived.room.numbers.paused)
 
 
 class Finding(msgspec.Struct, frozen=True):

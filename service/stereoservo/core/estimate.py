@@ -9,6 +9,7 @@ kinematics (`core.prediction`), so that control goes on between frames and throu
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from stereoservo.core.block import HISTORY
 from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays, model_arrays, require_fitting
+from stereoservo.core.ingest import TAKEN, newest_frames
+from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays, require_fitting
 from stereoservo.core.monitor_state import MOVED
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
@@ -26,7 +28,8 @@ from stereoservo.core.prediction import (
     HUBER,
     MODEL_SIGMA_PX,
     TIMING_SIGMA_S,
-    FrameResiduals,
+    Predicted,
+    arm_of,
     camera_chi2,
     distance2,
     joint_step,
@@ -43,45 +46,85 @@ from stereoservo.core.state import CoreState, share_sights
 from stereoservo.core.target import track
 from stereoservo.core.workspace import LENS_SIZE, Workspace
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.messages.status import ModelReadiness
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray, Record
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
-from stereoservo.ports.devices import CameraObservation
 
 AT_REST = 1e-3
 """[rad/s or m/s]"""
 
 
-def estimate(context: StepContext) -> StepContext:
-    """The context with the present in it: model, prediction, weights and pixels of the markers."""
-    if context.inputs.model_update is not None or context.state.pending_model is not None:
-        _take_model(context)
-    for sighting in context.state.watching.sightings:
+@kernel
+def estimate(block: Record, room: Record) -> None:
+    """Stage 2: the frames in the ``room`` that passed are folded into the estimates of their cameras, those that Python
+    has not looked at; then the present is predicted.
+    """
+    memory, work = block[0], room[0]
+    if work.frames_apart == 0:
+        for c in range(memory.cameras):
+            memory.sightings[c].fresh = False
+        for k in range(work.frames):
+            if work.arrived_found[k] == TAKEN:
+                take_frame(block, room, k)
+    if memory.history_count > 0:
+        present(block, room)
+
+
+@kernel
+def note_frames(block: Record, room: Record) -> None:
+    """Stage 2 of a cell without a model: of the frames that passed their numbers, and how many markers they show."""
+    memory, work = block[0], room[0]
+    for c in range(memory.cameras):
+        memory.sightings[c].fresh = False
+    for k in range(work.frames):
+        if work.arrived_found[k] == TAKEN:
+            note_frame(block, room, k)
+
+
+@kernel
+def note_frame(block: Record, room: Record, k: int) -> None:
+    """Frame ``k`` in the ``room`` is the newest one of its camera."""
+    work = room[0]
+    estimate = block[0].estimates[work.arrived_camera[k]]
+    estimate.last_seq, estimate.last_visible = work.arrived_seq[k], work.arrived_count[k]
+
+
+def take_frames_apart(context: StepContext) -> None:
+    """The frames of cells with cameras that may move, or with a target that is followed: Python looks at them one after
+    the other, and `estimate` at none.
+    """
+    state, room = context.state, context.derived.room
+    for sighting in state.watching.sightings:
         sighting.fresh = False
-    for camera, observation in context.ingested.observations:
-        if context.state.target is not None:
-            track.take_frame(camera, observation, context)
-        fold_frame(camera, observation, context)
-    context.observations = tuple([observation for _, observation in context.ingested.observations])
-    state = context.state
-    arrays = context.derived.arrays if state.target is None else track.present_arrays(context)
-    if arrays is None or state.block.numbers.history_count == 0:
-        return context
-    context.arrays, room = arrays, context.derived.room
-    present(state.block.record, room.record, context.q, context.now_ns)
-    context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
-    if any(state.mobile):
-        context = moving_camera.step(context)
-        if context.arrays is not arrays:
-            assert context.arrays is not None
-            context.derived.use(context.arrays)
-    return context
+    found = room.arrays["arrived_found"]
+    for k, observation in enumerate(newest_frames(context.inputs)):
+        if found[k] == TAKEN:
+            camera = context.derived.cameras[observation.camera]
+            if state.target is not None:
+                track.take_frame(camera, observation, context)
+            _take_frame_apart(camera, k, observation.t_shutter_ns, context)
+    if state.target is not None:
+        context.moved_arrays = track.present_arrays(context)
+
+
+def _take_frame_apart(camera: int, k: int, t_ns: int, context: StepContext) -> None:
+    """`take_frame`, with a look at whether the camera moves."""
+    state, room = context.state, context.derived.room
+    if context.derived.arrays is None:
+        note_frame(state.block.record, room.record, k)
+        return
+    found = see_frame(state.block.record, room.record, k)
+    if found & TOLD:  # where the arm was is known, and not only expected
+        _look_for_motion(camera, t_ns, context)
+    room.arrays["unknown"][camera] = place_unknown(camera, state, context.settings)
+    fold_frame(state.block.record, room.record, k, found)
 
 
 # -- the model ----------------------------------------------------------------------------------------------
 
 
-def _take_model(context: StepContext) -> None:
+def take_model(context: StepContext) -> None:
     """A new model waits until the arm rests and no law runs, and until the kernels that it needs are loaded; then every
     estimate starts again.
     """
@@ -147,6 +190,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
         CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
     ]
     share_sights(state)
+    state.block.numbers.round_due = 0
 
 
 def fitted_readiness(model: CellModel) -> ModelReadiness:
@@ -168,34 +212,6 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 
 
 # -- frames -------------------------------------------------------------------------------------------------
-
-
-def fold_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
-    """Compare a frame with the prediction at its shutter, and fold it into its camera's estimate."""
-    state, arrays, room = context.state, context.derived.arrays, context.derived.room
-    estimate, watching, t_ns = state.cameras[camera], state.watching, observation.t_shutter_ns
-    estimate.last_seq = observation.seq
-    estimate.last_visible = observation.ids.size
-    if arrays is None:
-        return
-    # Of a camera that moves, and with joints that may be elsewhere than they tell, more is asked in between.
-    alone = state.mobile[camera] is None and arrays.joint_accuracy is None
-    found = take_frame(
-        state.block.record, room.record, camera, t_ns, observation.ids.astype(np.int64),
-        np.array(observation.pixels, np.float64, order="C"), np.array(observation.covariances, np.float64, order="C"),
-        watching.masked, alone, alone and not _unknown(camera, state, context.settings),
-    )  # fmt: skip
-    if found & TOLD and not alone:  # where the arm was is known, and not only expected
-        _look_for_motion(camera, t_ns, context)
-        found |= fold_residuals(state.block.record, room.record, camera, t_ns, watching.masked)
-    if found & WAITED:
-        watching.due = True
-    if found & TOLD and state.model is not None and state.model.shutter_offsets:
-        _follow_offset(camera, observation, context)
-    if found and not alone and not _unknown(camera, state, context.settings):
-        used, jacobian = watching.masked == 0.0, room.of_frame.jacobian[0]
-        common = common_change(estimate, room.residuals(t_ns), used, jacobian, arrays)
-        accept_sights(state.block.record, room.record, camera, t_ns, watching.masked, common)
 
 
 def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
@@ -222,38 +238,54 @@ def stated_offsets(model: CellModel) -> dict[str, int]:
     return {offset.camera: round(1e9 * offset.offset_s) for offset in model.shutter_offsets}
 
 
-def _follow_offset(camera: int, observation: CameraObservation, context: StepContext) -> None:
-    """Correct the offset of a camera's stamps by what its markers have shown in motion, within a bound.
+LEAVES, FOLLOWS_MOTION, AS_STATED = range(3)
+"""What becomes of the offset of a camera's stamps."""
 
-    Only where the trial motions have shown it, and none of the joints: play of a joint looks like a late picture. A
-    camera that was moved looks like one, too: its offset is the stated one from the verdict until it is known again,
-    and with any other verdict the offset stays. No shutter opens after its frame has come.
+
+def offset_rules(state: CoreState, settings: CoreSettings) -> list[tuple[int, int]]:
+    """What becomes of the offset of each camera's stamps, and the stated one [ns].
+
+    It is corrected only where the trial motions have shown it, and none of the joints: play of a joint looks like a
+    late picture. A camera that was moved looks like one, too: its offset is the stated one from the verdict until it
+    is known again, and with any other verdict the offset stays.
     """
-    state, model = context.state, context.state.model
-    if model is None or model.joint_accuracy is not None:
-        return
-    name = context.settings.cameras[camera].name
-    stated = stated_offsets(model).get(name)
-    if stated is None:
-        return
-    estimate, timing, verdict = (
-        state.cameras[camera],
-        state.watching.sightings[camera].timing,
-        state.watching.verdict,
-    )
-    if _unknown(camera, state, context.settings) or (verdict.kind in NO_STAMPS and name in verdict.subjects):
+    model, verdict = state.model, state.watching.verdict
+    if model is None or model.joint_accuracy is not None or not model.shutter_offsets:
+        return [(LEAVES, 0) for _ in settings.cameras]
+    offsets = stated_offsets(model)
+    rules = []
+    for c, camera in enumerate(settings.cameras):
+        doubtful = verdict.kind in NO_STAMPS and camera.name in verdict.subjects
+        rule = FOLLOWS_MOTION if verdict.kind == "ok" else LEAVES
+        if camera.name not in offsets:
+            rule = LEAVES
+        elif doubtful or place_unknown(c, state, settings):
+            rule = AS_STATED
+        rules.append((rule, offsets.get(camera.name, 0)))
+    return rules
+
+
+@kernel
+def _follow_offset(block: Record, room: Record, k: int) -> None:
+    """Correct the offset of a camera's stamps by what its markers have shown in motion, within a bound: see
+    `offset_rules`. No shutter opens after its frame ``k`` has come.
+    """
+    memory, work = block[0], room[0]
+    camera = work.arrived_camera[k]
+    rule, stated = work.offset_rule[camera], work.stated_offset_ns[camera]
+    estimate, timing = memory.estimates[camera], memory.sightings[camera].timing
+    if rule == AS_STATED:
         estimate.offset_ns, timing.product, timing.square = stated, 0.0, 0.0
+    if rule != FOLLOWS_MOTION or timing.square < FOLLOWED_DEVIATION_S**-2:
         return
-    if timing.square < FOLLOWED_DEVIATION_S**-2 or verdict.kind != "ok":
-        return
-    bound = round(1e9 * FOLLOWED_S)
-    latest = min(stated + bound, context.now_ns - observation.t_shutter_ns)
-    offset = estimate.offset_ns + round(1e9 * timing.product / timing.square)
+    bound = np.int64(round(1e9 * FOLLOWED_S))
+    latest = min(stated + bound, work.now_ns - work.arrived_ns[k])
+    offset = estimate.offset_ns + np.int64(round(1e9 * timing.product / timing.square))
     estimate.offset_ns = min(max(offset, stated - bound), latest)
     timing.product = timing.square = 0.0
 
 
-def _unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
+def place_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
     """Whether the place of a camera is not known: it is being found again, or it moves now."""
     mobile = state.mobile[camera]
     if mobile is not None and mobile.moving:
@@ -278,108 +310,91 @@ def masked_ids(state: CoreState) -> tuple[int, ...]:
 AGREEING_PX = 1.5
 
 
-KNOWN, TOLD, WAITED = 1, 2, 4
-"""What `take_frame` has found, added up: the joints are known at the shutter, and by samples on both sides of it; the
-camera's frame before has not been looked at yet.
-"""
+KNOWN, TOLD = 1, 2
+"""What `see_frame` has found, added up: the joints are known at the shutter, and by samples on both sides of it."""
 
 
 @kernel
-def take_frame(
-    block: Record, room: Record, camera: int, t_ns: int, ids: IntArray, pixels: FloatArray, covariances: FloatArray,
-    masked: FloatArray, watched: bool, used: bool,
-) -> int:  # fmt: skip
-    """Take a frame of ``camera``, stamped ``t_ns``: ``ids`` (k,) at raw ``pixels`` (k, 2) with ``covariances``
-    (k, 2, 2). What was found; nothing else happens where the joints then are not known.
-
-    Where it is ``watched`` and the joints are told it goes to the monitors, where it is ``used`` into the estimate;
-    both without the markers that are ``masked`` (m,) > 0.
-    """
-    memory = block[0]
-    shutter_ns = t_ns + memory.estimates[camera].offset_ns
-    known, told = see_frame(block, room, camera, shutter_ns, ids, pixels, covariances)
-    if not known:
-        return 0
-    found = KNOWN
-    if told:
-        found |= TOLD
-    if told and watched:
-        found |= fold_residuals(block, room, camera, t_ns, masked)
-    if used:
-        accept_sights(block, room, camera, t_ns, masked, np.zeros((masked.size, 2)))
-    return found
+def take_frame(block: Record, room: Record, k: int) -> None:
+    """Compare frame ``k`` in the ``room`` with the prediction at its shutter, and fold it into its camera's estimate."""
+    fold_frame(block, room, k, see_frame(block, room, k))
 
 
 @kernel
-def see_frame(
-    block: Record, room: Record, camera: int, shutter_ns: int, ids: IntArray, pixels: FloatArray,
-    covariances: FloatArray,
-) -> tuple[bool, bool]:  # fmt: skip
-    """Compare a frame of ``camera``, taken at ``shutter_ns``, with the prediction; into the ``room``, what it holds of
-    the frame that was looked at last. Whether the joints are known then, and told by samples on both sides.
+def see_frame(block: Record, room: Record, k: int) -> int:
+    """Compare frame ``k`` in the ``room`` with the prediction at its shutter; into the room, what it holds of the frame
+    that was looked at last. Whether the joints are known then, and told by samples on both sides.
 
     The velocities of the joints at present are those of a frame that is newer than their last sample. Sights that the
     camera's lens cannot have made are left out.
     """
+    note_frame(block, room, k)
     memory, work = block[0], room[0]
-    n, m, rows, lens = memory.joints, memory.markers, memory.rows, work.lens_size
-    standing = 2 * rows * camera
-    return _seen_frame(
-        memory.history_ns, memory.history_positions[: HISTORY * n].reshape((HISTORY, n)), memory.history_count,
-        shutter_ns, memory.velocities[:n], work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n],
-        work.tip_first != 0, work.marker_points[: 4 * m].reshape((m, 4)),
-        work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
-        work.lenses[LENS_SIZE * camera : LENS_SIZE * camera + lens], ids, pixels, covariances, work.row_ids[:rows],
-        work.row_of[:rows], work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)),
-        work.frame_q[:n], work.operators[: 16 * n].reshape((n, 4, 4)), work.points[: 4 * m].reshape((m, 4)),
-        work.predicted[: 2 * m].reshape((1, m, 2)), work.jacobian[: 2 * m * n].reshape((1, m, 2, n)),
-        work.frame_innovation[: 2 * rows].reshape((rows, 2)), work.frame_spread[: 4 * rows].reshape((rows, 2, 2)),
-        work.frame_noise[:rows], work.frame_seen[:rows], work.frame_velocity[: 2 * rows].reshape((rows, 2)),
-    )  # fmt: skip
-
-
-@kernel
-def _seen_frame(
-    stamps: IntArray, positions: FloatArray, count: int, t_ns: int, velocities: FloatArray, generators: FloatArray,
-    kinds: KindArray, zero: FloatArray, tip_first: bool, marker_points: FloatArray, matrix: FloatArray,
-    lens: FloatArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, row_ids: IntArray, row_of: IntArray,
-    standing: FloatArray, q: FloatArray, operators: FloatArray, points: FloatArray, predicted: FloatArray,
-    jacobian: FloatArray, innovation: FloatArray, spread: FloatArray, noise: FloatArray, seen: KindArray,
-    velocity: FloatArray,
-) -> tuple[bool, bool]:  # fmt: skip
-    """Whether the joints are known then, and told by samples on both sides; into the last nine arguments: ``q`` (n,),
-    the fields of a `Prediction` of one camera, and those of `FrameResiduals`.
-    """
-    known, then = positions_at(stamps, positions, count, t_ns)
+    camera, count = work.arrived_camera[k], work.arrived_count[k]
+    n, m, rows, lens_size = memory.joints, memory.markers, memory.rows, work.lens_size
+    shutter_ns = work.arrived_ns[k] + memory.estimates[camera].offset_ns
+    stamps, positions = memory.history_ns, memory.history_positions[: HISTORY * n].reshape((HISTORY, n))
+    known, then = positions_at(stamps, positions, memory.history_count, shutter_ns)
+    q = work.frame_q[:n]
     q[:] = then
-    told, speed = velocities_at(stamps, positions, count, t_ns)
+    told, speed = velocities_at(stamps, positions, memory.history_count, shutter_ns)
     if not told:
-        speed = velocities
-    predict_into(
-        generators, kinds, zero, q, tip_first, marker_points, matrix, operators, points, predicted, jacobian
+        speed = memory.velocities[:n]
+    predicted, jacobian = (
+        work.predicted[: 2 * m].reshape((1, m, 2)),
+        work.jacobian[: 2 * m * n].reshape((1, m, 2, n)),
     )
-    rows = rows_of(ids, row_ids, row_of)
+    predict_into(
+        arm_of(room), q, work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
+        Predicted(
+            work.operators[: 16 * n].reshape((n, 4, 4)), work.points[: 4 * m].reshape((m, 4)), predicted, jacobian
+        ),
+    )  # fmt: skip
+    at = MAX_MARKERS * k
+    pixels = work.arrived_pixels[2 * at : 2 * (at + count)].reshape((count, 2))
+    covariances = work.arrived_covariances[4 * at : 4 * (at + count)].reshape((count, 2, 2))
+    row = rows_of(work.arrived_ids[at : at + count], work.row_ids[:rows], work.row_of[:rows])
+    lens = work.lenses[LENS_SIZE * camera : LENS_SIZE * camera + lens_size]
     if not (lens.size == 4 and lens[0] == 0.0):
         pixels, covariances, possible = undistort_sights(lens, pixels, covariances)
-        for k in range(rows.size):
-            if not possible[k]:
-                rows[k] = -1
-    _innovations_into(
-        rows, pixels, covariances, predicted[0], standing, jacobian[0], speed, TIMING_SIGMA_S, innovation, spread,
-        noise, seen, velocity,
+        for i in range(row.size):
+            if not possible[i]:
+                row[i] = -1
+    standing = 2 * rows * camera
+    _compare(
+        room, Sights(row, pixels, covariances), predicted[0],
+        work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)), jacobian[0], speed,
     )  # fmt: skip
-    return known, told
+    return (KNOWN if known else 0) | (TOLD if known and told else 0)
 
 
 @kernel
-def fold_residuals(block: Record, room: Record, camera: int, t_ns: int, masked: FloatArray) -> int:
-    """What the ``room`` holds of a frame is the newest one of ``camera``; `WAITED` where no round has looked at the one
-    before.
+def fold_frame(block: Record, room: Record, k: int, found: int) -> None:
+    """What the ``room`` holds of frame ``k``, of which `see_frame` has ``found`` what of the joints, goes to the
+    monitors where these are told, and into its camera's estimate where the place of that is known; nothing where the
+    joints are not known.
+    """
+    work = room[0]
+    if found & KNOWN == 0:
+        return
+    if found & TOLD:
+        fold_residuals(block, room, k)
+        _follow_offset(block, room, k)
+    if work.unknown[work.arrived_camera[k]] == 0:
+        accept_sights(block, room, k)
+
+
+@kernel
+def fold_residuals(block: Record, room: Record, k: int) -> None:
+    """What the ``room`` holds of frame ``k`` is the newest one of its camera; a round is due where none has looked at
+    the one before.
     """
     memory, work = block[0], room[0]
-    n, rows = memory.joints, memory.rows
+    n, rows, m = memory.joints, memory.rows, memory.markers
+    camera, t_ns = work.arrived_camera[k], work.arrived_ns[k]
     frame = memory.sightings[camera]
-    found = 0 if frame.looked else WAITED
+    if not frame.looked:
+        memory.round_due = 1
     frame.t_ns, frame.fresh, frame.looked = t_ns, True, False
     at, end = rows * camera, rows * (camera + 1)
     innovation = memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2))
@@ -391,17 +406,13 @@ def fold_residuals(block: Record, room: Record, camera: int, t_ns: int, masked: 
     memory.frame_q[n * camera : n * (camera + 1)] = work.frame_q[:n]
     for i in range(rows):
         seen[i] = work.frame_seen[i]
-    used = rows_in_use(seen, masked)
+    used = rows_in_use(seen, work.masked[:m])
     chi2, squares, worst, _, count = camera_chi2(innovation, spread, used, MODEL_SIGMA_PX)
     frame.chi2 = chi2 / max(2.0 * count, 1.0)
     frame.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
     u, v = (0.0, 0.0) if worst < 0 else (innovation[worst, 0], innovation[worst, 1])
     frame.worst, frame.worst_px = worst, math.sqrt(u * u + v * v)
-    timing, noise = frame.timing, work.frame_noise[:rows]
-    timing.product, timing.square, timing.seen_ns = fold_timing(
-        timing.product, timing.square, timing.seen_ns, t_ns, innovation, velocity, noise, used
-    )
-    return found
+    fold_timing(frame.timing, t_ns, Moved(innovation, velocity, work.frame_noise[:rows]), used)
 
 
 FORGETTING_S = 30.0
@@ -410,30 +421,37 @@ MOVING_PX_S = 20.0
 """Mean pixel speed below which a frame says nothing of time."""
 
 
+class Moved(NamedTuple):
+    """Of the rows of a frame: ``innovations`` (k, 2) [px], ``velocities`` (k, 2) [px/s], and the variance ``noise`` (k,)
+    [px²] of a coordinate.
+    """
+
+    innovations: FloatArray
+    velocities: FloatArray
+    noise: FloatArray
+
+
 @kernel
-def fold_timing(
-    product: float, square: float, seen_ns: int, t_ns: int, innovations: FloatArray, velocities: FloatArray,
-    noise: FloatArray, used: FloatArray,
-) -> tuple[float, float, int]:  # fmt: skip
-    """The sums of a `CameraTiming` with the rows of a frame that are ``used`` (k,) > 0.
+def fold_timing(timing: Record, t_ns: int, frame: Moved, used: FloatArray) -> None:
+    """Into the sums of a `CameraTiming`, the rows of a frame that are ``used`` (k,) > 0.
 
     The markers of a frame share what the model is off by: they count as one sight, not as k.
     """
-    k, speed, along, squared = _timing_sums(innovations, velocities, noise, used)
+    k, speed, along, squared = _timing_sums(frame, used)
     if k == 0 or speed < MOVING_PX_S * k:
-        return product, square, seen_ns
-    elapsed_s = min((t_ns - seen_ns) * 1e-9, 0.2) if seen_ns != 0 else 0.0
+        return
+    elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns != 0 else 0.0
     keep = math.exp(-elapsed_s / FORGETTING_S)
-    return keep * product + along / k, keep * square + squared / k, t_ns
+    timing.product, timing.square = keep * timing.product + along / k, keep * timing.square + squared / k
+    timing.seen_ns = t_ns
 
 
 @kernel
-def _timing_sums(
-    innovations: FloatArray, velocities: FloatArray, variances: FloatArray, used: FloatArray
-) -> tuple[int, float, float, float]:
+def _timing_sums(frame: Moved, used: FloatArray) -> tuple[int, float, float, float]:
     """How many markers of a frame are ``used`` (k,) > 0, and sums over these: pixel speeds, and of the weighted fit of
     innovations to velocities.
     """
+    innovations, velocities, variances = frame
     count, speed, product, square = 0, 0.0, 0.0, 0.0
     for i in range(variances.shape[0]):
         if not used[i] > 0.0:
@@ -448,27 +466,23 @@ def _timing_sums(
 
 
 @kernel
-def accept_sights(
-    block: Record, room: Record, camera: int, t_ns: int, masked: FloatArray, common: FloatArray
-) -> None:
-    """Gate the frame that the ``room`` holds and fold it into the camera's estimate; markers that are ``masked``
-    (m,) > 0 are left out.
+def accept_sights(block: Record, room: Record, k: int) -> None:
+    """Gate frame ``k``, of which the ``room`` holds the residuals, and fold it into its camera's estimate; markers that
+    are masked are left out.
 
-    The gate is chi-square with two freedoms on the deviation from the filtered innovation and its ``common`` change
-    (m, 2) [px], with the covariances of detector, timing and model. Near the gate a sight counts less: in the filter,
-    and in triangulation by its sigma.
+    The gate is chi-square with two freedoms on the deviation from the filtered innovation and its common change (see
+    `_common_change`), with the covariances of detector, timing and model. Near the gate a sight counts less: in the
+    filter, and in triangulation by its sigma.
     """
     memory, work = block[0], room[0]
-    m = memory.markers
-    at, end = m * camera, m * (camera + 1)
-    seen = np.empty(m, np.bool_)
+    m, camera = memory.markers, work.arrived_camera[k]
+    used = np.empty(m, np.bool_)
     for i in range(m):
-        seen[i] = work.frame_seen[i] != 0 and masked[i] == 0.0
-    accepted, rejected, squares = fold_in(
-        work.frame_innovation[: 2 * m].reshape((m, 2)), work.frame_spread[: 4 * m].reshape((m, 2, 2)), seen,
-        work.frame_noise[:m], common, t_ns, memory.innovation[2 * at : 2 * end].reshape((m, 2)), memory.sigma[at:end],
-        memory.seen_ns[at:end], work.known_s, work.filter_s, work.gate, MODEL_SIGMA_PX, FIRST_SIGHT_SIGMA_PX,
-    )  # fmt: skip
+        used[i] = work.frame_seen[i] != 0 and work.masked[i] == 0.0
+    common = np.zeros((m, 2))
+    if work.erring:
+        _common_change(block, room, camera, used, common)
+    accepted, rejected, squares = _fold_in(block, room, k, used, common)
     estimate = memory.estimates[camera]
     estimate.last_visible = accepted
     estimate.frames += 1
@@ -477,69 +491,112 @@ def accept_sights(
     estimate.agreeing_frames = estimate.agreeing_frames + 1 if agrees else 0
     estimate.rejected_frames = estimate.rejected_frames + 1 if rejected > accepted else 0
     if accepted >= 3:
-        estimate.accepted_ns = t_ns
+        estimate.accepted_ns = work.arrived_ns[k]
 
 
 COMMON_ROUNDS = 8
 """Of reweighting, in which sights that the joints do not explain lose their weight."""
 
 
-def common_change(
-    estimate: CameraEstimate, sights: FrameResiduals, used: BoolArray, jacobian: FloatArray,
-    arrays: ModelArrays,
-) -> FloatArray:  # fmt: skip
-    """Change of the innovations (m, 2) [px] since the filtered ones that joints explain which pass through their play
-    or step, within the errors that the model states of them; zeros where it states none, or where nothing changed.
+@kernel
+def _common_change(block: Record, room: Record, camera: int, used: BoolArray, common: FloatArray) -> None:
+    """Into ``common`` (m, 2) [px], the change of the innovations since the filtered ones that joints explain which pass
+    through their play or step, within the errors that the model states of them; zeros where nothing changed.
 
-    ``jacobian`` (m, 2, n). By iterated weights of Huber: what is common moves all markers, an outlier one.
+    Markers that are ``used`` (m,). By iterated weights of Huber: what is common moves all markers, an outlier one.
     """
-    m, n = used.size, jacobian.shape[2]
-    none = np.zeros((m, 2))
-    if arrays.joint_accuracy is None:
-        return none
-    rows = sights.seen[:m] & used & (estimate.seen_ns > 0)
-    if int(rows.sum()) < 3:
-        return none
-    change = (sights.innovation[:m] - estimate.innovation)[rows]
-    variance = MODEL_SIGMA_PX**2 + 0.5 * (sights.spread[:m][rows, 0, 0] + sights.spread[:m][rows, 1, 1])
-    deviations = np.sqrt(arrays.joint_variances)
-    J = jacobian[rows] * deviations
-    equations = np.concatenate([J.reshape(-1, n), np.eye(n)])
-    wanted = np.concatenate([change.reshape(-1), np.zeros(n)])
-    left = change
-    if float(((left**2).sum(axis=-1) / variance).max()) <= HUBER * HUBER:
-        return none
-    step = np.zeros(n)
+    memory, work = block[0], room[0]
+    m, n, at = memory.markers, memory.joints, memory.markers * camera
+    filtered, seen_ns = (
+        memory.innovation[2 * at : 2 * (at + m)].reshape((m, 2)),
+        memory.seen_ns[at : at + m],
+    )
+    innovation, spread = (
+        work.frame_innovation[: 2 * m].reshape((m, 2)),
+        work.frame_spread[: 4 * m].reshape((m, 2, 2)),
+    )
+    jacobian, deviations = work.jacobian[: 2 * m * n].reshape((m, 2, n)), work.joint_deviations[:n]
+    rows, variance = np.empty(m, np.int64), np.empty(m)
+    change, left = np.empty((m, 2)), np.empty((m, 2))
+    count, largest = 0, 0.0
+    for i in range(m):
+        if not (used[i] and seen_ns[i] > 0):
+            continue
+        rows[count] = i
+        variance[count] = MODEL_SIGMA_PX**2 + 0.5 * (spread[i, 0, 0] + spread[i, 1, 1])
+        for a in range(2):
+            change[count, a] = left[count, a] = innovation[i, a] - filtered[i, a]
+        d2 = (left[count, 0] ** 2 + left[count, 1] ** 2) / variance[count]
+        largest = d2 if count == 0 or d2 > largest or math.isnan(d2) else largest
+        count += 1
+    if count < 3 or largest <= HUBER * HUBER:
+        return
+    equations, wanted = np.zeros((2 * count + n, n)), np.zeros(2 * count + n)
+    weights, step = np.ones(2 * count + n), np.zeros(n)
+    for r in range(count):
+        for a in range(2):
+            wanted[2 * r + a] = change[r, a]
+            for j in range(n):
+                equations[2 * r + a, j] = jacobian[rows[r], a, j] * deviations[j]
+    for j in range(n):
+        equations[2 * count + j, j] = 1.0
     for _ in range(COMMON_ROUNDS):
-        distance = np.sqrt((left**2).sum(axis=-1) / variance)
-        weights = np.sqrt(np.minimum(1.0, HUBER / np.maximum(distance, 1e-9)) / variance)
-        step = joint_step(equations, wanted, np.concatenate([np.repeat(weights, 2), np.ones(n)]), 0.0)
-        left = change - (J * step).sum(axis=-1)
-    common: FloatArray = (jacobian * (deviations * step)).sum(axis=-1)
-    return common
+        for r in range(count):
+            distance = math.sqrt((left[r, 0] ** 2 + left[r, 1] ** 2) / variance[r])
+            weight = math.sqrt(min(1.0, HUBER / max(distance, 1e-9)) / variance[r])
+            weights[2 * r] = weights[2 * r + 1] = weight
+        step[:] = joint_step(equations, wanted, weights, 0.0)
+        for r in range(count):
+            for a in range(2):
+                explained = 0.0
+                for j in range(n):
+                    explained += equations[2 * r + a, j] * step[j]
+                left[r, a] = change[r, a] - explained
+    for i in range(m):
+        for a in range(2):
+            for j in range(n):
+                common[i, a] += jacobian[i, a, j] * (deviations[j] * step[j])
+
+
+class Sights(NamedTuple):
+    """Of k sights: their ``rows`` (k,) among the model's markers and static points, -1 for none; ideal ``pixels``
+    (k, 2), ``covariances`` (k, 2, 2) [px²].
+    """
+
+    rows: IntArray
+    pixels: FloatArray
+    covariances: FloatArray
 
 
 @kernel
-def _innovations_into(
-    rows: IntArray, pixels: FloatArray, covariances: FloatArray, predicted: FloatArray, standing: FloatArray,
-    jacobian: FloatArray, speed: FloatArray, timing_s: float, innovation: FloatArray, spread: FloatArray,
-    noise: FloatArray, seen: KindArray, velocity: FloatArray,
-) -> None:  # fmt: skip
-    """Into the last five, the fields of `FrameResiduals`, k rows: observed less ``predicted`` (m, 2) or ``standing``
-    (s, 2) [px].
+def _compare(
+    room: Record,
+    sights: Sights,
+    predicted: FloatArray,
+    standing: FloatArray,
+    jacobian: FloatArray,
+    speed: FloatArray,
+) -> None:
+    """Into the ``room``, the fields of `FrameResiduals`: observed less ``predicted`` (m, 2) or ``standing`` (s, 2) [px].
 
-    ``rows``: the row of each sight, or -1. ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter stamp that is off by
-    ``timing_s`` [s] moves.
+    ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter stamp that is off by `TIMING_SIGMA_S` moves.
     """
-    markers, n = jacobian.shape[0], jacobian.shape[2]
+    work, markers, n = room[0], jacobian.shape[0], jacobian.shape[2]
+    rows, pixels, covariances = sights
+    count = markers + standing.shape[0]
+    innovation, spread = (
+        work.frame_innovation[: 2 * count].reshape((count, 2)),
+        work.frame_spread[: 4 * count].reshape((count, 2, 2)),
+    )
+    velocity = work.frame_velocity[: 2 * count].reshape((count, 2))
     innovation[:], spread[:], velocity[:] = 0.0, 0.0, 0.0
-    seen[:], noise[:] = 0, 1.0
+    work.frame_seen[:count], work.frame_noise[:count] = 0, 1.0
     for k in range(rows.size):
         i = rows[k]
         if i < 0:
             continue
-        seen[i] = 1
-        noise[i] = 0.5 * (covariances[k, 0, 0] + covariances[k, 1, 1])
+        work.frame_seen[i] = 1
+        work.frame_noise[i] = 0.5 * (covariances[k, 0, 0] + covariances[k, 1, 1])
         for a in range(2):
             innovation[i, a] = pixels[k, a] - (predicted[i, a] if i < markers else standing[i - markers, a])
         u = v = 0.0
@@ -547,7 +604,7 @@ def _innovations_into(
             u += jacobian[i, 0, j] * speed[j] if i < markers else 0.0
             v += jacobian[i, 1, j] * speed[j] if i < markers else 0.0
         velocity[i, 0], velocity[i, 1] = u, v
-        t = timing_s * timing_s
+        t = TIMING_SIGMA_S * TIMING_SIGMA_S
         spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
         spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
         spread[i, 1, 0] = spread[i, 0, 1]
@@ -555,34 +612,41 @@ def _innovations_into(
 
 
 @kernel
-def fold_in(
-    innovation: FloatArray, spread: FloatArray, seen: BoolArray, noise: FloatArray, common: FloatArray,
-    t_ns: int, filtered: FloatArray, sigma: FloatArray, seen_ns: IntArray,
-    known_s: float, filter_s: float, gate: float, model_px: float, first_px: float,
-) -> tuple[int, int, float]:  # fmt: skip
-    """Fold a frame's innovations (m, 2) into the ``filtered`` ones, each by its weight; those refused leave it alone.
+def _fold_in(
+    block: Record, room: Record, k: int, used: BoolArray, common: FloatArray
+) -> tuple[int, int, float]:
+    """Fold the innovations of frame ``k`` into the filtered ones, each by its weight; those refused leave it alone.
 
-    ``noise`` (m,): variance of a coordinate by the detector alone; ``gate``: squared distance; ``model_px``,
-    ``first_px``: what a prediction may be off by, for markers last seen within ``known_s`` and for others; ``common``
-    (m, 2) [px]: change of all of them together since the filtered ones, which the gate leaves out. Gives how
-    many were accepted and refused, and the sum of squares of the accepted innovations [px²].
+    Markers that are ``used`` (m,). A prediction may be off by `MODEL_SIGMA_PX`, or, of markers that were not seen of
+    late, by `FIRST_SIGHT_SIGMA_PX`; ``common`` (m, 2) [px]: change of all of them together since the filtered ones,
+    which the gate leaves out. Gives how many were accepted and refused, and the sum of squares of the accepted
+    innovations [px²].
     """
+    memory, work = block[0], room[0]
+    m, t_ns = memory.markers, work.arrived_ns[k]
+    at, end = m * work.arrived_camera[k], m * (work.arrived_camera[k] + 1)
+    innovation, spread = (
+        work.frame_innovation[: 2 * m].reshape((m, 2)),
+        work.frame_spread[: 4 * m].reshape((m, 2, 2)),
+    )
+    filtered = memory.innovation[2 * at : 2 * end].reshape((m, 2))
+    sigma, seen_ns, filter_s = memory.sigma[at:end], memory.seen_ns[at:end], work.filter_s
     accepted = refused = 0
     squares = 0.0
-    for i in range(seen.size):
-        if not seen[i]:
+    for i in range(m):
+        if not used[i]:
             continue
         age_s = (t_ns - seen_ns[i]) * 1e-9
-        known = seen_ns[i] > 0 and age_s <= known_s
+        known = seen_ns[i] > 0 and age_s <= work.known_s
         x, y = innovation[i, 0], innovation[i, 1]
         if known:
             x -= filtered[i, 0]
             y -= filtered[i, 1]
-        model = model_px if known else first_px
+        model = MODEL_SIGMA_PX if known else FIRST_SIGHT_SIGMA_PX
         off = model * model
         a, b = (x - common[i, 0], y - common[i, 1]) if known else (x, y)
         d2 = distance2(a, b, spread[i, 0, 0] + off, spread[i, 0, 1], spread[i, 1, 1] + off)
-        if not d2 <= gate:
+        if not d2 <= work.gate:
             refused += 1
             continue
         weight = 1.0 if d2 <= HUBER * HUBER else HUBER / math.sqrt(d2)
@@ -593,7 +657,7 @@ def fold_in(
         else:
             filtered[i, 0] = innovation[i, 0]
             filtered[i, 1] = innovation[i, 1]
-        sigma[i] = math.sqrt(noise[i] / weight)
+        sigma[i] = math.sqrt(work.frame_noise[i] / weight)
         seen_ns[i] = t_ns
         squares += innovation[i, 0] * innovation[i, 0] + innovation[i, 1] * innovation[i, 1]
         accepted += 1

@@ -8,14 +8,18 @@ of the future is wrong, however little. What is refused is not stored, so that o
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereoservo.core.block import HISTORY, VELOCITY_FILTER_S
 from stereoservo.core.context import Ingested, StepContext
+from stereoservo.core.cycle import StepInputs
 from stereoservo.core.move import MOTION_SOURCES
-from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.state import LEAST_APART_NS, CoreState, Refused
+from stereoservo.core.settings import CoreSettings
+from stereoservo.core.state import LEAST_APART_NS, Refused
+from stereoservo.core.workspace import MAX_FRAMES
+from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
@@ -32,62 +36,77 @@ STAMP_JITTER_S = 0.05
 """By which the stamps of two joint samples may be off, on top of which a jump counts as one."""
 FARTHEST = 1e6
 """[rad or m] No joint is so far from its zero."""
-MAX_MARKERS = 256
-"""Of one frame, at most."""
+FARTHEST_INTEGER = 1 << 62
 LARGEST_SIGMA_PX = 1e4
 FRESH_S = 0.15
 FRESH_FRAMES = 2.5  # without a frame for so many periods a law is said to coast
 
 
-def ingest(context: StepContext) -> Ingested:
-    """Pass what is new and stamped within [now - time-out, now]; keep the joints and follow the driver's state.
+STAMP, VALUES = 2, 3
+"""Why a joint sample or a frame is refused; `TAKEN` where it is not, and `NO_NEWS` where it was here before."""
+NO_NEWS, TAKEN = 0, 1
+REFUSED = 1
+"""Of what the stages find, as bits of a number: an input that cannot be right, or a loop that stood still."""
 
-    Of what is refused nothing is kept but the count and the reason. After a gap the drives were left alone, and the
-    last command is not what they do: commands begin from rest.
+
+@kernel
+def ingest(block: Record, room: Record) -> int:
+    """Pass what is new and stamped within [now - time-out, now], and keep the joints; `REFUSED` where anything is not
+    passed, and why in the ``room``.
+
+    Of what is refused nothing is kept. After a gap the drives were left alone, and the last command is not what they
+    do: commands begin from rest. A clock that went back makes all stamps of before ones of a time to come, which would
+    refuse all that is new: they are forgotten.
     """
-    state, inputs, numbers = context.state, context.inputs, context.state.block.numbers
-    if inputs.now_ns < numbers.last_step_ns:
-        _forget_stamps(state)
-    last_ns = numbers.last_step_ns
-    elapsed_s = (inputs.now_ns - last_ns if last_ns else context.derived.nominal_period_ns) * 1e-9
-    gap = _gap(elapsed_s, context)
-    observations, refused_frames = observations_of(context) if inputs.observations else ((), ())
-    joints, refused_joints = _take_joints(context)
-    numbers.last_step_ns = context.now_ns
-    stops: tuple[Reason, ...] = ()
-    if gap is not None or refused_joints is not None or refused_frames:
-        stops = tuple(reason for reason in (gap, refused_joints) if reason is not None)
-        if MOTION_SOURCES[type(state.source)].by_images:
-            stops += tuple(reason for _, reason in refused_frames if reason.level == "hold")
-    context.ingested = Ingested(joints, observations, elapsed_s, refused_joints, refused_frames, gap, stops)
-    if joints is not None:
-        state.refused_joints.reason = None
-    if observations or refused_joints is not None or refused_frames:
-        _count_refused(context.ingested, state)
-    if gap is not None:
-        state.block.command[:] = 0.0
-        forget_travel(state)
-    _follow_driver(context)
-    return context.ingested
+    memory, work = block[0], room[0]
+    if work.now_ns < memory.last_step_ns:
+        _forget_stamps(block)
+    last_ns = memory.last_step_ns
+    work.elapsed_s = (work.now_ns - last_ns) * 1e-9 if last_ns != 0 else work.nominal_s
+    within = 0.0 <= work.elapsed_s <= work.longest_gap_s
+    work.gap = int(last_ns != 0 and work.active_before != 0 and not within)
+    pass_frames(block, room)
+    work.joints_found = _take_joints(block, room)
+    memory.last_step_ns = work.now_ns
+    if work.gap != 0:
+        memory.command[: memory.joints] = 0.0
+        forget_travel(block)
+    return REFUSED if work.gap != 0 or work.joints_found > TAKEN or work.frames_refused != 0 else 0
 
 
-def _count_refused(ingested: Ingested, state: CoreState) -> None:
-    """Keep of each source what was refused since its last good sample."""
-    if ingested.refused_joints is not None:
-        _count(state.refused_joints, ingested.refused_joints)
-    for camera, _ in ingested.observations:
-        state.refused_frames[camera].reason = None
-    for camera, reason in ingested.refused_frames:
-        _count(state.refused_frames[camera], reason)
+@kernel
+def forget_travel(block: Record) -> None:
+    """Begin anew: what the drives did of late was not what they were sent."""
+    memory = block[0]
+    memory.missing_travel[: memory.joints] = 0.0
+    memory.untold_travel[: memory.joints] = 0.0
+    memory.followed = memory.silence_known = 0
 
 
-def _forget_stamps(state: CoreState) -> None:
-    """The clock went back: what was stamped before is of a time to come, and would refuse all that is new."""
-    block = state.block
-    block.numbers.history_count, block.numbers.last_joints_ns, block.numbers.last_joints_seq = 0, 0, -1
-    for estimate in state.cameras:
-        estimate.last_seq, estimate.accepted_ns = -1, 0
-        estimate.seen_ns[:] = 0
+@kernel
+def _forget_stamps(block: Record) -> None:
+    """All that is stamped is forgotten, but what was seen stays known."""
+    memory = block[0]
+    memory.history_count, memory.last_joints_ns, memory.last_joints_seq = 0, 0, -1
+    for c in range(memory.cameras):
+        memory.estimates[c].last_seq, memory.estimates[c].accepted_ns = -1, 0
+    memory.seen_ns[: memory.cameras * memory.markers] = 0
+
+
+@kernel
+def _take_joints(block: Record, room: Record) -> int:
+    """Take the joint sample in the ``room`` where it is new and in time: `NO_NEWS`, `TAKEN`, `STAMP` or `VALUES`."""
+    memory, work = block[0], room[0]
+    fresh = work.joints_seq != memory.last_joints_seq and work.joints_ns > memory.last_joints_ns
+    if work.joints_given == 0 or not fresh:
+        take_sample(block, room, False)
+        return NO_NEWS
+    if not 0.0 <= (work.now_ns - work.joints_ns) * 1e-9 <= work.joint_timeout_s:
+        take_sample(block, room, False)
+        return STAMP
+    if take_sample(block, room, work.joints_whole != 0) and work.joints_whole != 0:
+        return TAKEN
+    return VALUES
 
 
 @kernel
@@ -107,44 +126,63 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
 
 
 @kernel
-def take_sample(
-    block: Record, room: Record, told: bool, t_ns: int, seq: int, active: bool, q: FloatArray
-) -> bool:
-    """Whether a joint sample, of which the ``room`` holds the values, may be right; then it is the newest one of the
-    ``block``, and the filtered velocities are those since the last one. Into ``q`` (n,): the newest positions,
-    zero before the first. Without a sample (``told``): nothing is wrong.
+def take_sample(block: Record, room: Record, told: bool) -> bool:
+    """Whether the joint sample in the ``room`` may be right; then it is the newest one of the ``block``, and the
+    filtered velocities are those since the last one. Into ``q`` (n,) of the room: the newest positions, zero before the
+    first. Without a sample (``told``): nothing is wrong.
 
     The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
     """
     memory, work = block[0], room[0]
-    n = memory.joints
+    n, q = memory.joints, work.q
     kept = memory.history_positions[: HISTORY * n].reshape((HISTORY, n))
     sound = True
     if told:
         values, elapsed_s = (
             work.sample[: 4 * n].reshape((4, n)),
-            (t_ns - memory.last_joints_ns) * 1e-9,
+            (work.joints_ns - memory.last_joints_ns) * 1e-9,
         )
-        sound = _sound(values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], active)
+        sound = _sound(
+            values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], work.active_before != 0
+        )
         if sound:
             memory.history_count = _append_sample(
-                memory.history_ns, kept, memory.history_count, t_ns, values[0], memory.last_joints_ns,
-                work.velocity_max[:n], memory.velocities[:n],
+                Samples(memory.history_ns, kept), memory.history_count, work.joints_ns, values[0],
+                work.velocity_max[:n], Velocities(memory.last_joints_ns, memory.velocities[:n]),
             )  # fmt: skip
-            memory.last_joints_seq, memory.last_joints_ns = seq, t_ns
+            memory.last_joints_seq, memory.last_joints_ns = work.joints_seq, work.joints_ns
     for j in range(n):
         q[j] = kept[(memory.history_count - 1) % HISTORY, j] if memory.history_count > 0 else 0.0
     return sound
 
 
+class Samples(NamedTuple):
+    """A ring of joint samples: ``stamps`` (k,) [ns] and ``positions`` (k, n)."""
+
+    stamps: IntArray
+    positions: FloatArray
+
+
+class Velocities(NamedTuple):
+    """Filtered joint velocities (n,), as of the sample at ``last_ns``."""
+
+    last_ns: int
+    values: FloatArray
+
+
 @kernel
 def _append_sample(
-    stamps: IntArray, kept: FloatArray, count: int, t_ns: int, positions: FloatArray, last_ns: int,
-    velocity_max: FloatArray, velocities: FloatArray,
-) -> int:  # fmt: skip
-    """`remember_joints`, and the filtered joint ``velocities`` (n,) since the last sample at ``last_ns``, in place."""
+    ring: Samples,
+    count: int,
+    t_ns: int,
+    positions: FloatArray,
+    velocity_max: FloatArray,
+    filtered: Velocities,
+) -> int:
+    """`remember_joints`, and the ``filtered`` velocities since the last sample, in place."""
+    stamps, kept, velocities = ring.stamps, ring.positions, filtered.values
     if count > 0:
-        elapsed_s = (t_ns - last_ns) * 1e-9
+        elapsed_s = (t_ns - filtered.last_ns) * 1e-9
         previous = kept[(count - 1) % stamps.size]
         if _jumped(positions, previous, velocity_max, elapsed_s):
             count = 0
@@ -189,7 +227,10 @@ def _sound(
     )
 
 
-def _follow_driver(context: StepContext) -> None:
+# -- the driver -------------------------------------------------------------------------------------------------
+
+
+def follow_driver(context: StepContext) -> None:
     """The lifecycle follows what the servo process did with the driver; a fault is latched."""
     state, inputs = context.state, context.inputs
     before = state.lifecycle
@@ -238,53 +279,57 @@ def frame_timeout_s(settings: CoreSettings) -> float:
     return max(settings.limits.coast_s, features_fresh_s(settings))
 
 
-def _count(refused: Refused, reason: Reason) -> None:
-    refused.count += 1
-    refused.reason = reason
+# -- inputs ------------------------------------------------------------------------------------------------------
 
 
-def _gap(gap_s: float, context: StepContext) -> Reason | None:
-    """The reason where the loop stood still while the drives were on."""
-    state, limit_s = context.state, context.derived.longest_gap_s
-    if not state.block.numbers.last_step_ns or state.lifecycle != Lifecycle.ACTIVE or 0.0 <= gap_s <= limit_s:
-        return None
-    return Reason(
-        "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
-        f"the servo loop did not run for {gap_s:.3f} s, {limit_s:.3f} s is allowed, and the drives were left alone: "
-        "resume, then send the goal again; if it comes again, take load off this computer or give the loop priority "
-        "(servo.priority)",
-    )  # fmt: skip
+def put_inputs(context: StepContext) -> None:
+    """The step's inputs into the workspace."""
+    inputs, room = context.inputs, context.derived.room
+    work, sample = room.numbers, inputs.joints
+    work.now_ns, work.dt_s, work.stop = inputs.now_ns, context.dt_s, inputs.stop
+    work.joints_given = sample is not None
+    if sample is not None:
+        work.joints_ns, work.joints_seq = _within_bounds(sample.t_ns), _within_bounds(sample.seq)
+        work.tells_efforts, work.tells_following = (
+            sample.efforts is not None,
+            sample.following_errors is not None,
+        )
+        work.joints_whole = fill_sample(sample, room.sample)
+    work.has_sent = False
+    if inputs.sent is not None and inputs.sent.shape == room.sent.shape and np.isfinite(inputs.sent).all():
+        room.sent[:], work.has_sent = inputs.sent, True
+    work.frames = 0
+    if inputs.observations:
+        _put_frames(context)
 
 
-def _take_joints(context: StepContext) -> tuple[JointState | None, Reason | None]:
-    """The joint sample, which is in the history now, or why it is refused; neither where there is none or it was here
-    before.
-    """
-    block, room, sample, q = context.state.block, context.derived.room, new_sample(context), context.q
-    if sample is None:
-        take_sample(block.record, room.record, False, 0, 0, False, q)
-        return None, None
-    told, active = takes(sample, context), context.state.lifecycle == Lifecycle.ACTIVE
-    if take_sample(block.record, room.record, told, sample.t_ns, sample.seq, active, q) and told:
-        return sample, None
-    return None, _wrong(sample, context) if _in_time(sample, context) else _late(sample, context)
+def _within_bounds(number: int) -> int:
+    """A number that a record can hold: a stamp that is beyond all bounds stays too far to be right."""
+    return max(-FARTHEST_INTEGER, min(number, FARTHEST_INTEGER))
 
 
-def new_sample(context: StepContext) -> JointState | None:
-    """The joint sample of the step; None where there is none, or it was here before."""
-    sample, numbers = context.inputs.joints, context.state.block.numbers
-    if sample is None or sample.seq == numbers.last_joints_seq or sample.t_ns <= numbers.last_joints_ns:
-        return None
-    return sample
+def _put_frames(context: StepContext) -> None:
+    """The step's frames into the workspace, the last `MAX_FRAMES` of them."""
+    room, cameras = context.derived.room, context.derived.cameras
+    given = room.arrays
+    for k, frame in enumerate(newest_frames(context.inputs)):
+        count = len(frame.ids)
+        given["arrived_camera"][k] = cameras.get(frame.camera, -1)
+        given["arrived_seq"][k] = _within_bounds(frame.seq)
+        given["arrived_ns"][k] = _within_bounds(frame.t_shutter_ns)
+        whole = count <= MAX_MARKERS and frame.pixels.shape == (count, 2)
+        if not whole or frame.covariances.shape != (count, 2, 2):
+            count = -1
+        else:
+            given["arrived_ids"][k, :count], given["arrived_pixels"][k, :count] = frame.ids, frame.pixels
+            given["arrived_covariances"][k, :count] = frame.covariances
+        given["arrived_count"][k] = count
+        room.numbers.frames = k + 1
 
 
-def takes(sample: JointState, context: StepContext) -> bool:
-    """Whether a sample is in time, and tells of every joint; then its values are in the workspace."""
-    return _in_time(sample, context) and fill_sample(sample, context.derived.room.sample)
-
-
-def _in_time(sample: JointState, context: StepContext) -> bool:
-    return 0.0 <= (context.now_ns - sample.t_ns) * 1e-9 <= context.settings.limits.joint_timeout_s
+def newest_frames(inputs: StepInputs) -> tuple[CameraObservation, ...]:
+    """The frames that a step looks at: no more than `MAX_FRAMES`."""
+    return inputs.observations[-MAX_FRAMES:]
 
 
 def fill_sample(sample: JointState, values: FloatArray) -> bool:
@@ -300,6 +345,118 @@ def fill_sample(sample: JointState, values: FloatArray) -> bool:
     values[0], values[1] = sample.positions, sample.velocities
     values[2], values[3] = 0.0 if efforts is None else efforts, 0.0 if following is None else following
     return True
+
+
+@kernel
+def pass_frames(block: Record, room: Record) -> None:
+    """What is to be done with each frame in the ``room``: `TAKEN`, `STAMP`, `VALUES`, or `NO_NEWS`.
+
+    A frame that is too old stops nothing: the law coasts as if it had been lost, and brakes in time. A camera that
+    counts its frames anew is known by their stamps, which are checked; numbers alone are not trusted.
+    """
+    memory, work = block[0], room[0]
+    last_seq, accepted_ns = np.empty(memory.cameras, np.int64), np.empty(memory.cameras, np.int64)
+    for c in range(memory.cameras):
+        last_seq[c], accepted_ns[c] = memory.estimates[c].last_seq, memory.estimates[c].accepted_ns
+    work.frames_passed = work.frames_refused = 0
+    for k in range(work.frames):
+        c, seq, t_ns = work.arrived_camera[k], work.arrived_seq[k], work.arrived_ns[k]
+        found = NO_NEWS
+        if c >= 0 and seq != last_seq[c] and not (seq < last_seq[c] and t_ns <= accepted_ns[c]):
+            found = _judged(room, k)
+        if found == TAKEN:
+            last_seq[c], accepted_ns[c] = seq, max(accepted_ns[c], t_ns)
+            work.frames_passed += 1
+        elif found != NO_NEWS:
+            work.frames_refused += 1
+        work.arrived_found[k] = found
+
+
+@kernel
+def _judged(room: Record, k: int) -> int:
+    """Whether frame ``k`` of the ``room``, which is new, is `TAKEN`, or why not."""
+    work = room[0]
+    if not 0.0 <= (work.now_ns - work.arrived_ns[k]) * 1e-9 <= work.frame_timeout_s:
+        return STAMP
+    outside, vague = first_wrong(room, k)
+    return VALUES if work.arrived_count[k] < 0 or outside >= 0 or vague >= 0 else TAKEN
+
+
+@kernel
+def first_wrong(room: Record, k: int) -> tuple[int, int]:
+    """Of frame ``k`` of the ``room``, the first marker farther from the image than its own size, and the first whose
+    covariance is none; -1 where there is none such.
+    """
+    work = room[0]
+    c, count = work.arrived_camera[k], work.arrived_count[k]
+    at = MAX_MARKERS * k
+    width, height = work.image_sizes[2 * c], work.image_sizes[2 * c + 1]
+    outside, vague = -1, -1
+    for i in range(count):
+        u = work.arrived_pixels[2 * (at + i)] / width - 0.5
+        v = work.arrived_pixels[2 * (at + i) + 1] / height - 0.5
+        if outside < 0 and not (abs(u) <= 1.5 and abs(v) <= 1.5):
+            outside = i
+        C = work.arrived_covariances[4 * (at + i) : 4 * (at + i) + 4].reshape((2, 2))
+        largest = max(abs(C[0, 0]), abs(C[0, 1]), abs(C[1, 0]), abs(C[1, 1]))
+        numbers = math.isfinite(C[0, 0] + C[0, 1] + C[1, 0] + C[1, 1])
+        known = numbers and largest <= LARGEST_SIGMA_PX * LARGEST_SIGMA_PX
+        if vague < 0 and not (known and C[0, 0] > 0.0 and C[0, 0] * C[1, 1] - C[0, 1] * C[1, 0] > 0.0):
+            vague = i
+    return outside, vague
+
+
+# -- what is refused, in words -----------------------------------------------------------------------------------
+
+
+def passed_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], ...]:
+    """The frames that passed, each with the index of its camera."""
+    found, cameras = context.derived.room.arrays["arrived_found"], context.derived.cameras
+    frames = newest_frames(context.inputs)
+    return tuple([(cameras[frame.camera], frame) for k, frame in enumerate(frames) if found[k] == TAKEN])
+
+
+def account_inputs(context: StepContext) -> Ingested:
+    """What `ingest` has come to in this step, in words; of each source what is refused since its last good sample is
+    counted.
+    """
+    state, work = context.state, context.derived.room.numbers
+    joints, sample = work.joints_found, context.inputs.joints
+    taken = sample if joints == TAKEN else None
+    refused_joints = None
+    if sample is not None and joints > TAKEN:
+        refused_joints = _late(sample, context) if joints == STAMP else _wrong(sample, context)
+    passed = passed_frames(context) if work.frames_passed else ()
+    refused_frames = _refused_frames(context) if work.frames_refused else ()
+    gap = _gap(work.elapsed_s, context) if work.gap else None
+    stops = tuple(reason for reason in (gap, refused_joints) if reason is not None)
+    if MOTION_SOURCES[type(state.source)].by_images:
+        stops += tuple(reason for _, reason in refused_frames if reason.level == "hold")
+    if taken is not None:
+        state.refused_joints.reason = None
+    if refused_joints is not None:
+        _count(state.refused_joints, refused_joints)
+    for camera, _ in passed:
+        state.refused_frames[camera].reason = None
+    for camera, reason in refused_frames:
+        _count(state.refused_frames[camera], reason)
+    return Ingested(taken, passed, work.elapsed_s, refused_joints, refused_frames, gap, stops)
+
+
+def _count(refused: Refused, reason: Reason) -> None:
+    refused.count += 1
+    refused.reason = reason
+
+
+def _gap(gap_s: float, context: StepContext) -> Reason:
+    """The loop stood still while the drives were on."""
+    limit_s = context.derived.longest_gap_s
+    return Reason(
+        "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
+        f"the servo loop did not run for {gap_s:.3f} s, {limit_s:.3f} s is allowed, and the drives were left alone: "
+        "resume, then send the goal again; if it comes again, take load off this computer or give the loop priority "
+        "(servo.priority)",
+    )  # fmt: skip
 
 
 def _late(sample: JointState, context: StepContext) -> Reason:
@@ -361,80 +518,36 @@ def _jump(sample: JointState, context: StepContext) -> Reason:
     )  # fmt: skip
 
 
-def observations_of(
-    context: StepContext,
-) -> tuple[tuple[tuple[int, CameraObservation], ...], tuple[tuple[int, Reason], ...]]:
-    """New observations with the index of their camera, and the reasons of refused ones.
-
-    A frame that is too old stops nothing: the law coasts as if it had been lost, and brakes in time. A camera that
-    counts its frames anew is known by their stamps, which are checked; numbers alone are not trusted.
-    """
-    inputs = context.inputs
-    cameras = context.derived.cameras
-    newest: dict[int, tuple[int, int]] = {}  # of cameras with more than one frame
-    timeout_s = context.derived.frame_timeout_s
-    passed: list[tuple[int, CameraObservation]] = []
+def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
+    """The reasons of refused frames, each with the index of its camera."""
+    room, cameras = context.derived.room, context.derived.cameras
+    found = room.arrays["arrived_found"]
     refused: list[tuple[int, Reason]] = []
-    for observation in inputs.observations:
-        camera = cameras.get(observation.camera)
-        if camera is None:
-            continue
-        estimate = context.state.cameras[camera]
-        last_seq, accepted_ns = newest.get(camera) or (estimate.last_seq, estimate.accepted_ns)
-        if observation.seq == last_seq:
-            continue
-        if observation.seq < last_seq and observation.t_shutter_ns <= accepted_ns:
-            continue
-        age_s = (inputs.now_ns - observation.t_shutter_ns) * 1e-9
-        if not 0.0 <= age_s <= timeout_s:
-            refused.append((camera, _refused_frame(observation, age_s, timeout_s)))
-            continue
-        wrong = _wrong_sights(observation, context.settings.cameras[camera])
-        if wrong:
-            refused.append((camera, _impossible_frame(observation, wrong)))
-            continue
-        newest[camera] = observation.seq, max(accepted_ns, observation.t_shutter_ns)
-        passed.append((camera, observation))
-    return tuple(passed), tuple(refused)
+    for k, frame in enumerate(newest_frames(context.inputs)):
+        if found[k] == STAMP:
+            age_s = (context.now_ns - frame.t_shutter_ns) * 1e-9
+            reason = _refused_frame(frame, age_s, context.derived.frame_timeout_s)
+            refused.append((cameras[frame.camera], reason))
+        elif found[k] == VALUES:
+            camera = cameras[frame.camera]
+            refused.append((camera, _impossible_frame(frame, _wrong_sights(frame, k, context))))
+    return tuple(refused)
 
 
-def _wrong_sights(observation: CameraObservation, camera: CameraSettings) -> str:
-    """What cannot be in the markers of a frame; empty where they may be right."""
-    count = len(observation.ids)
+def _wrong_sights(frame: CameraObservation, k: int, context: StepContext) -> str:
+    """What cannot be in the markers of frame ``k``."""
+    count = len(frame.ids)
     if count > MAX_MARKERS:
         return f"it has {count} markers, {MAX_MARKERS} are allowed"
-    pixels, covariances = observation.pixels, observation.covariances
+    pixels, covariances = frame.pixels, frame.covariances
     if pixels.shape != (count, 2) or covariances.shape != (count, 2, 2):
         return f"{count} markers have pixels {pixels.shape} and covariances {covariances.shape}"
-    outside, vague = _first_wrong(
-        np.ascontiguousarray(pixels, dtype=np.float64), np.ascontiguousarray(covariances, dtype=np.float64),
-        float(camera.width), float(camera.height),
-    )  # fmt: skip
+    outside, vague = first_wrong(context.derived.room.record, k)
     if outside >= 0:
-        marker, at = observation.ids[outside], pixels[outside].tolist()
+        camera = context.settings.cameras[context.derived.cameras[frame.camera]]
+        marker, at = frame.ids[outside], pixels[outside].tolist()
         return f"marker {marker} is at {at} in an image of {camera.width}x{camera.height}"
-    if vague >= 0:
-        return f"marker {observation.ids[vague]} has the covariance {covariances[vague].tolist()}"
-    return ""
-
-
-@kernel
-def _first_wrong(pixels: FloatArray, covariances: FloatArray, width: float, height: float) -> tuple[int, int]:
-    """The first of ``pixels`` (k, 2) farther from the image than its own size, and the first of ``covariances``
-    (k, 2, 2) that is none; -1 where there is none such.
-    """
-    outside, vague = -1, -1
-    for k in range(pixels.shape[0]):
-        u, v = pixels[k, 0] / width - 0.5, pixels[k, 1] / height - 0.5
-        if outside < 0 and not (abs(u) <= 1.5 and abs(v) <= 1.5):
-            outside = k
-        C = covariances[k]
-        largest = max(abs(C[0, 0]), abs(C[0, 1]), abs(C[1, 0]), abs(C[1, 1]))
-        numbers = math.isfinite(C[0, 0] + C[0, 1] + C[1, 0] + C[1, 1])
-        known = numbers and largest <= LARGEST_SIGMA_PX * LARGEST_SIGMA_PX
-        if vague < 0 and not (known and C[0, 0] > 0.0 and C[0, 0] * C[1, 1] - C[0, 1] * C[1, 0] > 0.0):
-            vague = k
-    return outside, vague
+    return f"marker {frame.ids[vague]} has the covariance {covariances[vague].tolist()}"
 
 
 def _impossible_frame(observation: CameraObservation, wrong: str) -> Reason:
@@ -459,11 +572,3 @@ def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: floa
         "not used; check the camera's connection and this computer's load; a camera that is always so late needs a "
         "larger safety.coast_s",
     )  # fmt: skip
-
-
-def forget_travel(state: CoreState) -> None:
-    """Begin anew: what the drives did of late was not what they were sent."""
-    block = state.block
-    block.missing_travel[:] = 0.0
-    block.untold_travel[:] = 0.0
-    block.numbers.followed = block.numbers.silence_known = 0

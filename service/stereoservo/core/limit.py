@@ -16,10 +16,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.context import StepContext
 from stereoservo.core.settings import CoreSettings
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 
@@ -76,11 +75,6 @@ class SafetyLimits:
     def table(self) -> FloatArray:
         """The joints' limits as the kernel takes them (4, n): smallest and largest position, velocity, acceleration."""
         return np.array([self.position_min, self.position_max, self.velocity_max, self.acceleration_max])
-
-    @cached_property
-    def found(self) -> FloatArray:
-        """Room for what `limit_velocity` finds in a step (6 + n,)."""
-        return np.empty(6 + len(self.joint_names))
 
     @cached_property
     def bounds(self) -> FloatArray:
@@ -187,30 +181,34 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
         raise SafetyConfigurationError(
             f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
         )
-    limited, found = np.empty(n), limits.found
-    if not limit_velocity(
-        raw, positions, previous, inputs.brake, inputs.dt_s, inputs.joint_age_s, inputs.feature_age_s,
-        inputs.needs_features, inputs.speed_scale, limits.table, limits.bounds, limits.keep_outs, limited, found,
-    ):  # fmt: skip
+    limited, acted = np.empty(n), np.empty(n)
+    told, found = limit_velocity(
+        Wanted(
+            *(np.ascontiguousarray(array, dtype=np.float64) for array in (raw, positions, previous)), inputs.brake,
+            inputs.dt_s, inputs.joint_age_s, inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
+        ),
+        Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted,
+    )  # fmt: skip
+    if not told:
         return SafetyResult(raw, limited)
-    return _explained(inputs, limits, limited, found.tolist())
+    return explained(inputs, limits, limited, found, acted)
 
 
-def _explained(
-    inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: list[float]
+def explained(
+    inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: LimitsFound, acted: FloatArray
 ) -> SafetyResult:
-    """The result with its reasons, by what `limit_velocity` ``found``."""
+    """The result with its reasons, by what `limit_velocity` has ``found`` and ``acted`` (n,)."""
     reasons: list[Reason] = []
     brake = _stale(inputs, limits, reasons) or inputs.brake
-    finite, speed_scale, scale, scaled_by, share, shared_by, *acted = found
+    finite, speed_scale, scale, scaled_by, share, shared_by = found
     if not finite:
         brake = True
         _tell_non_finite(inputs.raw, inputs.positions, limits, reasons)
     if brake:
         reasons.append(_braking(limited, limits, inputs.brake))
-    _tell_positions(acted, inputs, limits, reasons)
+    _tell_positions(acted.tolist(), inputs, limits, reasons)
     if scaled_by >= 0 and scale < 1.0 - TOUCHED:
-        j = int(scaled_by)
+        j = scaled_by
         reasons.append(
             Reason(
                 VELOCITY_SCALED,
@@ -223,7 +221,7 @@ def _explained(
             )
         )
     if not brake and shared_by >= 0 and share < 1.0 - TOUCHED:
-        j = int(shared_by)
+        j = shared_by
         reasons.append(
             Reason(
                 ACCELERATION_LIMITED,
@@ -238,23 +236,22 @@ def _explained(
     return SafetyResult(inputs.raw, limited, tuple(reasons), brake)
 
 
-def limit(context: StepContext, motion: SourceOutput, limits: SafetyLimits) -> SafetyResult:
-    """Stage 6: the source's velocity within all limits; it becomes the command, zero outside ACTIVE."""
-    state, block, now_ns = context.state, context.state.block, context.now_ns
+def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
+    """What the safety stage has made of this step's motion, with its reasons."""
+    room, block = context.derived.room, context.state.block
+    work, given = room.numbers, room.arrays
+    raw, command = given["raw"].copy(), block.command.copy()
+    if not work.limited:
+        return SafetyResult(raw, command)
     inputs = SafetyInputs(
-        motion.velocity,
-        context.q if context.outermost is None else context.outermost,
-        block.command,
-        context.dt_s,
-        (now_ns - block.numbers.last_joints_ns) * 1e-9,
-        (now_ns - context.features_ns) * 1e-9,
-        motion.needs_features,
-        motion.speed_scale * context.settings.limits.speed_scale,
-        context.paused,
+        raw, given["outermost"], given["previous"], context.dt_s,
+        (context.now_ns - block.numbers.last_joints_ns) * 1e-9, (context.now_ns - work.features_ns) * 1e-9,
+        bool(work.needs_features), work.speed_scale, bool(work.paused),
+    )  # fmt: skip
+    found = LimitsFound(
+        bool(work.finite), work.allowed_scale, work.scale, work.scaled_by, work.share, work.shared_by
     )
-    result = safety_stage(inputs, limits)
-    block.command[:] = result.limited if state.lifecycle == Lifecycle.ACTIVE else 0.0
-    return result
+    return explained(inputs, limits, command, found, given["acted"])
 
 
 def safety_limits(settings: CoreSettings, features_fresh_s: float) -> SafetyLimits:
@@ -506,20 +503,55 @@ def _velocity_scale(
     return scale, scaled_by
 
 
+class Wanted(NamedTuple):
+    """What a motion asks for: ``raw``, with joints at ``positions`` after the command ``previous``, (n,) each; the rest
+    as in `SafetyInputs`.
+    """
+
+    raw: FloatArray
+    positions: FloatArray
+    previous: FloatArray
+    brake: bool
+    dt: float
+    joint_age: float
+    feature_age: float
+    needs_features: bool
+    speed_scale: float
+
+
+class Bounds(NamedTuple):
+    """``table`` (4, n), ``bounds`` (4,) and ``keep_outs`` (k, n, 2) of `SafetyLimits`."""
+
+    table: FloatArray
+    bounds: FloatArray
+    keep_outs: FloatArray
+
+
+class LimitsFound(NamedTuple):
+    """Whether all was ``finite``; the ``speed_scale`` that holds; velocity ``scale`` and acceleration ``share``, each
+    with the joint that asks for it, -1 for none.
+    """
+
+    finite: bool
+    speed_scale: float
+    scale: float
+    scaled_by: int
+    share: float
+    shared_by: int
+
+
 @kernel
 def limit_velocity(
-    raw: FloatArray, positions: FloatArray, previous: FloatArray, brake: bool, dt: float, joint_age: float,
-    feature_age: float, needs_features: bool, speed_scale: float, table: FloatArray, bounds: FloatArray,
-    keep_outs: FloatArray, limited: FloatArray, found: FloatArray,
-) -> bool:  # fmt: skip
+    wanted: Wanted, by: Bounds, limited: FloatArray, acted: FloatArray
+) -> tuple[bool, LimitsFound]:
     """Staleness, braking, velocity, positions and keep-outs, acceleration, in this order; whether there is anything to
-    tell.
+    tell, and what.
 
-    ``table``, ``bounds``, ``keep_outs``: see `SafetyLimits`. Where ``raw`` or ``positions`` are not finite it brakes,
-    too. Into the last two arguments the limited velocity (n,), and (6 + n,): whether all was finite; the speed scale
-    that holds; velocity scale, its joint, acceleration share, its joint, -1 for none; and who has acted on each joint:
-    0 nobody, 1 position limit, 2 + k keep-out k.
+    Where velocity or positions are not finite it brakes, too. Into ``limited`` the velocity (n,), and into ``acted``
+    (n,) who has acted on each joint: 0 nobody, 1 position limit, 2 + k keep-out k.
     """
+    raw, positions, previous, brake, dt, joint_age, feature_age, needs_features, speed_scale = wanted
+    table, bounds, keep_outs = by
     margin, timeout, fresh, coast = bounds[MARGIN], bounds[TIMEOUT], bounds[FRESH], bounds[COAST]
     limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)
     told, sample_age = brake, joint_age
@@ -530,7 +562,6 @@ def limit_velocity(
     speed_scale = min(max(speed_scale, 0.0), 1.0) if math.isfinite(speed_scale) else 0.0
     velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
     n = raw.shape[0]
-    acted = found[6:]
     finite = True
     for j in range(n):
         acted[j] = 0.0
@@ -581,6 +612,4 @@ def limit_velocity(
     told = told or brake or scaled_by >= 0 or shared_by >= 0
     for j in range(n):
         told = told or acted[j] != 0.0
-    found[0], found[1] = 1.0 if finite else 0.0, speed_scale
-    found[2], found[3], found[4], found[5] = scale, scaled_by, share, shared_by
-    return told
+    return told, LimitsFound(finite, speed_scale, scale, scaled_by, share, shared_by)

@@ -1,8 +1,10 @@
 """Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or
 ends its goal.
 
-Each monitor of `MONITORS` is called with the context, in the order of the table, and gives its findings, on which the
-stage acts at once: what one monitor stops, the next ones see stopped. To add one: a function, and a line in the table.
+What is detected in every step is one kernel, `detect`, which writes what it has found into the workspace. Where that is
+anything, or the state asks to be looked after (`attends`), each monitor of `MONITORS` is called with the context, in the
+order of the table, and gives its findings, on which the stage acts at once: what one monitor stops, the next ones see
+stopped. To add one: a function, and a line in the table.
 
 Requests are answered here, after the stop and before all other monitors: hold, resume, enable, teach and jog change
 what is monitored in this very step, and a goal that is accepted in a step in which something is found ends in that step
@@ -23,12 +25,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.core.block import DELAY_SAMPLES
 from stereoservo.core.camera_state import CameraMonitor
 from stereoservo.core.context import Finding, StepContext
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
+from stereoservo.core.ingest import TAKEN, VALUES
+from stereoservo.core.late_drives import account_travel, delays_of, measure_delays
 from stereoservo.core.monitor_state import LATE_S, MOVED, STALE_PERIODS, ModelDiagnosis, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
@@ -41,14 +44,13 @@ from stereoservo.core.monitors.diagnosis import (
 from stereoservo.core.monitors.fault_isolation import bench_now, diagnosed_beside_joint_errors
 from stereoservo.core.monitors.following import (
     LAG_S,
-    MEMORY_S,
     SILENCE_S,
     account_silence,
     not_following,
     silent,
     worst_follower,
 )
-from stereoservo.core.move import MOTION_SOURCES, account_travel, measure_delays
+from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import (
     MODEL_SIGMA_PX,
     SUSPECT_FRAMES,
@@ -64,25 +66,22 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
 from stereoservo.core.state import CalibrationMotion, CoreState
 from stereoservo.core.target.track import beside_target
-from stereoservo.core.workspace import Workspace
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
-from stereoservo.ports.devices import JointState
 
 Findings = Iterable[Finding]
 
 
 class Monitor(NamedTuple):
-    """A monitor: ``watch`` accounts for one step and gives what it has found. ``in_fast_path``: whether
-    `core.fast_path` leaves each step in which it would find anything to the stages; where it is of one monitor not
-    known to, every step goes by the stages.
+    """A monitor: ``watch`` accounts for one step and gives what it has found. ``attends``: whether it has to be called
+    in a step in which `detect` has found nothing; a monitor that does not say is called in every step.
     """
 
     name: str
     watch: Callable[[StepContext], Findings]
-    in_fast_path: bool = False
+    attends: Callable[[CoreState], bool] = lambda state: True
 
 
 def monitor(context: StepContext) -> tuple[Finding, ...]:
@@ -151,28 +150,80 @@ MOVING = 1e-3  # [rad/s or m/s] of commanded velocity
 GAP_S = 0.5  # without a sample for so long, means are of another time
 
 
-def detect_collision(
-    state: CoreState, settings: CoreSettings, room: Workspace, sample: JointState | None
-) -> Reason | None:
-    """Account for one step, with the sample's values in the ``room``; the reason where a joint (worst first) is in
-    contact.
+CONTACT, NOT_FOLLOWING, ROUND, CONTRADICTED = 2, 4, 8, 16
+"""Of what the stages find, as bits of a number: a joint beyond a limit of its load; one that does not follow; a round of
+frames that is to be explained; a camera that contradicts the model.
+"""
 
-    The block's command is still that of the last step.
-    """
-    block = state.block
-    if sample is None or sample.t_ns <= block.numbers.loads_ns:
-        return None
+
+@kernel
+def detect(block: Record, room: Record) -> int:
+    """Stage 3, in every step: account for loads, travel and frames; what was found, as bits."""
+    memory, work = block[0], room[0]
+    halted = work.stopped != 0 or work.stop != 0 or (work.active != 0 and stops_arm(room))
+    found = 0
+    work.contact = work.contact_watched = work.looked_at = work.odd = work.any_masked = 0
+    if work.joints_found == TAKEN and work.joints_ns > memory.loads_ns:
+        moving, beyond = account_loads(block, room, halted)
+        work.contact_watched, work.contact = int(moving), int(beyond)
+        if (beyond and work.watches_loads != 0) or (moving and work.learning != 0):
+            found |= CONTACT
+    work.following = FOLLOWS
+    if work.watches_following != 0 and memory.history_count > 0:
+        work.following = account_following(block, room)
+        if work.active == 0:
+            memory.silence_known = 0  # what was sent before is no matter of what is sent next
+            work.following = FOLLOWS  # an arm that is off may be moved by hand
+    if work.following != FOLLOWS:
+        return found | NOT_FOLLOWING
+    if work.modelled == 0:
+        return found
+    if work.rounds_apart == 0 and memory.history_count > 0 and work.faulty == 0 and round_is_due(block):
+        looked_at, odd, masked = judge_round(block, room, 0)
+        work.looked_at, work.odd, work.any_masked = looked_at, odd, int(masked)
+        if looked_at != 0 and (odd != 0 or masked or work.quiet == 0):
+            found |= ROUND
+    for c in range(memory.cameras):
+        if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
+            found |= CONTRADICTED
+    return found
+
+
+@kernel
+def stops_arm(room: Record) -> bool:
+    """Whether inputs that `ingest` has refused stop an arm that may move."""
+    work = room[0]
+    if work.gap != 0 or work.joints_found > TAKEN:
+        return True
+    stops = False
+    for k in range(work.frames):
+        wrong = work.arrived_found[k] == VALUES or work.arrived_ns[k] > work.now_ns
+        stops = stops or (work.by_images != 0 and work.arrived_found[k] > TAKEN and wrong)
+    return stops
+
+
+@kernel
+def round_is_due(block: Record) -> bool:
+    """Whether the newest frames are to be looked at together; then they are not due any more."""
+    memory = block[0]
+    if memory.round_due == 0 and not round_complete(block):
+        return False
+    memory.round_due = 0
+    return True
+
+
+def explain_contact(context: StepContext) -> Reason | None:
+    """The reason where a joint (worst first) is in contact, by what `account_loads` has found in this step."""
+    state, room = context.state, context.derived.room
+    block, work = state.block, room.numbers
     learning = isinstance(state.source, CalibrationMotion)
-    moving, beyond = account_loads(
-        block.record, room.record, sample.t_ns, sample.efforts is not None, sample.following_errors is not None,
-        state.lifecycle == Lifecycle.ACTIVE, state.stopped, learning,
-    )  # fmt: skip
     efforts, following = room.sample[2], room.sample[3]
-    if learning and moving:
+    if learning and work.contact_watched:
         learn_loads(state.source.id, state, np.abs(block.command), efforts, following)  # type: ignore[union-attr]
-    if not (beyond and room.watches_loads):
+    if not (work.contact and work.watches_loads):
         return None
-    reason = worst_contact(block, settings, *(room.stated_limits if learning else room.limits), learning)
+    limits = room.stated_load_limits if learning else room.load_limits
+    reason = worst_contact(block, context.settings, *limits, learning)
     if reason is not None:
         block.contact_low[:] = np.minimum(block.mean_efforts, efforts), np.minimum(following, 0.0)
         block.contact_high[:] = np.maximum(block.mean_efforts, efforts), np.maximum(following, 0.0)
@@ -181,48 +232,74 @@ def detect_collision(
     return reason
 
 
-@kernel
-def account_loads(
-    block: Record, room: Record, t_ns: int, tells_efforts: bool, tells_following: bool, active: bool, stopped: bool,
-    learning: bool,
-) -> tuple[bool, bool]:  # fmt: skip
-    """Take the efforts and following errors of a sample at ``t_ns``, in the ``room``, into the ``block``; whether the
-    arm moves and is watched, and whether a joint is beyond a limit then: see `_account_loads`.
+class Loads(NamedTuple):
+    """Of the joints (n,): ``efforts`` and ``following`` errors of a sample, or the limits of these."""
 
-    What a sample does not tell, or what is no number, becomes what is expected, in the ``room``, too.
+    efforts: FloatArray
+    following: FloatArray
+
+
+class LoadHistory(NamedTuple):
+    """Of the block: the moving ``mean`` (n,) of efforts; how far samples of late lay beyond what is expected, ``effort``
+    and ``following`` (samples, n); what a contact has brought, ``low`` and ``high`` (2, n).
+    """
+
+    mean: FloatArray
+    effort: FloatArray
+    following: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+class Situation(NamedTuple):
+    """Of a sample: the time since the one before, whether what was before is forgotten, whether the arm moves and is
+    watched, and whether it is leaving a contact.
+    """
+
+    elapsed_s: float
+    forgets: bool
+    moving: bool
+    leaving: bool
+
+
+@kernel
+def account_loads(block: Record, room: Record, halted: bool) -> tuple[bool, bool]:
+    """Take the efforts and following errors of the sample in the ``room`` into the ``block``; whether the arm moves,
+    not ``halted``, and is watched, and whether a joint is beyond a limit then: see `_account_loads`.
+
+    What a sample does not tell, or what is no number, becomes what is expected, in the ``room``, too. The block's
+    command is still that of the last step.
     """
     memory, work = block[0], room[0]
     n, window = memory.joints, memory.window
     efforts, following = work.sample[2 * n : 3 * n], work.sample[3 * n : 4 * n]
     mean = memory.mean_efforts[:n]
-    elapsed_s = (t_ns - memory.loads_ns) * 1e-9 if memory.loads_ns > 0 else math.inf
-    memory.loads_ns, memory.tells_efforts, memory.tells_following = (
-        t_ns,
-        int(tells_efforts),
-        int(tells_following),
-    )
+    elapsed_s = (work.joints_ns - memory.loads_ns) * 1e-9 if memory.loads_ns > 0 else math.inf
+    memory.loads_ns = work.joints_ns
+    memory.tells_efforts, memory.tells_following = work.tells_efforts, work.tells_following
     for j in range(n):
-        if tells_efforts:
+        if work.tells_efforts != 0:
             memory.efforts[j] = efforts[j]
         else:
             efforts[j] = mean[j]
-        if tells_following:
+        if work.tells_following != 0:
             memory.following_errors[j] = following[j]
-    forgets = elapsed_s > GAP_S or not active
+    forgets = elapsed_s > GAP_S or work.active == 0
     if forgets:
         memory.leave_s = 0.0
-    moving = not (forgets or stopped) and _moves(memory.command[:n])
+    moving = not (forgets or halted) and _moves(memory.command[:n])
     if moving:
         memory.leave_s = max(0.0, memory.leave_s - elapsed_s)
-    effort_limits, following_limits = work.effort_limits[:n], work.following_limits[:n]
-    if learning:
-        effort_limits, following_limits = work.stated_effort_limits[:n], work.stated_following_limits[:n]
-    beyond = _account_loads(
-        efforts, following, mean, memory.effort_excess[: window * n].reshape((window, n)),
+    limits = Loads(work.effort_limits[:n], work.following_limits[:n])
+    if work.learning != 0:
+        limits = Loads(work.stated_effort_limits[:n], work.stated_following_limits[:n])
+    history = LoadHistory(
+        mean, memory.effort_excess[: window * n].reshape((window, n)),
         memory.following_excess[: window * n].reshape((window, n)), memory.contact_low[: 2 * n].reshape((2, n)),
-        memory.contact_high[: 2 * n].reshape((2, n)), elapsed_s, forgets, moving, memory.leave_s > 0.0, effort_limits,
-        following_limits,
+        memory.contact_high[: 2 * n].reshape((2, n)),
     )  # fmt: skip
+    situation = Situation(elapsed_s, forgets, moving, memory.leave_s > 0.0)
+    beyond = _account_loads(Loads(efforts, following), history, situation, limits)
     return moving, beyond and moving
 
 
@@ -235,18 +312,18 @@ def _moves(command: FloatArray) -> bool:
 
 
 @kernel
-def _account_loads(
-    efforts: FloatArray, following: FloatArray, mean: FloatArray, effort_excess: FloatArray,
-    following_excess: FloatArray, low: FloatArray, high: FloatArray, elapsed_s: float, forgets: bool, moving: bool,
-    leaving: bool, effort_limits: FloatArray, following_limits: FloatArray,
-) -> bool:  # fmt: skip
-    """Take a sample's ``efforts`` and ``following`` errors (n,) into the arrays of the block; whether all samples of
-    a window are beyond a limit on one side, or a limit is none.
+def _account_loads(sample: Loads, history: LoadHistory, situation: Situation, limits: Loads) -> bool:
+    """Take a ``sample`` into the ``history``; whether all samples of a window are beyond a limit on one side, or a
+    limit is none.
 
-    Readings that are no numbers become what is expected. The mean begins anew where it ``forgets`` (the drives were
-    off, or nothing was heard for long); at rest what comes while the arm is ``leaving`` a contact belongs to it. In
-    motion a reading is compared with the mean and zero, or with anything that a contact brought of late.
+    Readings that are no numbers become what is expected. The mean begins anew where it forgets (the drives were off, or
+    nothing was heard for long); at rest what comes while the arm is leaving a contact belongs to it. In motion a
+    reading is compared with the mean and zero, or with anything that a contact brought of late.
     """
+    efforts, following = sample
+    mean, effort_excess, following_excess, low, high = history
+    elapsed_s, forgets, moving, leaving = situation
+    effort_limits, following_limits = limits
     beyond = False
     for j in range(efforts.size):
         if not math.isfinite(efforts[j]):
@@ -290,66 +367,46 @@ FOLLOWS, LACKS, SILENT = range(3)
 """What `account_following` has found."""
 
 
-def detect_following_error(
-    state: CoreState, settings: CoreSettings, room: Workspace, q: FloatArray, dt_s: float,
-    sent: FloatArray | None = None,
-) -> Reason | None:  # fmt: skip
-    """Account for ``dt_s`` since the last step; the reason where a joint (worst first) does not follow.
-
-    The block's command is still that of the last step; ``sent`` (n,), if any: what the driver made of it, which counts.
-    A joint's missing travel is its commanded minus its measured one, forgotten over ``MEMORY_S``; it may reach
-    ``LAG_S`` at full speed, beside what its drive's delay explains. What is sent to a joint whose reading stands still
-    is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new sample nothing is concluded.
-    """
-    block, numbers, commanded = state.block, room.numbers, state.block.command
-    if sent is not None and sent.shape == q.shape and np.isfinite(sent).all():
-        commanded, block.command[:] = commanded.copy(), sent
-    found = account_following(block.record, room.record, q, dt_s)
-    block.command[:] = commanded
-    if found == FOLLOWS:
+def explain_following(context: StepContext) -> Reason | None:
+    """The reason where a joint (worst first) does not follow, by what `account_following` has found in this step."""
+    settings, block, work = context.settings, context.state.block, context.derived.room.numbers
+    if work.following == FOLLOWS:
         return None
-    joint = numbers.worst
-    if found == LACKS:
+    joint = work.worst
+    if work.following == LACKS:
         lag, delay_s = LAG_S * settings.limits.velocity_max, block.delay_s
-        return not_following(joint, numbers.missing, float(lag[joint]), float(delay_s[joint]), settings)
+        return not_following(joint, work.missing, float(lag[joint]), float(delay_s[joint]), settings)
     return silent(joint, float(block.silent_travel[joint]), float(block.silent_s[joint]), settings)
 
 
 @kernel
-def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -> int:
-    """Account for ``dt_s`` of the last command with the joints at ``q`` (n,), in the ``block``; what was found, of
-    which joint and how much is missing being in the ``room``.
+def account_following(block: Record, room: Record) -> int:
+    """Account for the time since the last step at the last command, or at what the driver has sent in its place; what
+    was found, of which joint and how much is missing being in the ``room``.
+
+    A joint's missing travel is its commanded minus its measured one, forgotten over ``MEMORY_S``; it may reach
+    ``LAG_S`` at full speed, beside what its drive's delay explains. What is sent to a joint whose reading stands still
+    is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new sample nothing is concluded.
     """
     memory, work = block[0], room[0]
-    n, past = memory.joints, memory.past
-    command, answers = memory.command[:n], work.answers[:n]
-    last, delay_s, sent = memory.last_positions[:n], memory.delay_s[:n], memory.delay_sent[:n]
-    samples = memory.delay_samples[: DELAY_SAMPLES * n].reshape((DELAY_SAMPLES, n))
-    accounted, missing_late = memory.delay_accounted[:n], memory.delay_missing[:n]
-    silent_from, silent_travel, silent_s = (
-        memory.silent_from[:n],
-        memory.silent_travel[:n],
-        memory.silent_s[:n],
-    )
-    untold, missing, velocity = memory.untold_travel[:n], memory.missing_travel[:n], memory.delay_velocity[:n]
+    n, dt_s = memory.joints, work.elapsed_s
+    q, command, answers = work.q[:n], memory.command[:n], work.answers[:n]
+    if work.has_sent != 0:
+        command = work.sent[:n]
+    last, missing_late = memory.last_positions[:n], memory.delay_missing[:n]
+    silent_travel, silent_s = memory.silent_travel[:n], memory.silent_s[:n]
+    missing = memory.missing_travel[:n]
     if memory.silence_known == 0:
-        silent_from[:], silent_travel[:], silent_s[:] = q, 0.0, 0.0
+        memory.silent_from[:n], silent_travel[:], silent_s[:] = q, 0.0, 0.0
         memory.silence_known = 1
-    onset = memory.delay_onset[: 7 * n].reshape((7, n))
-    measure_delays(command, q, answers, dt_s, sent, onset, samples, delay_s)
+    delays = delays_of(block)
+    measure_delays(command, q, answers, dt_s, delays)
     if memory.followed == 0:
-        last[:], missing_late[:], accounted[:] = q, 0.0, sent
+        last[:], missing_late[:], delays.accounted[:] = q, 0.0, delays.sent
     told = memory.last_joints_ns != memory.last_followed_ns
-    account_travel(
-        command, q - last, told, max(0.0, 1.0 - dt_s / MEMORY_S), dt_s, work.period_s, memory.delay_steps, answers,
-        (
-            delay_s, sent, memory.delay_past[: past * n].reshape((past, n)), velocity, memory.delay_under_way[:n],
-            accounted, missing_late,
-        ),
-        samples, untold, missing,
-    )  # fmt: skip
+    account_travel(block, room, command, told, delays)
     memory.delay_steps += 1
-    account_silence(q, velocity, answers, work.friction[:n], dt_s, silent_from, silent_travel, silent_s)
+    account_silence(block, room)
     if not told:
         return FOLLOWS
     memory.last_followed_ns, memory.followed = memory.last_joints_ns, 1
@@ -371,7 +428,7 @@ def account_following(block: Record, room: Record, q: FloatArray, dt_s: float) -
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
     """The arm has met something: it stops with its drives on, as if a person had stopped it."""
-    reason = detect_collision(context.state, context.settings, context.derived.room, context.ingested.joints)
+    reason = explain_contact(context)
     if reason is None:
         return ()
     return (Finding("stop", reason, reason.hint, f"contact: {reason.hint}"),)
@@ -379,14 +436,7 @@ def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
 
 def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
-    state = context.state
-    if not context.settings.watch_following or state.block.numbers.history_count == 0:
-        return ()
-    room, elapsed_s = context.derived.room, context.ingested.elapsed_s
-    reason = detect_following_error(state, context.settings, room, context.q, elapsed_s, context.inputs.sent)
-    if state.lifecycle != Lifecycle.ACTIVE:
-        state.block.numbers.silence_known = 0  # what was sent before is no matter of what is sent next
-        return ()  # an arm that is off may be moved by hand
+    reason = explain_following(context)
     if reason is None:
         return ()
     return (Finding("fault", reason, reason.hint, reason.hint),)
@@ -439,22 +489,15 @@ QUIET = [NOISE] * OF
 
 def finish_round(context: StepContext) -> ModelDiagnosis | None:
     """Finish a round where one is complete; the new verdict where it has changed."""
-    state, arrays = context.state, context.arrays
+    state, arrays, work = context.state, context.arrays, context.derived.room.numbers
     watching = state.watching
     if arrays is None:
         return None
-    if not (watching.due or round_complete(state.block.record)):
-        return None
-    if state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED:
-        return None  # joints that a faulty drive tells are no measure of cameras
-    watching.due = False
-    moving = moving_camera.moving_bits(state) if any(state.mobile) else 0
-    looked_at, odd, masked = judge_round(
-        state.block.record, context.derived.room.record, context.now_ns, watching.masked, moving
-    )
+    if work.rounds_apart:
+        _judge_round_apart(context)
+    looked_at, odd, masked = work.looked_at, work.odd, work.any_masked
     if not looked_at:
         return None
-    watching.rounds += 1
     if not odd and not masked and watching.last == QUIET and watching.verdict == NOISE:
         return None
     verdict = NOISE
@@ -468,22 +511,33 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     return _changed(watching)
 
 
+def _judge_round_apart(context: StepContext) -> None:
+    """`judge_round` where it is due, without the cameras that move. Joints that a faulty drive tells are no measure of
+    cameras.
+    """
+    state, room = context.state, context.derived.room
+    faulty = state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED
+    if faulty or not round_is_due(state.block.record):
+        return
+    moving = moving_camera.moving_bits(state) if any(state.mobile) else 0
+    work = room.numbers
+    work.looked_at, work.odd, work.any_masked = judge_round(state.block.record, room.record, moving)
+
+
 def _cameras(bits: int) -> list[int]:
     """Numbers of the cameras that ``bits`` stands for."""
     return [c for c in range(bits.bit_length()) if bits >> c & 1]
 
 
 @kernel
-def judge_round(
-    block: Record, room: Record, now_ns: int, masked: FloatArray, moving: int
-) -> tuple[int, int, bool]:
+def judge_round(block: Record, room: Record, moving: int) -> tuple[int, int, bool]:
     """Look at the newest frame of each camera: those that are recent, and of them those whose innovations do not look
-    like noise, all together and each of them; and whether any marker is ``masked`` (m,) > 0.
+    like noise, all together and each of them; and whether any marker is masked.
 
     Cameras are bits of a number, as are those that are ``moving``, which are left out.
     """
     memory, work = block[0], room[0]
-    rows = memory.rows
+    rows, masked, now_ns = memory.rows, work.masked[: memory.markers], work.now_ns
     known = odd = 0
     for c in range(memory.cameras):
         frame, bit = memory.sightings[c], 1 << c
@@ -581,14 +635,35 @@ def _monitor_relocalization(context: StepContext) -> Findings:
     return ()
 
 
+def _never(state: CoreState) -> bool:
+    """Of monitors that act on what `detect`, or a request, brings."""
+    return False
+
+
+def _refuses(state: CoreState) -> bool:
+    """Whether the newest sample of some source is one that was refused: the next one may be good."""
+    return state.refused_joints.reason is not None or any(
+        refused.reason is not None for refused in state.refused_frames
+    )
+
+
+def looks_apart(state: CoreState) -> bool:
+    """Whether Python looks at the rounds of frames: where cameras may move, or are found anew."""
+    return state.reanchoring is not None or any(state.mobile)
+
+
 MONITORS: tuple[Monitor, ...] = (
-    Monitor("stop", _monitor_stop, in_fast_path=True),
-    Monitor("requests", _answer_requests, in_fast_path=True),
-    Monitor("inputs", _monitor_inputs, in_fast_path=True),
-    Monitor("collision", monitor_collision, in_fast_path=True),
-    Monitor("following error", monitor_following, in_fast_path=True),
-    Monitor("teaching", _monitor_teaching, in_fast_path=True),
-    Monitor("innovations", _monitor_innovations, in_fast_path=True),
-    Monitor("model", _monitor_model, in_fast_path=True),
-    Monitor("relocalization", _monitor_relocalization, in_fast_path=True),
+    Monitor("stop", _monitor_stop, _never),
+    Monitor("requests", _answer_requests, _never),
+    Monitor("inputs", _monitor_inputs, _refuses),
+    Monitor("collision", monitor_collision, _never),
+    Monitor("following error", monitor_following, _never),
+    Monitor("teaching", _monitor_teaching, lambda state: state.teaching is not None),
+    Monitor(
+        "innovations",
+        _monitor_innovations,
+        lambda state: state.watching.verdict.kind != "ok" or looks_apart(state),
+    ),
+    Monitor("model", _monitor_model, lambda state: state.readiness is ModelReadiness.SUSPECT),
+    Monitor("relocalization", _monitor_relocalization, lambda state: state.reanchoring is not None),
 )

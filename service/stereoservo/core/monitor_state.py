@@ -4,7 +4,7 @@ averages of pixels at rest.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -60,9 +60,6 @@ class ModelMonitor(msgspec.Struct, eq=False):
     back: IntArray
     verdict: ModelDiagnosis = msgspec.field(default_factory=ModelDiagnosis)
     last: list[ModelDiagnosis] = []
-    rounds: int = 0
-    due: bool = False
-    """A camera has given two frames since the last round: the others are not waited for."""
 
 
 class MobileCamera(msgspec.Struct, eq=False):
@@ -161,8 +158,8 @@ class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
     """Frames taken, by camera."""
 
 
-class DriveDelays(msgspec.Struct, eq=False):
-    """How late the joints' drives are, and what they lack of their travel besides; see `core.move`.
+class DriveDelays(NamedTuple):
+    """How late the joints' drives are, and what they lack of their travel besides; see `core.late_drives`.
 
     ``delay_s`` (n,) as measured, 0 before and where it is no matter: the median of ``samples`` (k, n) [s]. ``onset``
     (7, n): the measurement in progress. ``sent`` (n,) [rad or m] in all, and ``past`` (r, n) of the last r steps.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,7 +30,7 @@ from stereoservo.kinematics.kernels import (
     undistort_pixel,
 )
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArray, Record
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import inlined_kernel, kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
@@ -72,47 +73,77 @@ def chain_at(arrays: ModelArrays, q: FloatArray) -> tuple[FloatArray, FloatArray
     return found
 
 
+class Arm(NamedTuple):
+    """An arm as the cameras see it: ``generators`` (n, 4, 4) at the ``zero`` (n,), ``kinds`` (n,) 1 for prismatic
+    joints, whether they compose ``tip_first``, and the ``marker_points`` (m, 4) that it carries at the zero.
+    """
+
+    generators: FloatArray
+    kinds: KindArray
+    zero: FloatArray
+    tip_first: bool
+    marker_points: FloatArray
+
+
+class Predicted(NamedTuple):
+    """The fields of a `Prediction`, to be written into."""
+
+    operators: FloatArray
+    points: FloatArray
+    pixels: FloatArray
+    jacobian: FloatArray
+
+
+def arm_in(arrays: ModelArrays) -> Arm:
+    """The arm of a model."""
+    return Arm(arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first, arrays.marker_points)
+
+
+@inlined_kernel
+def arm_of(room: Record) -> Arm:
+    """The arm whose model is in the ``room``."""
+    work = room[0]
+    n, m = work.joints, work.markers
+    return Arm(
+        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], work.tip_first != 0,
+        work.marker_points[: 4 * m].reshape((m, 4)),
+    )  # fmt: skip
+
+
 def predict(arrays: ModelArrays, q: FloatArray, camera: int | None = None) -> Prediction:
     """Bring the projective kinematics to ``q`` (5.21) and predict every marker in every camera, or in one (8.35)."""
-    return Prediction(
-        *predict_markers(
-            arrays.generators, arrays.kinds, arrays.zero, np.ascontiguousarray(q), arrays.tip_first,
-            arrays.marker_points, arrays.matrices if camera is None else arrays.matrices[camera : camera + 1],
-        )
-    )  # fmt: skip
+    matrices = arrays.matrices if camera is None else arrays.matrices[camera : camera + 1]
+    return Prediction(*predict_markers(arm_in(arrays), np.ascontiguousarray(q), matrices))
 
 
 @kernel
 def predict_markers(
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, tip_first: bool,
-    marker_points: FloatArray, matrices: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """The fields of a `Prediction`."""
-    H, operators = chain_forward(generators, kinds, zero, q, tip_first)
-    points = transform_points(H, marker_points)
+    arm: Arm, q: FloatArray, matrices: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The fields of a `Prediction` in cameras (c, 3, 4)."""
+    H, operators = chain_forward(arm.generators, arm.kinds, arm.zero, q, arm.tip_first)
+    points = transform_points(H, arm.marker_points)
     pixels, _ = project_points(matrices, points)
     return operators, points, pixels, image_jacobian(operators, matrices, points)
 
 
 @kernel
-def predict_into(
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, tip_first: bool,
-    marker_points: FloatArray, matrices: FloatArray, operators: FloatArray, points: FloatArray, pixels: FloatArray,
-    jacobian: FloatArray,
-) -> None:  # fmt: skip
-    """`predict_markers` into the last four. To Python, an array that is returned costs more than one passed."""
-    found = predict_markers(generators, kinds, zero, q, tip_first, marker_points, matrices)
-    operators[:], points[:], pixels[:], jacobian[:] = found
+def predict_into(arm: Arm, q: FloatArray, matrices: FloatArray, found: Predicted) -> None:
+    """`predict_markers` into ``found``. To Python, an array that is returned costs more than one passed."""
+    operators, points, pixels, jacobian = predict_markers(arm, q, matrices)
+    found.operators[:], found.points[:], found.pixels[:], found.jacobian[:] = (
+        operators,
+        points,
+        pixels,
+        jacobian,
+    )
 
 
 @kernel
-def body_points(
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, tip_first: bool,
-    marker_points: FloatArray,
-) -> FloatArray:  # fmt: skip
+def body_points(arm: Arm, q: FloatArray) -> FloatArray:
     """The markers (m, 4) at ``q``."""
-    H, _ = chain_forward(generators, kinds, zero, q, tip_first)
-    return transform_points(H, marker_points)
+    H, _ = chain_forward(arm.generators, arm.kinds, arm.zero, q, arm.tip_first)
+    return transform_points(H, arm.marker_points)
 
 
 @kernel
@@ -124,9 +155,7 @@ def joint_step(jacobian: FloatArray, residual: FloatArray, weights: FloatArray, 
 
 def markers_at(arrays: ModelArrays, q: FloatArray) -> FloatArray:
     """The markers (m, 4) by kinematics alone at ``q`` (n,)."""
-    points: FloatArray = body_points(
-        arrays.generators, arrays.kinds, arrays.zero, q, arrays.tip_first, arrays.marker_points
-    )
+    points: FloatArray = body_points(arm_in(arrays), q)
     return points
 
 
@@ -253,51 +282,42 @@ FURTHER_STEPS = 3
 
 
 @kernel
-def present(block: Record, room: Record, q: FloatArray, now_ns: int) -> None:
-    """Into the ``room``, the present at ``q`` (n,): the markers by kinematics, the weights and pixels of what the
-    cameras saw of late; into the ``block``, the correction of the joints. See `_present`.
-    """
-    memory, work = block[0], room[0]
-    n, c, m = memory.joints, memory.cameras, memory.markers
-    _present(
-        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], q, work.tip_first != 0,
-        work.marker_points[: 4 * m].reshape((m, 4)), work.matrices[: 12 * c].reshape((c, 3, 4)),
-        memory.innovation[: 2 * c * m].reshape((c, m, 2)), memory.sigma[: c * m].reshape((c, m)),
-        memory.seen_ns[: c * m].reshape((c, m)), now_ns, work.lasting_ns, work.operators[: 16 * n].reshape((n, 4, 4)),
-        work.points[: 4 * m].reshape((m, 4)), work.predicted[: 2 * c * m].reshape((c, m, 2)),
-        work.jacobian[: 2 * c * m * n].reshape((c, m, 2, n)), work.weights[: c * m].reshape((c, m)),
-        work.pixels[: 2 * c * m].reshape((c, m, 2)), memory.correction[:n],
-    )  # fmt: skip
-
-
-@kernel
-def _present(
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, tip_first: bool,
-    marker_points: FloatArray, matrices: FloatArray, innovation: FloatArray, sigma: FloatArray, seen_ns: IntArray,
-    now_ns: int, lasting_ns: int, operators: FloatArray, points: FloatArray, predicted: FloatArray,
-    jacobian: FloatArray, weights: FloatArray, pixels: FloatArray, correction: FloatArray,
-) -> None:  # fmt: skip
-    """Into the last seven arguments: the fields of a `Prediction`; ``weights`` (c, m) 1/sigma [1/px] of markers seen
-    within ``lasting_ns``, 0 elsewhere; ``pixels`` (c, m, 2) where the markers are now: prediction plus held innovation;
-    and the ``correction`` (n,) of the joints that explains the innovations best, so that corrected points stay one
-    rigid body.
+def present(block: Record, room: Record) -> None:
+    """Into the ``room``, the present at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m) 1/sigma
+    [1/px] of markers seen of late, 0 elsewhere; ``pixels`` (c, m, 2) where the markers are now: prediction plus held
+    innovation. Into the ``block``, the ``correction`` (n,) of the joints that explains the innovations best, so that
+    corrected points stay one rigid body.
 
     The correction is one step of Gauss and Newton; more where it is large, as of arms with play, as long as they
     explain more.
     """
+    memory, work = block[0], room[0]
+    n, cameras, markers = memory.joints, memory.cameras, memory.markers
+    arm, q = arm_of(room), work.q[:n]
+    matrices = work.matrices[: 12 * cameras].reshape((cameras, 3, 4))
+    innovation = memory.innovation[: 2 * cameras * markers].reshape((cameras, markers, 2))
+    sigma, seen_ns = memory.sigma[: cameras * markers], memory.seen_ns[: cameras * markers]
+    predicted = work.predicted[: 2 * cameras * markers].reshape((cameras, markers, 2))
+    jacobian = work.jacobian[: 2 * cameras * markers * n].reshape((cameras, markers, 2, n))
+    weights = work.weights[: cameras * markers].reshape((cameras, markers))
+    pixels = work.pixels[: 2 * cameras * markers].reshape((cameras, markers, 2))
     predict_into(
-        generators, kinds, zero, q, tip_first, marker_points, matrices, operators, points, predicted, jacobian
-    )
-    cameras, markers, n = predicted.shape[0], predicted.shape[1], q.size
+        arm, q, matrices,
+        Predicted(
+            work.operators[: 16 * n].reshape((n, 4, 4)), work.points[: 4 * markers].reshape((markers, 4)), predicted,
+            jacobian,
+        ),
+    )  # fmt: skip
     row_weights = np.empty(2 * cameras * markers)
     for c in range(cameras):
         for i in range(markers):
+            at = c * markers + i
             weights[c, i] = 0.0
-            if seen_ns[c, i] > 0 and now_ns - seen_ns[c, i] <= lasting_ns:
-                weights[c, i] = 1.0 / max(sigma[c, i], LEAST_SIGMA_PX)
+            if seen_ns[at] > 0 and work.now_ns - seen_ns[at] <= work.lasting_ns:
+                weights[c, i] = 1.0 / max(sigma[at], LEAST_SIGMA_PX)
             for k in range(2):
                 pixels[c, i, k] = predicted[c, i, k] + innovation[c, i, k]
-            row_weights[2 * (c * markers + i)] = row_weights[2 * (c * markers + i) + 1] = weights[c, i]
+            row_weights[2 * at] = row_weights[2 * at + 1] = weights[c, i]
     apart = innovation.copy().reshape(-1)
     step = joint_step(jacobian.reshape((-1, n)), apart, row_weights, CORRECTION_DAMPING)
     total, before = step.copy(), math.inf
@@ -307,9 +327,7 @@ def _present(
             large = large or not abs(step[j]) < LARGE_CORRECTION
         if not large:
             break
-        _, _, there, rows = predict_markers(
-            generators, kinds, zero, q + total, tip_first, marker_points, matrices
-        )
+        _, _, there, rows = predict_markers(arm, q + total, matrices)
         apart = (pixels - there).reshape(-1)
         left = 0.0
         for k in range(apart.size):
@@ -320,7 +338,7 @@ def _present(
         before = left
         step = joint_step(rows.reshape((-1, n)), apart, row_weights, CORRECTION_DAMPING)
         total = total + step
-    correction[:] = total
+    memory.correction[:n] = total
 
 
 def pixels_now(prediction: Prediction, cameras: list[CameraEstimate]) -> FloatArray:
@@ -362,35 +380,36 @@ def scene_of(
     return Scene(prediction.operators, arrays.composition, matrices, centres, points, pixels, weights)
 
 
+class Centre(NamedTuple):
+    """The centre of a goal: the affine middle of the markers by its ``weights`` (m,), or, where these are zero, the
+    point ``body`` (4,) of the body in the chain's zero.
+    """
+
+    weights: FloatArray
+    body: FloatArray
+
+
 def centre_of(source: ServoGoal, joints: FloatArray, arrays: ModelArrays, points: FloatArray) -> FloatArray:
     """The goal's centre (4,) of a body whose markers are at ``points`` (m, 4), with the arm at ``joints`` (n,)."""
     centre = np.empty(4)
-    centre_into(
-        arrays.generators, arrays.kinds, arrays.zero, joints, arrays.tip_first, points, source.centre_weights,
-        source.centre_body, centre,
-    )  # fmt: skip
+    centre_into(arm_in(arrays), joints, points, Centre(source.centre_weights, source.centre_body), centre)
     return centre
 
 
 @kernel
-def centre_into(
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, tip_first: bool, points: FloatArray,
-    centre_weights: FloatArray, centre_body: FloatArray, centre: FloatArray,
-) -> None:  # fmt: skip
-    """The ``centre`` (4,) of a goal: the affine middle of ``points`` (m, 4) by its weights (m,), or, where these are
-    zero, the point ``centre_body`` (4,) of the body, moved by the joints ``q`` (n,).
-    """
+def centre_into(arm: Arm, q: FloatArray, points: FloatArray, by: Centre, centre: FloatArray) -> None:
+    """The ``centre`` (4,) of a body with its markers at ``points`` (m, 4), moved by the joints ``q`` (n,)."""
     weighted = False
-    for i in range(centre_weights.size):
-        weighted = weighted or centre_weights[i] != 0.0
+    for i in range(by.weights.size):
+        weighted = weighted or by.weights[i] != 0.0
     if not weighted:
-        H, _ = chain_forward(generators, kinds, zero, q, tip_first)
-        transform_points_into(H, centre_body.reshape((1, 4)), centre.reshape((1, 4)))
+        H, _ = chain_forward(arm.generators, arm.kinds, arm.zero, q, arm.tip_first)
+        transform_points_into(H, by.body.reshape((1, 4)), centre.reshape((1, 4)))
         return
     for k in range(4):
-        centre[k] = centre_weights[0] * points[0, k]
-        for i in range(1, centre_weights.size):
-            centre[k] += centre_weights[i] * points[i, k]
+        centre[k] = by.weights[0] * points[0, k]
+        for i in range(1, by.weights.size):
+            centre[k] += by.weights[i] * points[i, k]
 
 
 HUBER = 2.5

@@ -5,116 +5,108 @@ model health and the estimated time offset of each camera.
 from __future__ import annotations
 
 import math
-from operator import is_
+from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.core.camera_state import CameraEstimate, CameraTiming
+from stereoservo.core.camera_state import CameraTiming
 from stereoservo.core.context import COMPILING, SourceOutput, StepContext
-from stereoservo.core.cycle import Event, Status, StepOutputs
+from stereoservo.core.cycle import Status, StepOutputs
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
-from stereoservo.core.limit import SafetyResult
+from stereoservo.core.limit import SafetyLimits, SafetyResult, limited_command
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import TIMING_SIGMA_S, Prediction, propagate_covariance
-from stereoservo.core.state import CoreState
+from stereoservo.core.sources.law import found_by_kernel
+from stereoservo.core.state import CoreState, LawRun, ServoGoal
 from stereoservo.core.workspace import LENS_SIZE
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
 from stereoservo.messages.reasons import Level, Reason
 from stereoservo.messages.status import CameraHealth, Health, Lifecycle, ModelReadiness
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, Record
+from stereoservo.numerics.arrays import BoolArray, FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import Prior
 
 LEVELS: tuple[Level, ...] = ("info", "slow", "hold", "fault")
 
 
-def report(
-    context: StepContext, motion: SourceOutput, limited: SafetyResult, events: list[Event]
-) -> StepOutputs:
+LOOK_EVERY_S = 0.2
+"""Between two examinations of why a law is slow or stuck."""
+
+
+def finish_step(context: StepContext, limits: SafetyLimits) -> None:
+    """Stage 7, in every step: a motion that has finished ends, and a few times a second a law's run is examined."""
+    state, output = context.state, context.output
+    if output is not None and output.finished:
+        finish(output, context)
+    state.step += 1
+    if not context.derived.room.numbers.runs or state.step % max(1, round(LOOK_EVERY_S / context.dt_s)):
+        return
+    source = state.source
+    examine = MOTION_SOURCES[type(source)].examine
+    if examine is not None:
+        told = tuple(_reasons_before(context, limited_command(context, limits)))
+        source.reasons = examine(source, context, told)  # type: ignore[union-attr]
+
+
+def outputs_of(context: StepContext, limits: SafetyLimits) -> StepOutputs:
     """The outputs of the step: nothing is commanded outside ACTIVE."""
     state = context.state
-    if motion.finished:
-        finish(motion, context)
-    state.step += 1
     return StepOutputs(
         state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
-        _status(context, motion, limited),
+        status_of(context, limits),
         () if state.step % context.derived.prior_every else _priors(context),
-        tuple(events),
+        tuple(context.events),
         state.driver_request,  # type: ignore[arg-type]
     )
 
 
-def _status(context: StepContext, motion: SourceOutput, limited: SafetyResult) -> Status:
-    """The status, its fields in their order: an argument by name costs as much as an array."""
+def status_of(context: StepContext, limits: SafetyLimits) -> Status:
+    """The status after the step, its fields in their order: an argument by name costs as much as an array."""
     state, derived, block = context.state, context.derived, context.state.block
-    diagnosis, health = _model_health(context)
+    masked = masked_ids(state)
+    diagnosis = shown_diagnosis(state.watching.verdict, masked)
+    motion, limited = motion_of(context), limited_command(context, limits)
     source, kind = state.source, MOTION_SOURCES[type(state.source)]
-    reasons = _reasons(context, motion, limited, diagnosis)
+    reasons = _reasons(context, _reasons_before(context, limited))
     done, left_s = (None, None) if kind.progress is None else kind.progress(source, context)
-    seen = derived.seen
-    if context.observations or seen is None or seen[0] is not state.cameras:
-        seen = derived.seen = _seen(context)
-    _, innovation_px, visible = seen
     numbers, (effort_limits, following_limits) = block.numbers, derived.load_limits or (None, None)
     model_epoch = 0 if state.model is None else state.model.epoch
-    efforts = block.efforts.copy() if numbers.tells_efforts else None
-    following_errors = block.following_errors.copy() if numbers.tells_following else None
+    estimates, names = state.cameras, derived.cameras
     return Status(
         context.now_ns, state.step, str(state.lifecycle), str(state.readiness), model_epoch, kind.name,
         kind.subject(source), kind.law(source), _level(reasons), reasons, context.q, block.velocities.copy(),
-        motion.velocity, block.command.copy(), motion.error_px, motion.task_error, innovation_px, visible, done, left_s,
-        efforts, following_errors, effort_limits, following_limits, health,
+        limited.raw, block.command.copy(), motion.error_px, motion.task_error,
+        {name: estimates[c].rms_px for name, c in names.items()},
+        {name: estimates[c].last_visible for name, c in names.items()}, done, left_s,
+        block.efforts.copy() if numbers.tells_efforts else None,
+        block.following_errors.copy() if numbers.tells_following else None, effort_limits, following_limits,
+        _health(context, diagnosis, masked),
     )  # fmt: skip
 
 
-def _seen(context: StepContext) -> tuple[list[CameraEstimate], dict[str, float], dict[str, int]]:
-    """The cameras' estimates, and of each camera, by name: the innovation [px], and the markers visible."""
-    estimates, names = context.state.cameras, context.derived.cameras
-    innovation_px = {name: estimates[c].rms_px for name, c in names.items()}
-    return estimates, innovation_px, {name: estimates[c].last_visible for name, c in names.items()}
+NO_MOTION = SourceOutput(np.zeros(0))
 
 
-def _model_health(context: StepContext) -> tuple[ModelDiagnosis, Health]:
-    """The diagnosis as it is shown, and what the status says of the model's health: those of the step before, where no
-    frame has come and nothing else that they follow from is another.
-    """
-    state, derived, watching = context.state, context.derived, context.state.watching
-    if context.plain and not context.observations and derived.model_health is not None:
-        return derived.model_health[2]
-    told = state.model, state.readiness, watching, watching.verdict
-    marks, known = watching.masked.tobytes(), derived.model_health
-    quiet = state.reanchoring is None and not any(state.mobile)
-    if (
-        known is not None
-        and quiet
-        and not context.observations
-        and all(map(is_, told, known[0]))
-        and marks == known[1]
-    ):
-        return known[2]
-    masked = masked_ids(state)
-    diagnosis = shown_diagnosis(watching.verdict, masked)
-    found = diagnosis, _health(context, diagnosis, masked)
-    derived.model_health = (told, marks, found) if quiet else None
-    return found
+def motion_of(context: StepContext) -> SourceOutput:
+    """What the active source has given in this step, a law's kernel included."""
+    if context.output is not None:
+        return context.output
+    source = context.state.source
+    if isinstance(source, ServoGoal) and not context.derived.room.numbers.rests:
+        return found_by_kernel(source, context)
+    return NO_MOTION
 
 
-def _reasons(
-    context: StepContext, motion: SourceOutput, limited: SafetyResult, diagnosis: ModelDiagnosis
-) -> tuple[Reason, ...]:
-    """Why the arm does not do what its source wants, or may not soon."""
-    state, explain = context.state, MOTION_SOURCES[type(context.state.source)].progress_reasons
-    if context.plain:
-        told = (*limited.reasons, *motion.reasons)
-        return told if explain is None else told + explain(state.source, context, told)
-    found = [*state.fault, *limited.reasons, *motion.reasons]
+def _reasons_before(context: StepContext, limited: SafetyResult) -> list[Reason]:
+    """Why the arm does not do what its source wants, before what a law's run shows over time."""
+    state = context.state
+    found = [*state.fault, *limited.reasons, *motion_of(context).reasons]
     for refused in (state.refused_joints, *state.refused_frames):
         if refused.reason is not None and not _latched(refused.reason, state):
             found.append(refused.reason)
@@ -122,12 +114,20 @@ def _reasons(
         found.extend(camera_relocalization.reasons(state))
     if any(state.mobile):
         found.extend(moving_camera.reasons(state, context.settings))
+    diagnosis = shown_diagnosis(state.watching.verdict, masked_ids(state))
     if state.reanchoring is None and diagnosis.kind != "ok":
         reason = diagnosis_reason(diagnosis)
         if reason is not None:
             found.append(reason)
-    if explain is not None and not context.paused:
-        found.extend(explain(state.source, context, tuple(found)))
+    return found
+
+
+def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
+    """All reasons, beside those ``found`` before: of a law's run those of its last examination."""
+    state = context.state
+    if context.derived.room.numbers.runs and isinstance(state.source, LawRun):
+        codes = {reason.code for reason in found}
+        found.extend([reason for reason in state.source.reasons if reason.code not in codes])
     if state.planning is not None:
         found.append(planning_reason(state.planning))
     if context.inputs.compiling:
@@ -257,12 +257,13 @@ def priors(
     """
     state, room, now_ns = context.state, context.derived.room, context.now_ns
     shape = prediction.pixels.shape
-    pixels, speed, covariance = np.empty(shape), np.empty(shape), np.empty((*shape, 2))
+    expected = Expected(np.empty(shape), np.empty(shape), np.empty((*shape, 2)))
+    pixels, speed, covariance = expected
     if arrays.joint_accuracy is not None:
         room.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
     beyond = expect_sights(
-        state.block.record, room.record, now_ns, prediction.pixels, prediction.jacobian,
-        sum([1 << c for c in moving]), pixels, speed, covariance,
+        state.block.record, room.record, prediction.pixels, prediction.jacobian, sum([1 << c for c in moving]),
+        expected,
     )  # fmt: skip
     found = []
     for c, (camera, estimate) in enumerate(zip(context.settings.cameras, state.cameras, strict=True)):
@@ -277,68 +278,58 @@ def priors(
     return tuple(found)
 
 
-@kernel
-def expect_sights(
-    block: Record, room: Record, now_ns: int, predicted: FloatArray, jacobian: FloatArray, moving: int,
-    pixels: FloatArray, speed: FloatArray, covariance: FloatArray,
-) -> int:  # fmt: skip
-    """Into the last three, (c, m, …): `expected_sights_into` of all cameras, as their lenses show them. As bits of a
-    number, the cameras with markers beyond the folds of their lenses; pixels of these are no numbers.
-
-    ``predicted`` (c, m, 2) with its ``jacobian`` (c, m, 2, n). Cameras whose bits are set in ``moving`` have seen
-    nothing of late.
-    """
-    memory, work = block[0], room[0]
-    m, lens_size = memory.markers, work.lens_size
-    beyond = 0
-    for c in range(memory.cameras):
-        at, end = m * c, m * (c + 1)
-        seen_ns = memory.seen_ns[at:end]
-        if moving & (1 << c):
-            seen_ns = np.zeros(m, np.int64)
-        expected_sights_into(
-            predicted[c], jacobian[c], memory.velocities[: memory.joints],
-            memory.innovation[2 * at : 2 * end].reshape((m, 2)), now_ns, seen_ns, work.unseen_px[at:end], pixels[c],
-            speed[c], covariance[c],
-        )  # fmt: skip
-        lens = work.lenses[LENS_SIZE * c : LENS_SIZE * c + lens_size]
-        if lens_size == 4 and lens[0] == 0.0:
-            continue
-        pixels[c], speed[c], covariance[c], seen = distort_expected(lens, pixels[c], speed[c], covariance[c])
-        if not seen.all():
-            beyond |= 1 << c
-    return beyond
-
-
-@kernel
-def expected_sights_into(
-    predicted: FloatArray, jacobian: FloatArray, velocities: FloatArray, innovation: FloatArray, now_ns: int,
-    seen_ns: IntArray, unseen_px: FloatArray, pixels: FloatArray, speed: FloatArray, covariance: FloatArray,
-) -> None:  # fmt: skip
-    """Pixels (m, 2), their velocities (m, 2) and covariances (m, 2, 2) that a camera is expected to have.
-
-    ``predicted`` (m, 2) with its ``jacobian`` (m, 2, n), plus the ``innovation`` (m, 2) of markers seen of late, at
-    ``seen_ns`` (m,); ``unseen_px`` (m,): deviation of the others.
-    """
-    m, n = jacobian.shape[0], jacobian.shape[2]
-    for i in range(m):
-        fresh = now_ns - seen_ns[i] <= SEEN_LATELY_NS and seen_ns[i] > 0
-        fastest = 0.0
-        for a in range(2):
-            along = 0.0
-            for j in range(n):
-                along += jacobian[i, a, j] * velocities[j]
-            speed[i, a] = along
-            fastest = max(fastest, abs(along))
-            pixels[i, a] = predicted[i, a] + (innovation[i, a] if fresh else 0.0)
-        sigma = (1.0 if fresh else unseen_px[i]) + TIMING_SIGMA_S * fastest
-        covariance[i, 0, 0] = covariance[i, 1, 1] = sigma * sigma
-        covariance[i, 0, 1] = covariance[i, 1, 0] = 0.0
-
-
 SEEN_LATELY_NS = 1_000_000_000
 LARGEST_WINDOW_PX = 20.0
 """Deviation beyond which a detector does better to look in the whole image."""
+
+
+class Expected(NamedTuple):
+    """What cameras are expected to see: ``pixels`` (c, m, 2), their ``velocities`` (c, m, 2) and ``covariances``
+    (c, m, 2, 2).
+    """
+
+    pixels: FloatArray
+    velocities: FloatArray
+    covariances: FloatArray
+
+
+@kernel
+def expect_sights(
+    block: Record, room: Record, predicted: FloatArray, jacobian: FloatArray, moving: int, expected: Expected
+) -> int:
+    """Into ``expected``, what all cameras are to see, as their lenses show it: ``predicted`` (c, m, 2) with its
+    ``jacobian`` (c, m, 2, n), plus the innovations of markers seen of late. As bits of a number, the cameras with
+    markers beyond the folds of their lenses; pixels of these are no numbers.
+
+    Cameras whose bits are set in ``moving`` have seen nothing of late.
+    """
+    memory, work = block[0], room[0]
+    n, m, lens_size = memory.joints, memory.markers, work.lens_size
+    beyond = 0
+    for c in range(memory.cameras):
+        pixels, speed, covariance = expected.pixels[c], expected.velocities[c], expected.covariances[c]
+        for i in range(m):
+            at = m * c + i
+            fresh = work.now_ns - memory.seen_ns[at] <= SEEN_LATELY_NS and memory.seen_ns[at] > 0
+            fresh = fresh and moving & (1 << c) == 0
+            fastest = 0.0
+            for a in range(2):
+                along = 0.0
+                for j in range(n):
+                    along += jacobian[c, i, a, j] * memory.velocities[j]
+                speed[i, a] = along
+                fastest = max(fastest, abs(along))
+                pixels[i, a] = predicted[c, i, a] + (memory.innovation[2 * at + a] if fresh else 0.0)
+            sigma = (1.0 if fresh else work.unseen_px[at]) + TIMING_SIGMA_S * fastest
+            covariance[i, 0, 0] = covariance[i, 1, 1] = sigma * sigma
+            covariance[i, 0, 1] = covariance[i, 1, 0] = 0.0
+        lens = work.lenses[LENS_SIZE * c : LENS_SIZE * c + lens_size]
+        if lens_size == 4 and lens[0] == 0.0:
+            continue
+        pixels[:], speed[:], covariance[:], within = distort_expected(lens, pixels, speed, covariance)
+        if not within.all():
+            beyond |= 1 << c
+    return beyond
 
 
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:

@@ -1,69 +1,67 @@
 """`ServoCore`, the control algorithm of the servo loop: one step maps joint samples, camera observations and requests
-to a joint velocity, by seven stages. Deterministic given its state: no clock, no I/O, no random number.
+to a joint velocity. Deterministic given its state: no clock, no I/O, no random number.
 
-A step is seven stages, each a module of `core`, in this order:
+A step observes, moves and commands, by kernels on one flat record:
 
-1. `ingest`: stamps are checked before anything is used; the joints and the driver's lifecycle are those of now.
-2. `estimate`: a model that waited is taken, frames are compared at their own stamps, then the present is predicted:
-   all that follows works on one and the same present.
-3. `monitor`: the stop, then requests, then what the monitors find: before a goal is advanced or anything moves, so that
-   what must stop the arm stops it in this step, and requests are in force for the monitors (see there).
-4. `execute_goals`: plans go on, the next goal begins or is blended into, leases are watched; after the monitors, for
-   what they ended makes room for the next goal, and before the motion, so that a goal moves in the step it begins.
-5. `move`: the active motion source's velocity.
-6. `limit`: the safety stage; nothing changes a command after it.
-7. `report`: what became of it all, after the command is fixed: status, reasons, events, priors of the detectors.
+1. `observe`: `ingest` checks stamps before anything is used; `estimate` compares frames at their own stamps, then
+   predicts the present; `detect` looks for what must stop the arm; the progress of the active goal is measured.
+2. `decide`, only where something is asked, found, or to be looked after: the stop, then requests, then what the monitors
+   make of what was found, before a goal is advanced or anything moves; then plans, queued goals and leases.
+3. `move`: the active motion source's velocity.
+4. `command`: friction, late drives and the safety stage; nothing changes a command after it.
+5. `finish_step`: what has ended, ends. Status, reasons and detector priors are made of the step when they are asked for.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
-
 from stereoservo.control.law_registry import LAWS
+from stereoservo.core.arrange import arrange, attends, lease_until_ns
 from stereoservo.core.block import steps_of_delay
-from stereoservo.core.context import Derived, Ingested, StepContext
-from stereoservo.core.cycle import Event, StepInputs, StepOutputs
-from stereoservo.core.estimate import estimate, load_limits, workspace
+from stereoservo.core.command import command
+from stereoservo.core.context import NOTHING, Derived, StepContext
+from stereoservo.core.cycle import StepInputs, StepOutputs
+from stereoservo.core.estimate import load_limits, take_model, workspace
 from stereoservo.core.execute_goals import execute_goals
-from stereoservo.core.fast_path import fast_path
 from stereoservo.core.ingest import (
+    account_inputs,
     features_fresh_s,
+    follow_driver,
     frame_timeout_s,
-    ingest,
     longest_gap_s,
     nominal_period_ns,
+    put_inputs,
 )
-from stereoservo.core.limit import limit, safety_limits
+from stereoservo.core.limit import safety_limits
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitor import monitor
+from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import move
-from stereoservo.core.report import report
+from stereoservo.core.observe import observe
+from stereoservo.core.report import finish_step, outputs_of
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CoreState, initial_state
+from stereoservo.core.state import CoreState, Holding, ServoGoal, initial_state
+from stereoservo.messages.status import Lifecycle
 
 PRIOR_RATE_HZ = 125.0
-NOTHING = Ingested(None, (), 0.0, None, (), None, ())
+NO_INPUTS = StepInputs(0, 0, None)
 
 
 class ServoCore:
-    """The servo loop's algorithm. ``state`` is all that it remembers; ``fast``: whether ordinary steps go by
-    `core.fast_path`, with the same bits.
-    """
+    """The servo loop's algorithm. ``state`` is all that it remembers."""
 
-    def __init__(self, settings: CoreSettings, state: CoreState | None = None, *, fast: bool = True) -> None:
-        self.settings, self.fast = settings, fast
+    def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
+        self.settings = settings
         self.state = initial_state(settings) if state is None else state
         block, past = self.state.block, steps_of_delay(settings.rate_hz)
         if block.numbers.past != past:  # of a state that was written before drives were known to be late
             block.remember_steps(past)
         model = self.state.model
+        fresh_s = features_fresh_s(settings)
         self._derived = Derived(
             nominal_period_ns=nominal_period_ns(settings),
             longest_gap_s=longest_gap_s(settings),
             frame_timeout_s=frame_timeout_s(settings),
-            features_fresh_s=features_fresh_s(settings),
+            features_fresh_s=fresh_s,
             laws=LAWS.usable(),
             cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
             room=workspace(settings, model),
@@ -72,44 +70,78 @@ class ServoCore:
         )
         if model is not None:
             self._derived.use(model_arrays(model, settings))
-        self._limits = safety_limits(settings, self._derived.features_fresh_s)
+        self._limits = safety_limits(settings, fresh_s)
+        self._put_limits()
+        self._context = StepContext(self.state, settings, self._derived, NO_INPUTS)
+        self._arranged = self._attends = False
+        self._lease_until_ns = 0
+
+    def _put_limits(self) -> None:
+        """Write the limits of the safety stage and the longest ages of inputs into the workspace."""
+        derived, given = self._derived, self._derived.room.arrays
+        work, limits = derived.room.numbers, self._limits
+        given["limits"][:], given["bounds"][:] = limits.table, limits.bounds
+        work.nominal_s, work.longest_gap_s = derived.nominal_period_ns * 1e-9, derived.longest_gap_s
+        work.frame_timeout_s = derived.frame_timeout_s
 
     def step(self, inputs: StepInputs) -> StepOutputs:
-        """One cycle: the seven stages, in their order."""
-        events: list[Event] = []
-        context = self._context(inputs, events)
-        asked = inputs.requests or self.state.planning is not None
-        done = fast_path(context, self._limits) if self.fast and not asked else None
-        if done is not None:
-            motion, limited = done
-        else:
-            ingest(context)
-            context = estimate(context)
-            monitor(context)
-            execute_goals(context)
-            motion = move(context)
-            limited = limit(context, motion, self._limits)
-        return report(context, motion, limited, events)
+        """One cycle, and all that there is to tell of it."""
+        self.advance(inputs)
+        return self.outputs()
 
-    def _context(self, inputs: StepInputs, events: list[Event]) -> StepContext:
-        """The context before the first stage: nothing is known yet but the inputs and the state."""
-        state = self.state
+    def outputs(self) -> StepOutputs:
+        """What there is to tell of the newest step."""
+        return outputs_of(self._context, self._limits)
+
+    def advance(self, inputs: StepInputs) -> None:
+        """One cycle."""
+        context, state = self._context, self.state
+        context.begin(inputs)
         state.driver_request = ""
-
-        def emit(kind: str, **fields: Any) -> None:
-            state.event_seq += 1
-            events.append(Event(state.event_seq, inputs.now_ns, kind, **fields))  # type: ignore[arg-type]
-
-        # Whatever the last period was, a command may change by one step of the next.
-        period_ns = min(inputs.period_ns, self._derived.nominal_period_ns)
-        return StepContext(
-            inputs,
-            inputs.now_ns,
-            period_ns * 1e-9,
-            state,
-            self.settings,
-            self._derived,
-            emit,
-            np.empty(state.block.command.size),
-            NOTHING,
+        self._prepare(context)
+        put_inputs(context)
+        decides = bool(
+            self._attends or inputs.requests or inputs.stop or inputs.now_ns > self._lease_until_ns
         )
+        if observe(context, decides=decides) or decides:
+            self._decide(context)
+        source = state.source
+        if not isinstance(source, ServoGoal | Holding) and context.ingested is NOTHING:
+            context.ingested = account_inputs(context)
+        move(context)
+        room = self._derived.room
+        command(state.block.record, room.record, self._limits.keep_outs)
+        finish_step(context, self._limits)
+        if context.output is not None:  # Python has moved the arm, and may have changed what it likes
+            self._arranged = False
+
+    def _prepare(self, context: StepContext) -> None:
+        """What comes before a step: the driver's lifecycle is followed, and a model that waits is taken."""
+        state, inputs, work = context.state, context.inputs, self._derived.room.numbers
+        if not self._arranged:
+            self._arrange(context)
+        work.active_before = work.active
+        lifecycle = Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE
+        follows = state.lifecycle is lifecycle and inputs.driver_configured and inputs.driver_fault is None
+        if not follows:
+            follow_driver(context)
+        takes = inputs.model_update is not None or state.pending_model is not None
+        if takes:
+            take_model(context)
+        if takes or not follows:
+            self._arrange(context)
+
+    def _decide(self, context: StepContext) -> None:
+        """Act on what was asked and found, and advance goals."""
+        context.ingested = account_inputs(context)
+        if any(context.state.mobile):
+            moving_camera.step(context)
+        monitor(context)
+        execute_goals(context)
+        self._arrange(context)
+        self._arranged = False  # what is decided may bring something with the next step
+
+    def _arrange(self, context: StepContext) -> None:
+        arrange(context)
+        self._attends, self._lease_until_ns = attends(context), lease_until_ns(context.state.source)
+        self._arranged = True

@@ -30,7 +30,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
-STATE_VERSION = 12
+STATE_VERSION = 13
 LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
 
 

@@ -170,6 +170,7 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
     midst of trial motions, whose course is another one now.
     """
+    state = _with_round_due(state, version)
     if version >= 12:
         return state | {"version": STATE_VERSION}
     if version >= 10:
@@ -182,7 +183,16 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
         state["refused_frames"] = [nothing for _ in state["cameras"]]
     if version < 8 and (planning := state.get("planning")) is not None:  # large bodies are planned in parts
         planning["goal"] = planning["source"]["goal"]
-    return _with_run(state | {"block": _block_of(state)}) | {
+    block = _block_of(state) | {"round_due": int(state["watching"].get("due", False))}
+    return _with_run(state | {"block": block}) | {
         "version": STATE_VERSION,
         "loads": state["contact"].get("loads"),
     }
+
+
+def _with_round_due(state: dict[str, Any], version: int) -> dict[str, Any]:
+    """A state of before version 13, which had whether a round of frames is due beside the block."""
+    if version < 10:
+        return state  # it has no block yet
+    due = int(state["watching"].get("due", False))
+    return state | {"block": {**state["block"], "round_due": due}}

@@ -1,5 +1,6 @@
-"""What compiled kernels take beside the block: the constants of settings and model, and room for the results of one
-step, as one flat record of fixed size. Nothing of it is remembered: it follows from settings, model and block.
+"""What compiled kernels take beside the block: the inputs of one step, the constants of settings and model, what the
+core's Python state says of this step, and room for the results, as one flat record of fixed size. Nothing of it is
+remembered: it follows from inputs, settings, model and state.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 
 from stereoservo.control.faces import FaceChoice
 from stereoservo.control.law import Scene, Task
-from stereoservo.core.block import BLOCK, JOINTS, Shapes, packed_type, views
+from stereoservo.core.block import JOINTS, Shapes, packed_type, views
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitors.following import LAG_S, of_kinds
 from stereoservo.core.prediction import (
@@ -22,11 +23,13 @@ from stereoservo.core.prediction import (
     improbable,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.messages.cell_file import MAX_MARKERS
+from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_MARKERS
 from stereoservo.numerics.arrays import FloatArray
 
 LENS_SIZE = 7
 """Numbers of a lens, at most."""
+MAX_FRAMES = 4 * MAX_CAMERAS
+"""Frames that a step looks at, at most: the newest ones."""
 
 
 class Numbers(ctypes.Structure):
@@ -56,8 +59,69 @@ class Numbers(ctypes.Structure):
     tolerance_px: float
     time_limit_s: float
     hold_frames: int
-    told: int
+    now_ns: int
+    dt_s: float
+    elapsed_s: float
+    nominal_s: float
+    longest_gap_s: float
+    joint_timeout_s: float
+    frame_timeout_s: float
+    stop: int
+    active_before: int
+    active: int
+    faulty: int
+    joints_given: int
+    joints_whole: int
+    joints_ns: int
+    joints_seq: int
+    tells_efforts: int
+    tells_following: int
+    has_sent: int
+    frames: int
+    modelled: int
+    frames_apart: int
+    erring: int
+    stopped: int
+    by_images: int
+    watches_following: int
+    watches_loads: int
+    learning: int
+    rounds_apart: int
+    quiet: int
+    attend_ns: int
+    paused: int
+    aims: int
+    markers_needed: int
+    joints_found: int
+    frames_passed: int
+    frames_refused: int
+    gap: int
+    contact_watched: int
+    contact: int
+    following: int
+    looked_at: int
+    odd: int
+    any_masked: int
+    followed: int
+    seen: int
+    run_found: int
+    rests: int
+    by_law: int
+    compensates: int
+    needs_features: int
+    damping: float
+    redundant: int
+    speed_scale: float
+    runs: int
     features_ns: int
+    added: int
+    finite: int
+    allowed_scale: float
+    scale: float
+    scaled_by: int
+    share: float
+    shared_by: int
+    limited: int
     _fields_ = [
         (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
         for name, kind in __annotations__.items()
@@ -82,9 +146,19 @@ ARRAYS: Shapes = {
     "centre_target": (4,), "face": (3,), "eyes": ("cameras", 4),
     "usable": ("cameras", "markers"), "body": ("markers", 4), "centre": (4,),
     "velocity": JOINTS, "components": (2, 3), "component_status": (3,),
+    "q": JOINTS, "sent": JOINTS, "masked": ("markers",), "unknown": ("cameras",), "offset_rule": ("cameras",),
+    "stated_offset_ns": ("cameras",), "image_sizes": ("cameras", 2), "joint_deviations": JOINTS,
+    "limits": (4, "joints"), "bounds": (4,), "friction_most": JOINTS, "friction_travel": JOINTS, "raw": JOINTS,
+    "outermost": JOINTS, "previous": JOINTS, "acted": JOINTS,
+    "arrived_camera": (MAX_FRAMES,), "arrived_seq": (MAX_FRAMES,), "arrived_ns": (MAX_FRAMES,),
+    "arrived_count": (MAX_FRAMES,), "arrived_found": (MAX_FRAMES,), "arrived_ids": (MAX_FRAMES, MAX_MARKERS),
+    "arrived_pixels": (MAX_FRAMES, MAX_MARKERS, 2), "arrived_covariances": (MAX_FRAMES, MAX_MARKERS, 2, 2),
 }  # fmt: skip
-OTHER_TYPES = {"kinds": np.uint8, "row_ids": np.int64, "row_of": np.int64, "frame_seen": np.uint8, "face": np.int64,
-    "component_status": np.int64}  # fmt: skip
+INTEGERS = (
+    "row_ids", "row_of", "face", "component_status", "unknown", "offset_rule", "stated_offset_ns", "arrived_camera",
+    "arrived_seq", "arrived_ns", "arrived_count", "arrived_found", "arrived_ids",
+)  # fmt: skip
+OTHER_TYPES = {"kinds": np.uint8, "frame_seen": np.uint8, **dict.fromkeys(INTEGERS, np.int64)}
 WORKSPACE = packed_type(Numbers, ARRAYS, OTHER_TYPES, {})
 NOISE_CHI2 = np.array([improbable(2.0 * count) for count in range(MAX_MARKERS + 1)])
 """Of so many markers: what `improbable` says of a frame that is nothing but noise."""
@@ -94,30 +168,49 @@ Limits = tuple[FloatArray, FloatArray]
 class Workspace:
     """Constants and room; ``record`` (1,) of type `WORKSPACE` is all of it, and what kernels take.
 
-    Of the settings: ``period_s`` of the loop; ``velocity_max`` (n,); the ``lag`` [rad or m] of a healthy joint's drive
-    and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for how long a sight has a weight,
-    ``lasting_ns``; of a frame's gate: the squared distance ``gate``, for how long an innovation is known, ``known_s``,
-    and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,). Limits (n,) of efforts and following
-    errors: of the model, and those that the cell file states. Of the model: as in `ModelArrays`, its lenses of
-    ``lens_size`` numbers.
+    Inputs of the step, put there by `core.ingest`: the time ``now_ns`` and the period ``dt_s``, at most the nominal one
+    ``nominal_s``; whether the ``stop`` was raised; the joint ``sample`` (4, n) (positions, velocities, efforts,
+    following errors; ``joints_given``, ``joints_whole``: of every joint) with ``joints_ns`` and ``joints_seq``; what the
+    driver ``sent`` (n,) in place of the last command, where ``has_sent``; and ``frames`` that have ``arrived_…``, each
+    with its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes), ``ids``,
+    ``pixels``, ``covariances``.
 
-    Of a step: the ``sample`` (4, n) of the joints (positions, velocities, efforts, following errors), the fields of its
-    ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2), and the joint that follows ``worst``, with what it is
-    ``missing``. Of the frame that was looked at last: joints ``frame_q`` (n,), what `residuals` gives, and until the
-    present is there the prediction of its camera alone, ``of_frame``.
+    Of the settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad
+    or m] of a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for
+    how long a sight has a weight, ``lasting_ns``; of a frame's gate: the squared distance ``gate``, for how long an
+    innovation is known, ``known_s``, and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,),
+    ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): of the model, and those that the cell file
+    states. ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.limit.SafetyLimits`. Of the model: as
+    in `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of readings that err.
 
-    Of the goal that a law works on, as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are ``wanted``
-    (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres ``eyes`` of the
-    ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and ``centre`` now,
-    and whether an ``error_px`` was ``measured``. Its ``gain`` now, and the goal's gains, tolerance and limits, as in
-    `state.LawRun`. What a law finds: see `control.law.Law`. ``arrays``: all of these by name; ``scene`` and ``task``:
-    those that laws take; ``aim`` and ``faced``: of which goal and face they are. Of `core.fast_path`: ``spare``, room
-    for what the block was before; whether joints were ``told``; ``features_ns``, the stamp of the newest features.
+    What the state says of the step, by `core.arrange`: the lifecycle, ``active_before`` the driver's newest news and
+    ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python has looked at the frames; ``erring``:
+    joints may stand beside their readings; the arm is ``stopped``, ``paused``; what is watched; ``rounds_apart``:
+    Python looks at the rounds of frames, and ``quiet``: none of the last ones needed an explanation; ``masked`` (m,);
+    of each camera whether its place is ``unknown`` and what becomes of the offset of its stamps (``offset_rule``).
+
+    Of a step: the joints ``q`` (n,), what `ingest` has found of ``joints``, ``frames`` and the ``gap`` of the loop; the
+    fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); what the monitors have found: ``contact``,
+    ``following``, of which joint ``worst`` with what it is ``missing``; of a round the cameras that were ``looked_at``
+    and are ``odd``, as bits. Of the frame that was looked at last: joints ``frame_q`` (n,), what `residuals` gives, and
+    until the present is there the prediction of its camera alone, ``of_frame``.
+
+    Of the goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are
+    ``wanted`` (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres
+    ``eyes`` of the ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and
+    ``centre`` now, and whether an ``error_px`` was ``measured``; whether it was ``followed`` in this step, how many of
+    its markers were ``seen`` and what `account_run` has ``run_found``. Its ``gain`` now, and the goal's gains, tolerance
+    and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those that laws
+    take; ``aim`` and ``faced``: of which goal and face they are.
+
+    Of the motion: the source's ``velocity`` (n,), by a law's kernel (``by_law``, which is damped and, of an arm that is
+    ``redundant``, led away from limits), what else `core.context.SourceOutput` says of it, and ``raw`` (n,), with what
+    friction takes. What `core.limit` has found: ``finite`` to ``shared_by``, ``acted`` (n,), ``previous`` (n,) the
+    command before. ``arrays``: all arrays by name.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
         self.record: np.ndarray[Any, Any] = np.zeros(1, WORKSPACE)
-        self.spare: np.ndarray[Any, Any] = np.zeros(1, BLOCK)
         self._counts = {
             "joints": len(settings.joint_names),
             "cameras": len(settings.cameras),
@@ -132,9 +225,13 @@ class Workspace:
         self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
         self.numbers.known_s, self.numbers.filter_s = settings.limits.coast_s + 1.0, settings.filter_s
         self.numbers.gate = gate_threshold(settings.gate_sigma)
+        self.numbers.joint_timeout_s = settings.limits.joint_timeout_s
+        self.numbers.watches_following = settings.watch_following
         given = self.arrays
         given["noise_chi2"][:] = NOISE_CHI2
         given["camera_rates"][:] = [camera.rate_hz for camera in settings.cameras]
+        for sizes, camera in zip(given["image_sizes"], settings.cameras, strict=True):
+            sizes[:] = camera.width, camera.height
         given["velocity_max"][:] = settings.limits.velocity_max
         given["lag"][:] = LAG_S * settings.limits.velocity_max
         given["play"][:], given["answers"][:], given["friction"][:] = of_kinds(
@@ -146,7 +243,7 @@ class Workspace:
 
     def limit_loads(self, limits: Limits | None) -> None:
         """Collision thresholds (n,), (n,) from here on; None: nothing reaches them."""
-        self.watches_loads = limits is not None
+        self.numbers.watches_loads = limits is not None
         efforts, following = limits or (np.inf, np.inf)
         self.arrays["effort_limits"][:], self.arrays["following_limits"][:] = efforts, following
 
@@ -172,6 +269,8 @@ class Workspace:
         given["lenses"][:, : arrays.lenses.shape[1]] = arrays.lenses
         given["scene_pixels"][:, : len(arrays.scene_points)] = arrays.scene_pixels
         self.unseen_px[:] = arrays.unseen_px
+        given["joint_deviations"][:] = np.sqrt(arrays.joint_variances)
+        numbers.modelled, numbers.erring = True, arrays.joint_accuracy is not None
         present = self.prediction
         self.scene = Scene(
             present.operators, arrays.composition, given["matrices"], given["camera_centres"], given["body"],
@@ -187,8 +286,10 @@ class Workspace:
     def _view(self) -> None:
         given = self.arrays = views(self.record, ARRAYS, self._counts)
         self.sample: FloatArray = given["sample"]
-        self.limits: Limits = given["effort_limits"], given["following_limits"]
-        self.stated_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
+        self.q: FloatArray = given["q"]
+        self.sent: FloatArray = given["sent"]
+        self.load_limits: Limits = given["effort_limits"], given["following_limits"]
+        self.stated_load_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
         self.weights: FloatArray = given["weights"]
         self.velocity: FloatArray = given["velocity"]
         self.pixels: FloatArray = given["pixels"]

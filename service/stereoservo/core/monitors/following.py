@@ -1,6 +1,6 @@
 """Joints that do not follow: bounds, sums and reasons of the watch in `core.monitor`.
 
-What a joint was sent is compared with its reading as of now and as of its drive's delay (`core.move.measure_delays`),
+What a joint was sent is compared with its reading as of now and as of its drive's delay (`core.late_drives.measure_delays`),
 and what lies between the two is not missing.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from stereoservo.core.settings import CoreSettings
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 
 MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
@@ -83,14 +83,23 @@ def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tu
 
 
 @kernel
-def account_silence(
-    q: FloatArray, velocity: FloatArray, answers: FloatArray, friction: FloatArray, dt_s: float,
-    silent_from: FloatArray, silent_travel: FloatArray, silent_s: FloatArray,
-) -> None:  # fmt: skip
-    """Add up what each joint was sent (``velocity`` (n,), as it arrives), and for how long, since its reading changed.
-
-    ``friction`` (n,) may hold the rest back.
+def account_silence(block: Record, room: Record) -> None:
+    """Add up what each joint was sent, as it arrives, and for how long, since its reading changed; friction may hold
+    some of it back.
     """
+    memory, work = block[0], room[0]
+    n, dt_s = memory.joints, work.elapsed_s
+    q, velocity, answers, friction = (
+        work.q[:n],
+        memory.delay_velocity[:n],
+        work.answers[:n],
+        work.friction[:n],
+    )
+    silent_from, silent_travel, silent_s = (
+        memory.silent_from[:n],
+        memory.silent_travel[:n],
+        memory.silent_s[:n],
+    )
     for j in range(q.shape[0]):
         if abs(q[j] - silent_from[j]) > answers[j]:
             silent_from[j], silent_travel[j], silent_s[j] = q[j], 0.0, 0.0

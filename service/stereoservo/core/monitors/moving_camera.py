@@ -246,11 +246,12 @@ def takes(context: StepContext) -> bool:
     return True
 
 
-def step(context: StepContext) -> StepContext:
-    """Use cameras that stand again; the present with what is known now."""
+def step(context: StepContext) -> None:
+    """Use cameras that stand again; the present is then the one with what is known now."""
     state, settings = context.state, context.settings
-    if context.arrays is None:
-        return context
+    arrays = context.arrays
+    if arrays is None:
+        return
     for c, mobile in enumerate(state.mobile):
         if mobile is None or not mobile.moving:
             continue
@@ -259,12 +260,13 @@ def step(context: StepContext) -> StepContext:
         elif mobile.still >= STILL_FRAMES and state.planning is None and not state.pending_reanchored:
             mobile.doubtful = not _proven(c, context)
             if not mobile.doubtful:
-                context = _stand(c, mobile, context)
+                _stand(c, mobile, context)
             elif mobile.moved_px < LEAST_PX:
                 _stand_as_before(c, context)
         elif mobile.lost:
             _hand_over(c, mobile, context)
-    return context
+    if context.arrays is not arrays:
+        context.derived.use(context.arrays)
 
 
 def _proven(c: int, context: StepContext) -> bool:
@@ -294,7 +296,7 @@ def _stand_as_before(c: int, context: StepContext) -> None:
     context.emit("health", name="ok", message=message, cameras=(name,))
 
 
-def _stand(c: int, mobile: MobileCamera, context: StepContext) -> StepContext:
+def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
     """The camera is where the mean of the frames that agree has it."""
     state, arrays, model = context.state, context.arrays, context.state.model
     assert arrays is not None
@@ -327,9 +329,8 @@ def _stand(c: int, mobile: MobileCamera, context: StepContext) -> StepContext:
     prediction = predict(new, context.q)
     weights = context.weights.copy()
     weights[c] = 0.0
-    return msgspec.structs.replace(
-        context, arrays=new, prediction=prediction, weights=weights, pixels=pixels_now(prediction, state.cameras)
-    )  # fmt: skip
+    context.arrays, context.prediction, context.weights = new, prediction, weights
+    context.pixels = pixels_now(prediction, state.cameras)
 
 
 def mean_way(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:

@@ -5,9 +5,8 @@ adaptive gain and tracking of a plan, until the error stays below its tolerance 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from operator import is_
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,17 +18,27 @@ from stereoservo.control.pd import damped_velocity
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
+from stereoservo.core.prediction import (
+    Centre,
+    arm_in,
+    arm_of,
+    body_points,
+    centre_into,
+    centre_of,
+    scene_of,
+    triangulated,
+)
 from stereoservo.core.sources.progress import (
+    GOES_ON,
     OUT_OF_TIME,
     SETTLED,
+    RunTerms,
     Traits,
     account_run,
     begin_run,
     decay_of_error,
     error_of_run,
     examine_progress,
-    follow_error,
 )
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import IncidenceGoal, LawRun, ServoGoal
@@ -37,7 +46,7 @@ from stereoservo.core.target.follow import Follower, follow_target, stands, star
 from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, IntArray, KindArray, Record
+from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
@@ -49,20 +58,26 @@ SELF_MOTION_RATE = 0.5
 """[1/s], of a joint's half range: how fast self-motion takes it from a limit."""
 
 
-def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput:
-    """One step of a law: error, joint velocity, and whether the goal is reached or out of time."""
+def by_kernel(source: ServoGoal, law: Law) -> bool:
+    """Whether the kernel of a ``law`` alone drives to a goal: one that stands, by predicted points."""
+    return (
+        law.kernel is not None
+        and source.stream is None
+        and source.followed is None
+        and source.points == "predicted"
+    )
+
+
+def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
+    """One step of a law: error, joint velocity, and whether the goal is reached or out of time; None where the velocity
+    is in the workspace.
+    """
     law = context.derived.laws[source.law]
+    if by_kernel(source, law) and context.weights is context.derived.room.weights:
+        return _kernel_step(source, context, law)  # the present is another where a camera's place is found
     waiting = wait_for_target(source, context)
     if waiting is not None:
         return waiting
-    if (
-        law.kernel is not None
-        and source.stream is None
-        and source.points == "predicted"
-        and context.weights is not None
-        and context.weights is context.derived.room.weights
-    ):  # the present is another in a step in which a camera's place is found
-        return _compiled_step(source, context, law, law.kernel)
     arrays, prediction, pixels = context.arrays, context.prediction, context.pixels
     if arrays is None or prediction is None or context.weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")
@@ -114,40 +129,49 @@ def may_end(source: Follower, context: StepContext) -> bool:
     return source.followed is None or stands(context.state.target)
 
 
-def _compiled_step(
-    source: ServoGoal, context: StepContext, law: Law, kernel: Callable[[Record, float, float, int], None]
-) -> SourceOutput:
-    """`servo_step` of a goal that stands, by the ``kernel`` of its law."""
-    room = context.derived.room
-    aim_at(room, source)
-    seen, numbers = measure_goal(context.state.block.record, room.record, context.q), room.numbers
-    error_px = numbers.error_px if numbers.measured else None
-    ended = run_ended(source, context, error_px, seen, source.wanted, may_end=may_end(source, context))
-    if ended is not None:
-        return ended
+def _kernel_step(source: ServoGoal, context: StepContext, law: Law) -> SourceOutput | None:
+    """`servo_step` by the kernel of a ``law``; where the goal goes on its velocity is in the workspace, and None."""
+    room, record = context.derived.room, context.state.block.record
+    work = room.numbers
+    if not work.followed:  # it has just begun, or the state was looked after before
+        aim_at(room, source)
+        follow_goal(record, room.record)
+    if work.run_found != GOES_ON or work.seen < work.markers_needed:
+        ended = _ended(source, context, work.run_found, error_now(room), work.seen, work.markers_needed)
+        if ended is not None:
+            return ended
     if law.components:
         show_face(source, context)
+    assert law.kernel is not None
     try:
-        kernel(room.record, gain_now(source, error_px), context.dt_s, source.jacobian)
+        law.kernel(room.record, work.gain, context.dt_s, source.jacobian)
     except Exception as error:  # as any law: it ends its goal, never the loop
-        return _law_failed(source, context, error_px, error)
-    return output_of(source, context, law, error_px)
+        return _law_failed(source, context, error_now(room), error)
+    if source.damping != 0.0:
+        room.velocity[:] = damp(source, context, room.velocity)
+    if room.velocity.size > RIGID_FREEDOMS:
+        room.velocity += away_from_limits(context)
+    return None
 
 
-def output_of(source: ServoGoal, context: StepContext, law: Law, error_px: float | None) -> SourceOutput:
-    """The motion that the kernel of a law has found."""
-    room = context.derived.room
+def error_now(room: Workspace) -> float | None:
+    """The error [px] of the goal in the workspace; None where none is measured."""
+    return room.numbers.error_px if room.numbers.measured else None
+
+
+def found_by_kernel(source: ServoGoal, context: StepContext) -> SourceOutput:
+    """What the kernel of the goal's law has found in this step."""
+    room, law = context.derived.room, context.derived.laws[source.law]
     step = _found_step(room, len(law.components))
-    velocity = step.velocity
-    expected: FloatArray | float = 0.0
-    if source.followed is not None:
-        expected = feed_forward(source, context, room.arrays["usable"] * source.wanted)
-        velocity = velocity + expected
-    velocity = damp(source, context, velocity, expected)
-    if len(velocity) > RIGID_FREEDOMS:
-        velocity = velocity + away_from_limits(context)
     return SourceOutput(
-        velocity, True, source.goal.speed_scale, False, False, error_px, step.error, law.reasons(step)
+        step.velocity,
+        True,
+        source.goal.speed_scale,
+        False,
+        False,
+        error_now(room),
+        step.error,
+        law.reasons(step),
     )
 
 
@@ -176,13 +200,13 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
     numbers = room.numbers
     numbers.gain_near, numbers.gain_far, numbers.gain_slope = goal.gain_near, goal.gain_far, goal.gain_slope
     numbers.tolerance_px, numbers.time_limit_s = goal.tolerance_px, goal.time_limit_s
-    numbers.hold_frames = goal.hold_frames
+    numbers.hold_frames, numbers.markers_needed = goal.hold_frames, markers_needed(goal.wanted)
 
 
 def show_face(goal: ServoGoal, context: StepContext) -> None:
     """The face that a law with components works on for a ``goal``, into the workspace: by new images another one."""
     room = context.derived.room
-    if goal.pose_known and (context.observations or goal.choice.cameras == 0):
+    if goal.pose_known and (room.numbers.frames_passed or goal.choice.cameras == 0):
         scene, task = choose(goal, context, room.scene, room.task)
         _face(room, task.face, scene.camera_centres)
     elif room.faced is not goal.choice:
@@ -224,58 +248,74 @@ def goal_error(
     source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray, pixels: FloatArray
 ) -> GoalError:
     """Error and body of ``source`` with the present ``weights`` (c, m) and ``pixels`` (c, m, 2)."""
-    usable, points, centre = np.empty(weights.shape), np.empty(arrays.marker_points.shape), np.empty(4)
-    measured, error_px, seen = _goal_error(
-        weights, source.used, source.wanted, pixels, source.set_points, arrays.generators, arrays.kinds,
-        arrays.zero, context.q, context.state.block.correction, arrays.tip_first, arrays.marker_points,
-        source.centre_weights, source.centre_body, usable, points, centre,
-    )  # fmt: skip
+    usable = np.empty(weights.shape)
+    aim = Aim(source.used, source.wanted, source.set_points)
+    measured, error_px, seen = _measure(weights, pixels, aim, usable)
+    joints = context.q + context.state.block.correction
+    points: FloatArray = body_points(arm_in(arrays), joints)
+    centre = centre_of(source, joints, arrays, points)
     return GoalError(usable, error_px if measured else None, seen, points, centre)
 
 
+class Aim(NamedTuple):
+    """Of a goal: cameras ``used`` (c,), and ``set_points`` (c, m, 2) that are ``wanted`` (c, m)."""
+
+    used: FloatArray
+    wanted: FloatArray
+    set_points: FloatArray
+
+
 @kernel
-def _goal_error(
-    weights: FloatArray, used: FloatArray, wanted: FloatArray, pixels: FloatArray, set_points: FloatArray,
-    generators: FloatArray, kinds: KindArray, zero: FloatArray, q: FloatArray, correction: FloatArray, tip_first: bool,
-    marker_points: FloatArray, centre_weights: FloatArray, centre_body: FloatArray, usable: FloatArray,
-    points: FloatArray, centre: FloatArray,
-) -> tuple[bool, float, int]:  # fmt: skip
-    """The arrays of `GoalError` into the last three; whether an error was measured, it, and the markers seen."""
+def _measure(
+    weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArray
+) -> tuple[bool, float, int]:
+    """Whether an error was measured, the largest distance [px] over markers and cameras, and how many markers are seen;
+    into ``usable`` (c, m) the weights of the cameras that may be used.
+    """
     cameras, markers = weights.shape
     largest, measured, seen = 0.0, False, 0
     for i in range(markers):
         visible = False
         for c in range(cameras):
-            usable[c, i] = weights[c, i] * used[c]
-            if not usable[c, i] * wanted[c, i] > 0.0:
+            usable[c, i] = weights[c, i] * aim.used[c]
+            if not usable[c, i] * aim.wanted[c, i] > 0.0:
                 continue
             visible = True
-            u, v = pixels[c, i, 0] - set_points[c, i, 0], pixels[c, i, 1] - set_points[c, i, 1]
+            u, v = pixels[c, i, 0] - aim.set_points[c, i, 0], pixels[c, i, 1] - aim.set_points[c, i, 1]
             distance = math.sqrt(u * u + v * v)
             if distance > largest or math.isnan(distance):
                 largest = distance
         measured = measured or visible
         seen += visible
-    joints = q + correction
-    points[:] = body_points(generators, kinds, zero, joints, tip_first, marker_points)
-    centre_into(generators, kinds, zero, joints, tip_first, points, centre_weights, centre_body, centre)
     return measured, largest, seen
 
 
 @kernel
-def measure_goal(block: Record, room: Record, q: FloatArray) -> int:
-    """`goal_error` of the goal in the ``room``; how many of its markers are seen."""
+def follow_goal(block: Record, room: Record) -> None:
+    """The error and the body of the goal in the ``room``, as in `GoalError`, the gain there, and what `account_run` has
+    found; at the end of what is observed in a step.
+    """
     memory, work = block[0], room[0]
     n, c, m = work.joints, work.cameras, work.markers
-    measured, work.error_px, seen = _goal_error(
-        work.weights[: c * m].reshape((c, m)), work.used[:c], work.wanted[: c * m].reshape((c, m)),
-        work.pixels[: 2 * c * m].reshape((c, m, 2)), work.set_points[: 2 * c * m].reshape((c, m, 2)),
-        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], q, memory.correction[:n],
-        work.tip_first != 0, work.marker_points[: 4 * m].reshape((m, 4)), work.centre_weights[:m], work.centre_body,
-        work.usable[: c * m].reshape((c, m)), work.body[: 4 * m].reshape((m, 4)), work.centre,
+    aim = Aim(
+        work.used[:c], work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2))
+    )
+    measured, error_px, work.seen = _measure(
+        work.weights[: c * m].reshape((c, m)), work.pixels[: 2 * c * m].reshape((c, m, 2)), aim,
+        work.usable[: c * m].reshape((c, m)),
     )  # fmt: skip
-    work.measured = int(measured)
-    return seen
+    work.measured, work.error_px = int(measured), error_px
+    arm, points = arm_of(room), work.body[: 4 * m].reshape((m, 4))
+    joints = work.q[:n] + memory.correction[:n]
+    points[:] = body_points(arm, joints)
+    centre_into(arm, joints, points, Centre(work.centre_weights[:m], work.centre_body), work.centre)
+    known_px = error_px if measured else math.nan
+    terms = RunTerms(work.tolerance_px, work.hold_frames, work.time_limit_s)
+    work.run_found = account_run(
+        block, measured, known_px, work.seen >= work.markers_needed, work.dt_s, terms
+    )
+    work.gain = adaptive_gain(work.gain_near, work.gain_far, work.gain_slope, known_px)
+    work.followed = 1
 
 
 def activate_run(source: LawRun, context: StepContext) -> None:
@@ -312,10 +352,21 @@ def run_ended(
     off for a goal that moves still.
     """
     needed = MIN_MARKERS if seen >= MIN_MARKERS or wanted is None else markers_needed(wanted)
+    terms = RunTerms(source.tolerance_px, source.hold_frames, source.time_limit_s)
     found = account_run(
         context.state.block.record, error_px is not None, math.nan if error_px is None else error_px, seen >= needed,
-        context.dt_s, source.tolerance_px, source.hold_frames, source.time_limit_s,
+        context.dt_s, terms,
     )  # fmt: skip
+    return _ended(source, context, found, error_px, seen, needed, may_end=may_end)
+
+
+def _ended(
+    source: LawRun, context: StepContext, found: int, error_px: float | None, seen: int, needed: int, *,
+    may_end: bool = True,
+) -> SourceOutput | None:  # fmt: skip
+    """What a step comes to of which `account_run` has ``found`` something, or which shows too few markers; None: it
+    goes on.
+    """
     if found == OUT_OF_TIME:
         return _out_of_time(source, context, error_px)
     if seen < needed:
@@ -363,7 +414,7 @@ def choose(source: ServoGoal, context: StepContext, scene: Scene, task: Task) ->
     if not source.pose_known:
         return scene, task
     before = source.choice
-    if before.cameras > 0 and not context.observations:  # nothing has been seen since
+    if before.cameras > 0 and not context.derived.room.numbers.frames_passed:  # nothing has been seen since
         return law_scene(scene, before), task
     choice = choose_face(source.faces, scene, task, before)
     if choice.cameras == 0:  # nobody sees three markers of one face: on with the former, by the kinematics
@@ -473,7 +524,7 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
     plan = source.plan
     assert plan is not None
     if source.plan_s > 0.0:  # cycles that the loop missed: the arm went on with the velocity of the last one
-        missed = round(context.ingested.elapsed_s / context.dt_s) - 1
+        missed = round(context.derived.room.numbers.elapsed_s / context.dt_s) - 1
         source.plan_s = min(max(0.0, source.plan_s + missed * context.dt_s), float(plan.times[-1]))
     begin_s = source.plan_s
     set_points, share = _planned_set_points(source, scene)
@@ -536,11 +587,14 @@ def run_progress(source: LawRun, context: StepContext) -> Progress:
     return (done, left_s) if known else (None, None)
 
 
-def servo_progress_reasons(
-    source: ServoGoal, context: StepContext, reported: tuple[Reason, ...]
-) -> tuple[Reason, ...]:
-    """The progress reasons of a goal in set-points."""
-    return progress_reasons(source, context, reported, _servo_traits)
+def examine_servo(source: ServoGoal, context: StepContext, told: tuple[Reason, ...]) -> list[Reason]:
+    """The progress reasons of a goal in set-points, beside those ``told`` in this step."""
+    return examine_progress(source, context, told, _servo_traits(source, context))
+
+
+def examine_run(source: LawRun, context: StepContext, told: tuple[Reason, ...]) -> list[Reason]:
+    """The progress reasons of any other law's goal."""
+    return examine_progress(source, context, told, _plain_traits(source, context))
 
 
 def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
@@ -553,20 +607,3 @@ def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
 def _plain_traits(source: LawRun, context: StepContext) -> Traits:
     gain = gain_now(source, error_of_run(context.state.block)) / (1.0 + source.damping)
     return Traits(gain, run_progress(source, context)[1] or 0.0, moves=bool(source.goal.follow_markers))
-
-
-def progress_reasons(
-    source: LawRun,
-    context: StepContext,
-    told: tuple[Reason, ...],
-    traits: Callable[[Any, StepContext], Traits] = _plain_traits,
-) -> tuple[Reason, ...]:
-    """What a law's run shows over time beside the reasons ``told`` in this step; kept between two examinations."""
-    follow_error(context.state.block.record, source.tolerance_px, context.dt_s)
-    every = max(1, round(LOOK_EVERY_S / context.dt_s))
-    if context.state.step % every == 0:
-        source.reasons = examine_progress(source, context, told, traits(source, context))
-    if not source.reasons:
-        return ()
-    codes = {reason.code for reason in told}
-    return tuple(reason for reason in source.reasons if reason.code not in codes)

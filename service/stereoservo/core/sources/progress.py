@@ -45,19 +45,28 @@ def begin_run(block: Record) -> None:
     run.mean_px, run.least_px, run.least_s = 0.0, 0.0, 0.0
 
 
+class RunTerms(NamedTuple):
+    """Of a run: the tolerance [px] in which it has to stay for so many frames, and the time [s] in which it has to get
+    there.
+    """
+
+    tolerance_px: float
+    hold_frames: int
+    time_limit_s: float
+
+
 @kernel
 def account_run(
-    block: Record, measured: bool, error_px: float, enough: bool, dt_s: float, tolerance_px: float, hold_frames: int,
-    time_limit_s: float,
-) -> int:  # fmt: skip
+    block: Record, measured: bool, error_px: float, enough: bool, dt_s: float, terms: RunTerms
+) -> int:
     """Account for a step of ``dt_s`` with this error; whether the run is out of time, or, where ``enough`` markers are
-    seen, has stayed below its tolerance for ``hold_frames`` frames of every camera on average.
+    seen, has stayed below its tolerance for its frames of every camera on average.
     """
     memory = block[0]
     run = memory.run
     run.moved_s += dt_s
     run.measured, run.newest_px = measured, error_px
-    if run.moved_s > time_limit_s:
+    if run.moved_s > terms.time_limit_s:
         return OUT_OF_TIME
     if not enough:
         return GOES_ON
@@ -67,8 +76,8 @@ def account_run(
     new = frames - run.last_frames
     if new >= memory.cameras:
         run.last_frames = frames
-        run.held = run.held + new // memory.cameras if measured and error_px <= tolerance_px else 0
-    return SETTLED if run.held >= hold_frames else GOES_ON
+        run.held = run.held + new // memory.cameras if measured and error_px <= terms.tolerance_px else 0
+    return SETTLED if run.held >= terms.hold_frames else GOES_ON
 
 
 @kernel
