@@ -10,14 +10,14 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 from stereoservo.recording import step_layout
 from stereoservo.recording.compression import Checkpoints, StepBlocks
-from stereoservo.recording.step_layout import StepEncoder, decode_step
+from stereoservo.recording.step_layout import decode_step, encode_step
 from stereoservo_sim.benchmarks.core_loop import CoreLoop
 from stereoservo_sim.benchmarks.cycle import drive
 from stereoservo_sim.world.synthetic import rx90
 
 
 def test_nothing_is_encoded_in_a_usual_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop, encoder, kept = CoreLoop(rx90(), 1), StepEncoder(), []
+    loop, kept = CoreLoop(rx90(), 1), []
     step = loop.core.step
     monkeypatch.setattr(loop.core, "step", lambda inputs: kept.append((inputs, step(inputs))) or kept[-1][1])
     drive(loop, "stereo", 120)
@@ -26,17 +26,17 @@ def test_nothing_is_encoded_in_a_usual_step(monkeypatch: pytest.MonkeyPatch) -> 
     usual = [(inputs, outputs) for inputs, outputs in kept[-100:] if not outputs.events]
     assert len(usual) > 80
     assert any(inputs.observations for inputs, _ in usual)
-    encoder.encode(*usual[0])
+    encode_step(*usual[0])
     encoded.clear()
     for inputs, outputs in usual:
-        encoder.encode(inputs, outputs)
+        encode_step(inputs, outputs)
     frames = sum(bool(inputs.observations) for inputs, _ in usual)
     assert len(encoded) <= frames + 2, "of the health, which a frame may change"
 
 
 def test_an_arm_at_rest_takes_half_a_gigabyte_a_day_at_most() -> None:
     """Two cameras at 30 Hz with 14 noisy markers, a loop at 250 Hz that wakes up to tens of microseconds late."""
-    loop, encoder, blocks, again = CoreLoop(rx90(), 1), StepEncoder(), StepBlocks(), StepBlocks()
+    loop, blocks, again = CoreLoop(rx90(), 1), StepBlocks(), StepBlocks()
     loop.take_model()
     rng, records, size = np.random.default_rng(4), [], 0
     kept = []
@@ -52,7 +52,7 @@ def test_an_arm_at_rest_takes_half_a_gigabyte_a_day_at_most() -> None:
     for _ in range(round(seconds * 250)):
         loop.now_ns += int(abs(rng.normal(0.0, 10_000)))
         loop.step()
-    records = [encoder.encode(inputs, outputs) for inputs, outputs in kept]
+    records = [encode_step(inputs, outputs) for inputs, outputs in kept]
     for k in range(0, len(records), 100):
         block = blocks.compress(records[k : k + 100])
         assert again.restore(block) == records[k : k + 100]

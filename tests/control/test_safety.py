@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from oracles.safety import expected
 from stereoservo.core import limit
+from stereoservo.core.block import Block, views
+from stereoservo.core.command import command
 from stereoservo.core.limit import SafetyConfigurationError, SafetyInputs, SafetyLimits, safety_stage
-from stereoservo.messages.status import Lifecycle
+from stereoservo.core.workspace import ARRAYS, WORKSPACE, Numbers
 
 DT = 0.004
 
@@ -411,44 +413,54 @@ def test_the_stage_answers_as_its_plain_description_does():
 
 def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
     rng = np.random.default_rng(2)
-    for lifecycle in (*Lifecycle, *[Lifecycle.ACTIVE] * 60):
+    counts = {"joints": 3, "cameras": 2, "markers": 0, "rows": 0, "window": 1, "past": 2}
+    for active in (False, *[True] * 60):
         limits, step = drawn(rng)
         now_ns, source, cell = 10**12 + int(rng.integers(10**9)), *rng.uniform(0.2, 1.0, 2)
         ages_ns = [int(age * 1e9) for age in rng.uniform(0.0, 0.8, 3)]
-        accepted = [SimpleNamespace(accepted_ns=now_ns - age) for age in ages_ns[: rng.integers(3)]]
+        accepted = ages_ns[: rng.integers(3)]
         late = bool(
             rng.integers(2)
         )  # drives that are late: where they will be counts, and not where they are
+        block, record = Block(counts), np.zeros(1, WORKSPACE)
+        work, arrays = Numbers.from_buffer(record.view(np.uint8).data), views(record, ARRAYS, counts)
+        for estimate, age_ns in zip(block.estimates, accepted, strict=False):
+            estimate.accepted_ns = now_ns - age_ns
+        block.command[:], block.numbers.last_joints_ns = step.previous, now_ns - ages_ns[2] // 4
+        arrays["q"][:], arrays["velocity"][:] = step.positions, step.raw
+        arrays["limits"][:], arrays["bounds"][:] = limits.table, limits.bounds
+        work.now_ns, work.dt_s, work.active, work.paused = now_ns, step.dt_s, active, step.brake
+        work.needs_features, work.speed_scale = step.needs_features, source * cell
+        outermost = step.positions
+        if late:
+            block.delay_s[:], block.delay_under_way[:] = 0.1, rng.uniform(-0.5, 0.5, 3)
+            ahead, towards = (
+                step.positions + block.delay_under_way,
+                np.where(step.raw != 0.0, step.raw, step.previous),
+            )
+            outermost = np.where(
+                towards > 0.0, np.maximum(step.positions, ahead), np.minimum(step.positions, ahead)
+            )
+        command(block.record, record, limits.keep_outs)
         context = SimpleNamespace(
-            outermost=step.positions if late else None,
-            features_ns=max((frame.accepted_ns for frame in accepted), default=0),
-            state=SimpleNamespace(
-                block=SimpleNamespace(
-                    command=step.previous.copy(),
-                    numbers=SimpleNamespace(last_joints_ns=now_ns - ages_ns[2] // 4),
-                ),
-                lifecycle=lifecycle,
-            ),
-            q=step.positions + (0.7 if late else 0.0),
-            dt_s=step.dt_s,
-            now_ns=now_ns,
-            paused=step.brake,
-            settings=SimpleNamespace(limits=SimpleNamespace(speed_scale=cell)),
-        )
-        motion = SimpleNamespace(velocity=step.raw, needs_features=step.needs_features, speed_scale=source)
-        result = limit.limit(context, motion, limits)
+            derived=SimpleNamespace(room=SimpleNamespace(numbers=work, arrays=arrays)),
+            state=SimpleNamespace(block=block), now_ns=now_ns, dt_s=step.dt_s,
+        )  # fmt: skip
+        result = limit.limited_command(context, limits)
         same = msgspec.structs.replace(
             step,
+            positions=outermost,
             joint_age_s=ages_ns[2] // 4 * 1e-9,
-            feature_age_s=min(ages_ns[: len(accepted)], default=now_ns) * 1e-9,
+            feature_age_s=min(accepted, default=now_ns) * 1e-9,
             speed_scale=source * cell,
         )
         wanted = expected(same, limits)
-        np.testing.assert_allclose(result.limited, wanted.limited, rtol=1e-9, atol=1e-10)
+        sent = wanted.limited if active else np.zeros(3)
+        np.testing.assert_allclose(block.command, sent, rtol=1e-9, atol=1e-10)
+        np.testing.assert_array_equal(result.limited, block.command)
+        np.testing.assert_array_equal(result.raw, step.raw)
         assert [reason.code for reason in result.reasons] == [reason[0] for reason in wanted.reasons]
-        command = result.limited if lifecycle == Lifecycle.ACTIVE else np.zeros(3)
-        np.testing.assert_array_equal(context.state.block.command, command)
-        assert not np.shares_memory(context.state.block.command, result.limited)
+        assert not np.shares_memory(block.command, result.limited)
 
 
 def test_the_limits_are_those_of_the_cell():

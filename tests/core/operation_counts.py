@@ -49,7 +49,6 @@ def part_by_attribute(core: Any) -> None:
         block.record.view(np.recarray),
         room.record.view(np.recarray),
     )
-    room.spare = room.spare.view(np.recarray)
 
 
 def recorded(path: Path, kinds: tuple[str, ...] = ()) -> list[str]:

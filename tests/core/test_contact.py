@@ -17,8 +17,10 @@ from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings, CoreSettings
 from stereoservo.core.state import CoreState, initial_state
 from stereoservo.core.state_encoding import decode_state, encode_state
+from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.messages.goals import Calibrate, Enable, Goal, Jog, JointTarget, Resume, RunGoal
+from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 from stereoservo.ports.devices import JointState
 
@@ -46,6 +48,20 @@ def enabled(settings: CoreSettings) -> CoreState:
     return state
 
 
+def contact(state: CoreState, settings: CoreSettings, room: Workspace, sample: JointState) -> Reason | None:
+    """What the watch says of one sample."""
+    work = room.numbers
+    fill_sample(sample, room.sample)
+    work.joints_ns, work.active = sample.t_ns, state.lifecycle is Lifecycle.ACTIVE
+    work.tells_efforts, work.tells_following = (
+        sample.efforts is not None,
+        sample.following_errors is not None,
+    )
+    moving, beyond = monitor.account_loads(state.block.record, room.record, state.stopped)
+    work.contact_watched, work.contact = moving, beyond
+    return monitor.explain_contact(state, settings, room)
+
+
 def fly(
     state: CoreState,
     settings: CoreSettings,
@@ -65,8 +81,7 @@ def fly(
             k, state.block.numbers.loads_ns + step_ns + (gap_ns if k == 0 else 0), np.zeros(N), np.zeros(N),
             None if efforts is None else efforts[k], None if following is None else following[k],
         )  # fmt: skip
-        fill_sample(sample, room.sample)
-        reason = monitor.detect_collision(state, settings, room, sample)
+        reason = contact(state, settings, room, sample)
         if reason is not None:
             found.append((k, reason))
     return found
@@ -161,7 +176,7 @@ def test_a_long_silence_of_the_drives_is_no_contact(settings: CoreSettings) -> N
 def test_drives_that_tell_nothing_are_not_watched(settings: CoreSettings) -> None:
     state = enabled(settings)
     sample = JointState(1, 1, np.zeros(N), np.zeros(N))
-    assert monitor.detect_collision(state, settings, workspace(settings, None), sample) is None
+    assert contact(state, settings, workspace(settings, None), sample) is None
     assert not state.block.numbers.tells_efforts
     assert not state.block.numbers.tells_following
     lags = np.zeros((40, N))

@@ -23,7 +23,7 @@ from stereoservo.recording.compression import COUNT, ZERO, Checkpoints, StepBloc
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, recorded_messages, replay
-from stereoservo.recording.step_layout import StepEncoder
+from stereoservo.recording.step_layout import encode_step
 from stereoservo.recording.step_records import fingerprint
 
 FILES = [300, pytest.param(100_000, marks=[pytest.mark.slow, pytest.mark.timeout(7200)])]
@@ -38,7 +38,7 @@ def record(bench: Any, path: Path, steps: int) -> FlightRecorder:
                 recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
             outputs = bench.step()
             inputs = bench.log[-1][0]
-            recorder.step(StepEncoder().encode(inputs, outputs), inputs.now_ns)
+            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
     return recorder
 
 
@@ -226,7 +226,7 @@ def test_a_message_that_lies_is_a_refusal_with_what_comes_before(bench: Any, tmp
             for _ in range(5):
                 outputs = bench.step()
                 inputs = bench.log[-1][0]
-                recorder.step(StepEncoder().encode(inputs, outputs), inputs.now_ns)
+                recorder.step(encode_step(inputs, outputs), inputs.now_ns)
             recorder._flush()
             lie(recorder)
         with pytest.raises(RecordingError, match=f"{topic} record is damaged") as caught:

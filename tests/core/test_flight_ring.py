@@ -12,7 +12,7 @@ from stereoservo.core.state_encoding import encode_state
 from stereoservo.recording import ring as ring_module
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.ring import FlightRing, RingLimits, RingThread
-from stereoservo.recording.step_layout import StepEncoder
+from stereoservo.recording.step_layout import encode_step
 from stereoservo.recording.step_records import (
     RecordedCheckpoint,
     RecordedStep,
@@ -53,7 +53,7 @@ class Flight:
                 self.ring.take(RecordedCheckpoint(self.bench.now_ns, state.step, encode_state(state)))
             outputs = self.bench.step()
             inputs = self.bench.log[-1][0]
-            self.ring.take(RecordedStep(inputs.now_ns, StepEncoder().encode(inputs, outputs)))
+            self.ring.take(RecordedStep(inputs.now_ns, encode_step(inputs, outputs)))
             self.steps += 1
             if self.steps % CHECKPOINT_EVERY == 0:
                 self.stamp()

@@ -10,16 +10,29 @@ import numpy as np
 import pytest
 
 from stereoservo.core.estimate import workspace
-from stereoservo.core.monitor import detect_following_error
+from stereoservo.core.monitor import account_following, explain_following
 from stereoservo.core.monitors.following import PLAY, SILENCE_S
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import CoreState, initial_state
+from stereoservo.core.workspace import Workspace
 from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Jog, JointTarget, Reset
 from stereoservo.messages.reasons import Reason
 
 RATE_HZ = 250.0
 DT_S = 1.0 / RATE_HZ
 Encoder = Callable[[np.ndarray], np.ndarray]
+
+
+def following_error(
+    state: CoreState, settings: Any, room: Workspace, q: np.ndarray, dt_s: float = DT_S,
+    sent: np.ndarray | None = None,
+) -> Reason | None:  # fmt: skip
+    """What the watch says of one step, ``dt_s`` after the last, with the joints read at ``q``."""
+    room.q[:], room.numbers.elapsed_s, room.numbers.has_sent = q, dt_s, sent is not None
+    if sent is not None:
+        room.sent[:] = sent
+    room.numbers.following = account_following(state.block.record, room.record)
+    return explain_following(state, settings, room)
 
 
 def watched(
@@ -36,7 +49,7 @@ def watched(
         q[0] = readings[k - k % every]
         state.block.numbers.last_joints_ns = 1 + k - k % every
         sent = None if sent_share is None else sent_share * state.block.command
-        reason = detect_following_error(state, settings, room, q, DT_S, sent)
+        reason = following_error(state, settings, room, q, DT_S, sent)
         if reason is not None:
             return reason, k
         state.block.command[:] = np.zeros_like(q)
@@ -167,12 +180,12 @@ def test_without_new_samples_nothing_is_concluded(bench):
     state, room, q = initial_state(bench.settings), workspace(bench.settings, None), np.zeros(6)
     state.block.numbers.last_joints_ns = 1
     for _ in range(100):  # 0.4 s at 1 rad/s
-        assert detect_following_error(state, bench.settings, room, q, DT_S) is None
+        assert following_error(state, bench.settings, room, q, DT_S) is None
         state.block.command[:] = np.eye(6)[0]
     q[0] = 99 * DT_S
     state.block.numbers.last_joints_ns = 2
     state.block.command[:] = np.zeros(6)
-    assert detect_following_error(state, bench.settings, room, q, DT_S) is None
+    assert following_error(state, bench.settings, room, q, DT_S) is None
     assert np.abs(state.block.missing_travel).max() < 1e-9
 
 
@@ -181,7 +194,7 @@ def test_what_was_missing_before_a_long_gap_is_forgotten(bench):
     state.block.missing_travel[0] = 0.14
     for k, dt_s in enumerate((DT_S, 3.0)):
         state.block.numbers.last_joints_ns = 1 + k
-        assert detect_following_error(state, bench.settings, room, q, dt_s) is None
+        assert following_error(state, bench.settings, room, q, dt_s) is None
     assert not state.block.missing_travel.any()
 
 

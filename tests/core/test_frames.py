@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.core.estimate import KNOWN, TOLD, WAITED, take_frame, workspace
+from stereoservo.core.estimate import KNOWN, TOLD, fold_frame, see_frame, workspace
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays
 from stereoservo.core.monitor import judge_round
 from stereoservo.core.prediction import HUBER, MODEL_SIGMA_PX, TIMING_SIGMA_S, gate_threshold, improbable
@@ -24,6 +24,7 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
     block, room = initial_state(settings).block, workspace(settings, None)
     arrays = model_arrays(truth.model, settings)
     room.use(arrays)
+    room.arrays["masked"][MASKED] = 1.0
     m, rows = len(arrays.marker_ids), len(arrays.row_ids)
     assert rows == m + 4
     block.begin_sights(m, rows)
@@ -49,10 +50,11 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
         if k == 4:
             observed[OUTLIER] += 9.0
         shown = rng.permutation(rows)[: rows - 1]  # one is not seen, and they come in any order
-        found = take_frame(
-            block.record, room.record, camera, t_ns, ids[shown], observed[shown], covariances[shown], masked, True, True
-        )  # fmt: skip
-        assert found == KNOWN | TOLD | (WAITED if k >= 2 else 0)
+        room.put_frame(0, camera, (k, t_ns), (ids[shown], observed[shown], covariances[shown]))
+        found = see_frame(block.record, room.record, 0)
+        assert found == KNOWN | TOLD
+        fold_frame(block.record, room.record, 0, found)
+        assert block.numbers.round_due == (k >= 2)  # none has looked at the frame before
         frame = residuals(observed, predicted, velocity, covariances, TIMING_SIGMA_S)
         seen = np.isin(np.arange(rows), shown)
         used = seen & np.concatenate([masked == 0.0, np.ones(4, bool)])
@@ -92,6 +94,11 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
             odd |= 1 << camera
         last_ns = t_ns
     assert odd == 1
-    assert judge_round(block.record, room.record, last_ns, masked, 0) == (3, 1, True)
-    assert judge_round(block.record, room.record, last_ns, masked, 2)[0] == 1
-    assert judge_round(block.record, room.record, last_ns + 10**9, masked, 0)[:2] == (0, 0)
+
+    def judged(now_ns: int, moving: int = 0) -> tuple[int, int, bool]:
+        room.numbers.now_ns = now_ns
+        return judge_round(block.record, room.record, moving)
+
+    assert judged(last_ns) == (3, 1, True)
+    assert judged(last_ns, 2)[0] == 1
+    assert judged(last_ns + 10**9)[:2] == (0, 0)

@@ -25,7 +25,7 @@ from stereoservo.messages.goals import (
 )
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.replay import replay
-from stereoservo.recording.step_layout import StepEncoder
+from stereoservo.recording.step_layout import encode_step
 from stereoservo.recording.step_records import fingerprint
 
 DISPLACED = np.array([0.2, -0.15, 0.1, 0.3, -0.2, 0.4])
@@ -120,7 +120,7 @@ def test_planning_in_the_middle_replays_bit_for_bit(benches: Any, tmp_path: Path
                 recorder.checkpoint(bench.core.state.step + 1, encode_state(bench.core.state), bench.now_ns)
                 assert (bench.core.state.planning is not None) == (k == 8)
             outputs = bench.step(*([command] if k == 5 else []))
-            recorder.step(StepEncoder().encode(bench.log[-1][0], outputs), bench.log[-1][0].now_ns)
+            recorder.step(encode_step(bench.log[-1][0], outputs), bench.log[-1][0].now_ns)
     result = replay(path)
     assert (result.identical, result.steps, result.checkpoints) == (True, 300, 2)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.estimate import see_frame, workspace
+from stereoservo.core.estimate import KNOWN, see_frame, workspace
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import initial_state
@@ -134,7 +134,8 @@ def test_sights_beyond_the_fold_are_dropped_and_pinholes_pass_untouched(benches:
         block.begin_sights(len(arrays.ids), len(arrays.row_ids))
         room.use(arrays)
         given = observation.ids, observation.pixels, observation.covariances
-        assert see_frame(block.record, room.record, 0, 1, *given)[0]
+        room.put_frame(0, 0, (1, 1), given)
+        assert see_frame(block.record, room.record, 0) & KNOWN
         found = room.residuals(1)
         seen.append(found.seen[:3].tolist())
         pixels.append((room.of_frame.pixels[0] + found.innovation[: len(arrays.ids)])[:3])

@@ -16,7 +16,7 @@ from oracles.former_recording import FormerRecorder
 from oracles.former_recording import encode_step as former_step
 from stereoservo.control.law import LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.cycle import DriverFault, ModelUpdate, encode
+from stereoservo.core.cycle import DriverFault, Event, ModelUpdate, encode
 from stereoservo.core.state import STATE_VERSION
 from stereoservo.core.state_encoding import (
     OLDEST_VERSION,
@@ -32,7 +32,7 @@ from stereoservo.recording.compression import StepBlocks
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, replay
-from stereoservo.recording.step_layout import StepEncoder, decode_step, outputs_crc
+from stereoservo.recording.step_layout import decode_step, encode_step, outputs_crc, result_crc
 from stereoservo.recording.step_records import Fingerprint, fingerprint
 
 
@@ -72,7 +72,7 @@ def record(
                         inputs.joints, positions=inputs.joints.positions * (1 + 1e-12)
                     ),
                 )
-            recorder.step(StepEncoder().encode(inputs, outputs), inputs.now_ns)
+            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
         return recorder.steps
 
 
@@ -374,7 +374,7 @@ def test_a_step_record_holds_all_inputs_bit_for_bit(benches: Any) -> None:
             model_update=ModelUpdate(bench.truth.model, ("left",)),
         )
     )  # fmt: skip
-    records = [StepEncoder().encode(one, outputs) for one in variants]
+    records = [encode_step(one, outputs) for one in variants]
     for one, record in zip(variants, records, strict=True):
         again = decode_step(record)
         assert encode(again.inputs) == encode(one)
@@ -385,11 +385,29 @@ def test_a_step_record_holds_all_inputs_bit_for_bit(benches: Any) -> None:
         assert reader.restore(writer.compress(records[k : k + 20])) == records[k : k + 20]
 
 
-def test_the_checksum_sees_every_bit_of_the_outputs(bench: Any) -> None:
+def test_the_checksum_sees_every_bit_of_what_a_step_has_come_to(bench: Any) -> None:
     bench.ready()
     outputs = bench.step()
     status = outputs.status
     known = outputs_crc(outputs)
+    assert known == result_crc(bench.core.newest)  # of the core itself, where no outputs were made
+    for name in ("command_raw", "velocities"):
+        other = getattr(status, name).copy()
+        other[3] = np.nextafter(other[3], 1.0)
+        changed = msgspec.structs.replace(outputs, status=msgspec.structs.replace(status, **{name: other}))
+        assert outputs_crc(changed) != known, name
+    changed = msgspec.structs.replace(outputs, status=msgspec.structs.replace(status, error_px=0.0))
+    assert outputs_crc(changed) != known
+    told = Event(1, 1, "warning")
+    for name, value in (("driver_request", "reset"), ("command", None), ("events", (told,))):
+        assert outputs_crc(msgspec.structs.replace(outputs, **{name: value})) != known, name
+
+
+def test_the_checksum_of_layout_2_sees_every_bit_of_the_outputs(bench: Any) -> None:
+    bench.ready()
+    outputs = bench.step()
+    status = outputs.status
+    known = outputs_crc(outputs, 2)
     for name in status.__struct_fields__:
         value = getattr(status, name)
         if name in ("t_ns", "step"):  # compared by themselves, or the inputs'
@@ -407,9 +425,9 @@ def test_the_checksum_sees_every_bit_of_the_outputs(bench: Any) -> None:
             if name in ("efforts", "following_errors", "effort_limits", "following_limits"):
                 other = np.zeros(6)
         changed = msgspec.structs.replace(outputs, status=msgspec.structs.replace(status, **{name: other}))
-        assert outputs_crc(changed) != known, name
-    assert outputs_crc(msgspec.structs.replace(outputs, driver_request="reset")) != known
-    assert outputs_crc(msgspec.structs.replace(outputs, command=None)) != known
+        assert outputs_crc(changed, 2) != known, name
+    assert outputs_crc(msgspec.structs.replace(outputs, driver_request="reset"), 2) != known
+    assert outputs_crc(msgspec.structs.replace(outputs, command=None), 2) != known
 
 
 @pytest.mark.parametrize("told", range(16))
@@ -420,4 +438,4 @@ def test_loads_that_drives_do_not_tell_are_no_zeros(bench: Any, told: int) -> No
     fewer = msgspec.structs.replace(outputs, status=msgspec.structs.replace(outputs.status, **given))
     all_told = msgspec.structs.replace(outputs.status, **dict.fromkeys(names, np.zeros(6)))
     whole = msgspec.structs.replace(outputs, status=all_told)
-    assert (outputs_crc(fewer) == outputs_crc(whole)) == (told == 15)
+    assert (outputs_crc(fewer, 2) == outputs_crc(whole, 2)) == (told == 15)

@@ -7,7 +7,7 @@ import pytest
 
 from stereoservo.core.block import HISTORY
 from stereoservo.core.camera_state import CameraTiming
-from stereoservo.core.estimate import fold_timing
+from stereoservo.core.estimate import Moved, TimingSums, fold_timing
 from stereoservo.core.ingest import remember_joints
 from stereoservo.core.prediction import MODEL_SIGMA_PX, joints_at, velocities_at
 from stereoservo.core.report import advice, offset_s
@@ -18,9 +18,13 @@ from stereoservo.numerics.arrays import FloatArray
 def fold(timing: CameraTiming, innovation: FloatArray, velocity: FloatArray, t_ns: int) -> None:
     """Take in a frame of markers of a detector of 0.05 px."""
     noise, used = np.full(len(innovation), 0.05**2), np.ones(len(innovation))
-    timing.product, timing.square, timing.seen_ns = fold_timing(
-        timing.product, timing.square, timing.seen_ns, t_ns, innovation, velocity, noise, used
+    sums = fold_timing(
+        TimingSums(timing.product, timing.square, timing.seen_ns),
+        t_ns,
+        Moved(innovation, velocity, noise),
+        used,
     )
+    timing.product, timing.square, timing.seen_ns = sums
 
 
 def seen(

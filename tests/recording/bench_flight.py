@@ -12,7 +12,7 @@ from stereoservo.messages.recording_request import images_directory
 from stereoservo.ports.devices import Frame
 from stereoservo.ports.image_files import ImageWriter
 from stereoservo.recording.flight_recorder import FlightRecorder
-from stereoservo.recording.step_layout import StepEncoder
+from stereoservo.recording.step_layout import encode_step
 from stereoservo.recording.step_records import fingerprint
 
 GOAL_ID = str(uuid.UUID(int=1))
@@ -24,7 +24,6 @@ def record_bench(flight: Path, steps: int) -> tuple[Bench, FeatureTarget]:
     left, all of whose pixels are its number / 4. Returns the bench with its log, and the goal's set-points.
     """
     bench = make_bench(0, 0.02, k1=-0.1).ready()
-    encoder = StepEncoder()
     target = FeatureTarget(bench.features(bench.q + np.array([0.2, -0.1, 0.1, 0.2, -0.2, 0.3])))
     images_directory(flight).mkdir()
     left = bench.settings.cameras[0]
@@ -36,7 +35,7 @@ def record_bench(flight: Path, steps: int) -> tuple[Bench, FeatureTarget]:
         for k in range(steps):
             outputs = bench.step(*([RunGoal(Goal(GOAL_ID, target))] if k == GOAL_STEP else []))
             inputs = bench.log[-1][0]
-            recorder.step(encoder.encode(inputs, outputs), inputs.now_ns)
+            recorder.step(encode_step(inputs, outputs), inputs.now_ns)
             if k % 100 == 0:
                 image = np.full((left.height, left.width), k // 4, dtype=np.uint8)
                 pictures.append(Frame(left.name, k, inputs.now_ns, inputs.now_ns, image))

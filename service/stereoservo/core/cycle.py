@@ -5,7 +5,7 @@ events, and their msgpack encoding, arrays bit for bit.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import msgspec
 import numpy as np
@@ -202,6 +202,45 @@ class StepOutputs(msgspec.Struct, frozen=True, eq=False):
     priors: tuple[Prior, ...] = ()
     events: tuple[Event, ...] = ()
     driver_request: Literal["", "activate", "deactivate", "reset"] = ""
+
+    @property
+    def step(self) -> int:
+        """Number of the step."""
+        return self.status.step
+
+    @property
+    def raw(self) -> FloatArray:
+        """Velocity (n,) before the safety stage."""
+        return self.status.command_raw
+
+    @property
+    def velocities(self) -> FloatArray:
+        """Filtered velocities (n,) of the joints."""
+        return self.status.velocities
+
+    @property
+    def error_px(self) -> float | None:
+        """Error of the active goal; None where none is measured."""
+        return self.status.error_px
+
+
+class StepResult(Protocol):
+    """What a recording keeps of a step's outputs, as in `StepOutputs`."""
+
+    @property
+    def command(self) -> FloatArray | None: ...
+    @property
+    def events(self) -> tuple[Event, ...]: ...
+    @property
+    def driver_request(self) -> str: ...
+    @property
+    def step(self) -> int: ...
+    @property
+    def raw(self) -> FloatArray: ...
+    @property
+    def velocities(self) -> FloatArray: ...
+    @property
+    def error_px(self) -> float | None: ...
 
 
 _DTYPES = {dtype.str: dtype for dtype in map(np.dtype, "?bBhHiIqQfd")}

@@ -412,7 +412,9 @@ def fold_residuals(block: Record, room: Record, k: int) -> None:
     frame.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
     u, v = (0.0, 0.0) if worst < 0 else (innovation[worst, 0], innovation[worst, 1])
     frame.worst, frame.worst_px = worst, math.sqrt(u * u + v * v)
-    fold_timing(frame.timing, t_ns, Moved(innovation, velocity, work.frame_noise[:rows]), used)
+    timing, moved = frame.timing, Moved(innovation, velocity, work.frame_noise[:rows])
+    sums = fold_timing(TimingSums(timing.product, timing.square, timing.seen_ns), t_ns, moved, used)
+    timing.product, timing.square, timing.seen_ns = sums
 
 
 FORGETTING_S = 30.0
@@ -431,19 +433,26 @@ class Moved(NamedTuple):
     noise: FloatArray
 
 
+class TimingSums(NamedTuple):
+    """The sums of a `CameraTiming`."""
+
+    product: float
+    square: float
+    seen_ns: int
+
+
 @kernel
-def fold_timing(timing: Record, t_ns: int, frame: Moved, used: FloatArray) -> None:
-    """Into the sums of a `CameraTiming`, the rows of a frame that are ``used`` (k,) > 0.
+def fold_timing(sums: TimingSums, t_ns: int, frame: Moved, used: FloatArray) -> TimingSums:
+    """The ``sums`` with the rows of a frame that are ``used`` (k,) > 0.
 
     The markers of a frame share what the model is off by: they count as one sight, not as k.
     """
     k, speed, along, squared = _timing_sums(frame, used)
     if k == 0 or speed < MOVING_PX_S * k:
-        return
-    elapsed_s = min((t_ns - timing.seen_ns) * 1e-9, 0.2) if timing.seen_ns != 0 else 0.0
+        return sums
+    elapsed_s = min((t_ns - sums.seen_ns) * 1e-9, 0.2) if sums.seen_ns != 0 else 0.0
     keep = math.exp(-elapsed_s / FORGETTING_S)
-    timing.product, timing.square = keep * timing.product + along / k, keep * timing.square + squared / k
-    timing.seen_ns = t_ns
+    return TimingSums(keep * sums.product + along / k, keep * sums.square + squared / k, t_ns)
 
 
 @kernel

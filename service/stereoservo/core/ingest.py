@@ -311,19 +311,9 @@ def _within_bounds(number: int) -> int:
 def _put_frames(context: StepContext) -> None:
     """The step's frames into the workspace, the last `MAX_FRAMES` of them."""
     room, cameras = context.derived.room, context.derived.cameras
-    given = room.arrays
     for k, frame in enumerate(newest_frames(context.inputs)):
-        count = len(frame.ids)
-        given["arrived_camera"][k] = cameras.get(frame.camera, -1)
-        given["arrived_seq"][k] = _within_bounds(frame.seq)
-        given["arrived_ns"][k] = _within_bounds(frame.t_shutter_ns)
-        whole = count <= MAX_MARKERS and frame.pixels.shape == (count, 2)
-        if not whole or frame.covariances.shape != (count, 2, 2):
-            count = -1
-        else:
-            given["arrived_ids"][k, :count], given["arrived_pixels"][k, :count] = frame.ids, frame.pixels
-            given["arrived_covariances"][k, :count] = frame.covariances
-        given["arrived_count"][k] = count
+        stamp = _within_bounds(frame.seq), _within_bounds(frame.t_shutter_ns)
+        room.put_frame(k, cameras.get(frame.camera, -1), stamp, (frame.ids, frame.pixels, frame.covariances))
         room.numbers.frames = k + 1
 
 

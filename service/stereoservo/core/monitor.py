@@ -66,6 +66,7 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
 from stereoservo.core.state import CalibrationMotion, CoreState
 from stereoservo.core.target.track import beside_target
+from stereoservo.core.workspace import Workspace
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray, Record
@@ -212,9 +213,8 @@ def round_is_due(block: Record) -> bool:
     return True
 
 
-def explain_contact(context: StepContext) -> Reason | None:
+def explain_contact(state: CoreState, settings: CoreSettings, room: Workspace) -> Reason | None:
     """The reason where a joint (worst first) is in contact, by what `account_loads` has found in this step."""
-    state, room = context.state, context.derived.room
     block, work = state.block, room.numbers
     learning = isinstance(state.source, CalibrationMotion)
     efforts, following = room.sample[2], room.sample[3]
@@ -223,7 +223,7 @@ def explain_contact(context: StepContext) -> Reason | None:
     if not (work.contact and work.watches_loads):
         return None
     limits = room.stated_load_limits if learning else room.load_limits
-    reason = worst_contact(block, context.settings, *limits, learning)
+    reason = worst_contact(block, settings, *limits, learning)
     if reason is not None:
         block.contact_low[:] = np.minimum(block.mean_efforts, efforts), np.minimum(following, 0.0)
         block.contact_high[:] = np.maximum(block.mean_efforts, efforts), np.maximum(following, 0.0)
@@ -367,9 +367,9 @@ FOLLOWS, LACKS, SILENT = range(3)
 """What `account_following` has found."""
 
 
-def explain_following(context: StepContext) -> Reason | None:
+def explain_following(state: CoreState, settings: CoreSettings, room: Workspace) -> Reason | None:
     """The reason where a joint (worst first) does not follow, by what `account_following` has found in this step."""
-    settings, block, work = context.settings, context.state.block, context.derived.room.numbers
+    block, work = state.block, room.numbers
     if work.following == FOLLOWS:
         return None
     joint = work.worst
@@ -428,7 +428,7 @@ def account_following(block: Record, room: Record) -> int:
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
     """The arm has met something: it stops with its drives on, as if a person had stopped it."""
-    reason = explain_contact(context)
+    reason = explain_contact(context.state, context.settings, context.derived.room)
     if reason is None:
         return ()
     return (Finding("stop", reason, reason.hint, f"contact: {reason.hint}"),)
@@ -436,7 +436,7 @@ def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
 
 def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
-    reason = explain_following(context)
+    reason = explain_following(context.state, context.settings, context.derived.room)
     if reason is None:
         return ()
     return (Finding("fault", reason, reason.hint, reason.hint),)

@@ -11,7 +11,7 @@ import numpy as np
 
 from stereoservo.core.camera_state import CameraTiming
 from stereoservo.core.context import COMPILING, SourceOutput, StepContext
-from stereoservo.core.cycle import Status, StepOutputs
+from stereoservo.core.cycle import Status
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
@@ -22,12 +22,12 @@ from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import TIMING_SIGMA_S, Prediction, propagate_covariance
-from stereoservo.core.sources.law import found_by_kernel
+from stereoservo.core.sources.law import error_now, found_by_kernel
 from stereoservo.core.state import CoreState, LawRun, ServoGoal
 from stereoservo.core.workspace import LENS_SIZE
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
 from stereoservo.messages.reasons import Level, Reason
-from stereoservo.messages.status import CameraHealth, Health, Lifecycle, ModelReadiness
+from stereoservo.messages.status import CameraHealth, Health, ModelReadiness
 from stereoservo.numerics.arrays import BoolArray, FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import Prior
@@ -54,18 +54,6 @@ def finish_step(context: StepContext, limits: SafetyLimits) -> None:
         source.reasons = examine(source, context, told)  # type: ignore[union-attr]
 
 
-def outputs_of(context: StepContext, limits: SafetyLimits) -> StepOutputs:
-    """The outputs of the step: nothing is commanded outside ACTIVE."""
-    state = context.state
-    return StepOutputs(
-        state.block.command.copy() if state.lifecycle == Lifecycle.ACTIVE else None,
-        status_of(context, limits),
-        () if state.step % context.derived.prior_every else _priors(context),
-        tuple(context.events),
-        state.driver_request,  # type: ignore[arg-type]
-    )
-
-
 def status_of(context: StepContext, limits: SafetyLimits) -> Status:
     """The status after the step, its fields in their order: an argument by name costs as much as an array."""
     state, derived, block = context.state, context.derived, context.state.block
@@ -88,6 +76,15 @@ def status_of(context: StepContext, limits: SafetyLimits) -> Status:
         block.following_errors.copy() if numbers.tells_following else None, effort_limits, following_limits,
         _health(context, diagnosis, masked),
     )  # fmt: skip
+
+
+def error_of_step(context: StepContext) -> float | None:
+    """The error [px] of the active goal in the step; None where none is measured."""
+    if context.output is not None:
+        return context.output.error_px
+    room = context.derived.room
+    by_law = isinstance(context.state.source, ServoGoal) and not room.numbers.rests
+    return error_now(room) if by_law else None
 
 
 NO_MOTION = SourceOutput(np.zeros(0))
@@ -149,7 +146,7 @@ def _latched(reason: Reason, state: CoreState) -> bool:
     return latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
 
 
-def _priors(context: StepContext) -> tuple[Prior, ...]:
+def priors_of(context: StepContext) -> tuple[Prior, ...]:
     """What the detectors are to expect, in steps that send it."""
     state, arrays, prediction = context.state, context.derived.arrays, context.prediction
     if prediction is None or arrays is None or state.step % context.derived.prior_every:

@@ -19,7 +19,7 @@ from stereoservo.core.arrange import arrange, attends, lease_until_ns
 from stereoservo.core.block import steps_of_delay
 from stereoservo.core.command import command
 from stereoservo.core.context import NOTHING, Derived, StepContext
-from stereoservo.core.cycle import StepInputs, StepOutputs
+from stereoservo.core.cycle import Event, Status, StepInputs, StepOutputs
 from stereoservo.core.estimate import load_limits, take_model, workspace
 from stereoservo.core.execute_goals import execute_goals
 from stereoservo.core.ingest import (
@@ -31,19 +31,82 @@ from stereoservo.core.ingest import (
     nominal_period_ns,
     put_inputs,
 )
-from stereoservo.core.limit import safety_limits
+from stereoservo.core.limit import SafetyLimits, safety_limits
 from stereoservo.core.model_arrays import model_arrays
 from stereoservo.core.monitor import monitor
 from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import move
 from stereoservo.core.observe import observe
-from stereoservo.core.report import finish_step, outputs_of
+from stereoservo.core.report import error_of_step, finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, Holding, ServoGoal, initial_state
 from stereoservo.messages.status import Lifecycle
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import Prior
 
 PRIOR_RATE_HZ = 125.0
 NO_INPUTS = StepInputs(0, 0, None)
+
+
+class NewestStep:
+    """The newest step of a core: what it has come to, of which nothing is made before it is asked for. Its arrays are
+    the core's own, and of the next step after that.
+    """
+
+    def __init__(self, context: StepContext, limits: SafetyLimits) -> None:
+        self._context, self._limits = context, limits
+
+    @property
+    def command(self) -> FloatArray | None:
+        """Joint velocities (n,) to write; None where nothing may be written."""
+        state = self._context.state
+        return state.block.command if state.lifecycle is Lifecycle.ACTIVE else None
+
+    @property
+    def moves(self) -> bool:
+        """Whether the arm moves, or may with the next step."""
+        state = self._context.state
+        return not isinstance(state.source, Holding) or bool(state.block.command.any())
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """The step's events."""
+        return tuple(self._context.events)
+
+    @property
+    def driver_request(self) -> str:
+        """What the core asks of the joint driver."""
+        return self._context.state.driver_request
+
+    @property
+    def step(self) -> int:
+        """Number of the step."""
+        return self._context.state.step
+
+    @property
+    def raw(self) -> FloatArray:
+        """Velocity (n,) before the safety stage."""
+        return self._context.derived.room.raw
+
+    @property
+    def velocities(self) -> FloatArray:
+        """Filtered velocities (n,) of the joints."""
+        return self._context.state.block.velocities
+
+    @property
+    def error_px(self) -> float | None:
+        """Error of the active goal; None where none is measured."""
+        return error_of_step(self._context)
+
+    @property
+    def priors(self) -> tuple[Prior, ...]:
+        """What the detectors are to expect, in steps that send it."""
+        return priors_of(self._context)
+
+    @property
+    def status(self) -> Status:
+        """The status after the step."""
+        return status_of(self._context, self._limits)
 
 
 class ServoCore:
@@ -73,6 +136,7 @@ class ServoCore:
         self._limits = safety_limits(settings, fresh_s)
         self._put_limits()
         self._context = StepContext(self.state, settings, self._derived, NO_INPUTS)
+        self.newest = NewestStep(self._context, self._limits)
         self._arranged = self._attends = False
         self._lease_until_ns = 0
 
@@ -90,8 +154,10 @@ class ServoCore:
         return self.outputs()
 
     def outputs(self) -> StepOutputs:
-        """What there is to tell of the newest step."""
-        return outputs_of(self._context, self._limits)
+        """All outputs of the newest step."""
+        newest = self.newest
+        command = None if newest.command is None else newest.command.copy()
+        return StepOutputs(command, newest.status, newest.priors, newest.events, newest.driver_request)  # type: ignore[arg-type]
 
     def advance(self, inputs: StepInputs) -> None:
         """One cycle."""

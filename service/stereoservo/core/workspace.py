@@ -24,7 +24,7 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_MARKERS
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 LENS_SIZE = 7
 """Numbers of a lens, at most."""
@@ -283,11 +283,27 @@ class Workspace:
         self.aim: tuple[Any, ...] = ()
         self.faced: FaceChoice | None = None
 
+    def put_frame(
+        self, k: int, camera: int, stamp: tuple[int, int], sights: tuple[IntArray, FloatArray, FloatArray]
+    ) -> None:
+        """Frame ``k`` of a step: number of its camera, sequence number and shutter stamp [ns]; ids (s,), raw pixels
+        (s, 2) and covariances (s, 2, 2) of its markers. Arrays of other shapes count as wrong.
+        """
+        given, count = self.arrays, len(sights[0])
+        if count > MAX_MARKERS or sights[1].shape != (count, 2) or sights[2].shape != (count, 2, 2):
+            count = -1
+        else:
+            given["arrived_ids"][k, :count] = sights[0]
+            given["arrived_pixels"][k, :count], given["arrived_covariances"][k, :count] = sights[1:]
+        given["arrived_camera"][k], given["arrived_count"][k] = camera, count
+        given["arrived_seq"][k], given["arrived_ns"][k] = stamp
+
     def _view(self) -> None:
         given = self.arrays = views(self.record, ARRAYS, self._counts)
         self.sample: FloatArray = given["sample"]
         self.q: FloatArray = given["q"]
         self.sent: FloatArray = given["sent"]
+        self.raw: FloatArray = given["raw"]
         self.load_limits: Limits = given["effort_limits"], given["following_limits"]
         self.stated_load_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
         self.weights: FloatArray = given["weights"]

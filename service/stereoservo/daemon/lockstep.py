@@ -315,7 +315,8 @@ class LockstepCell:
 
     def step(self) -> StepOutputs:
         """Run one cycle of the servo loop, one period of virtual time later."""
-        inputs, outputs = self.servo.cycle(self._pacing)
+        inputs = self.servo.cycle(self._pacing)
+        outputs = self.servo.core.outputs()
         fresh = self.links.take_events()
         self.status = outputs.status
         self.events.extend(fresh)

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stereoservo.core.cycle import DriverFault, StepInputs, StepOutputs
-from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.cycle import DriverFault, StepInputs
+from stereoservo.core.servo_core import NewestStep, ServoCore
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan
 from stereoservo.daemon.kernel_compilation import (
@@ -148,20 +148,21 @@ class ServoProcess:
             self._latch_fault(error, now_ns)
             return None
 
-    def _write(self, outputs: StepOutputs, now_ns: int) -> None:
-        self._sent = None
-        if outputs.command is None or not self._active or self._dry_run:
+    def _write(self, newest: NewestStep, now_ns: int) -> None:
+        self._sent, command = None, newest.command
+        if command is None or not self._active or self._dry_run:
             return
+        command = command.copy()
         try:
-            report = self.driver.write_velocity(outputs.command)
+            report = self.driver.write_velocity(command)
         except DriverError as error:
             self._latch_fault(error, now_ns)
             return
         self._differences = report.reasons
-        if report.sent is not report.asked and not np.array_equal(report.sent, outputs.command):
+        if report.sent is not report.asked and not np.array_equal(report.sent, command):
             self._sent = np.array(report.sent, dtype=np.float64)
 
-    def _order_auxiliary(self, inputs: StepInputs, outputs: StepOutputs, now_ns: int) -> None:
+    def _order_auxiliary(self, inputs: StepInputs, outputs: NewestStep, now_ns: int) -> None:
         """Hand orders of auxiliary joints, which the core has accepted, to the driver; a stop stops them, too."""
         if self._auxiliary is None or self._dry_run:
             return
@@ -184,7 +185,7 @@ class ServoProcess:
             return {}
         return self._auxiliary.read_auxiliary()
 
-    def _apply_driver_request(self, outputs: StepOutputs, now_ns: int) -> None:
+    def _apply_driver_request(self, outputs: NewestStep, now_ns: int) -> None:
         """Change the driver's state as the core requests; where the driver refuses, the next step sees a fault."""
         request = outputs.driver_request
         if request == "":
@@ -220,15 +221,16 @@ class ServoProcess:
                 return messages._replace(requests=(Request(-1, SILENCE, Hold()),))
         return messages
 
-    def _publish(self, outputs: StepOutputs, pacing: Pacing) -> None:
+    def _publish(self, newest: NewestStep, pacing: Pacing) -> None:
         """Publish priors to the cameras, and state and events to the gateway."""
-        for prior in outputs.priors:
+        for prior in newest.priors:
             self._links.publish_prior(prior)
+        events = newest.events
         if self._statistics is None or self._cycles % self._statistics_every == 0:
             self._statistics = pacing.statistics()
-        if outputs.events or self._cycles % self._state_every == 0:
+        if events or self._cycles % self._state_every == 0:
             state = ServoState(
-                status=outputs.status,
+                status=newest.status,
                 loop=self._statistics,
                 driver_configured=self._configured,
                 driver_active=self._active,
@@ -239,12 +241,12 @@ class ServoProcess:
             )
             self._links.publish_state(state)
         self._cycles += 1
-        self._links.publish_events(outputs.events)  # after the state: who hears an event finds none older
+        self._links.publish_events(events)  # after the state: who hears an event finds none older
 
     # -- one cycle ------------------------------------------------------------------------------------------
 
-    def cycle(self, pacing: Pacing, *, stop: bool = False) -> tuple[StepInputs, StepOutputs]:
-        """Run one cycle: wait, read, step, write, publish. ``stop`` requests the core to brake (shutdown)."""
+    def cycle(self, pacing: Pacing, *, stop: bool = False) -> StepInputs:
+        """Run one cycle: wait, read, step, write, publish; the inputs of its step. ``stop`` requests the core to brake (shutdown)."""
         pacing.wait()
         now_ns = self._clock.now_ns()
         joints = self._read(now_ns)
@@ -265,18 +267,19 @@ class ServoProcess:
             sent=self._sent,
         )
         self._stream.before(self._links.step_recorder(), self.core, now_ns)
-        outputs = self.core.step(inputs)
-        self._write(outputs, now_ns)
-        if self._auxiliary is not None and (inputs.requests or outputs.events):
-            self._order_auxiliary(inputs, outputs, now_ns)
-        self._apply_driver_request(outputs, now_ns)
-        self._moving = outputs.status.source != "hold" or bool(outputs.status.command.any())
-        self._publish(outputs, pacing)
-        self._stream.after(inputs, outputs)
+        self.core.advance(inputs)
+        newest = self.core.newest
+        self._write(newest, now_ns)
+        if self._auxiliary is not None and (inputs.requests or newest.events):
+            self._order_auxiliary(inputs, newest, now_ns)
+        self._apply_driver_request(newest, now_ns)
+        self._moving = newest.moves
+        self._publish(newest, pacing)
+        self._stream.after(inputs, newest)
         self._beat(SERVO_HANG_S)
         if self._kernels is not None and not self._moving:
             self._load_kernels(self._kernels, now_ns)
-        return inputs, outputs
+        return inputs
 
     def _load_kernels(self, kernels: KernelLoader, now_ns: int) -> None:
         """Load the next kernel, if it is time. Never compiles: what is loaded is in the cache."""
@@ -289,9 +292,10 @@ class ServoProcess:
         until = self._clock.now_ns() + int(REST_TIMEOUT_S * 1e9)
         first = True
         while not cut_short() and self._clock.now_ns() < until:
-            _, outputs = self.cycle(pacing, stop=first)
+            self.cycle(pacing, stop=first)
             first = False
-            if outputs.command is None or not outputs.command.any():
+            command = self.core.newest.command
+            if command is None or not command.any():
                 return
 
 

@@ -17,13 +17,13 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
-from stereoservo.core.cycle import Status, StepInputs, StepOutputs, decode_array, encode
-from stereoservo.messages.status import Health
+from stereoservo.core.cycle import Status, StepInputs, StepOutputs, StepResult, decode_array, encode
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
 
-LAYOUT = 2
-"""First byte of a record; msgpack's records of before begin with another."""
+LAYOUT = 3
+"""First byte of a record. Records of layout 2 hold the same with another checksum; msgpack's records of before begin
+with another byte."""
 HEAD = struct.Struct("<BBBBIqqqqIHH")
 """Layout, flags, joints of a velocity, observations, CRC of the outputs; step, now, period, parameter epoch; bytes of
 the rest, joints of a sample, a mark of the cameras whose observations follow."""
@@ -65,79 +65,73 @@ _ARRAYS, _NUMBERS = _fields(FloatArray, FloatArray | None), _fields(float | None
 _APART = (*_ARRAYS, *_NUMBERS, "t_ns", "step", "reasons", "innovation_px", "health")
 _WORDS = tuple(name for name in Status.__struct_fields__ if name not in _APART)
 _arrays, _numbers, _words = attrgetter(*_ARRAYS), attrgetter(*_NUMBERS), attrgetter(*_WORDS)
+_error = struct.Struct("<d").pack
 
 
-class OutputsChecksum:
-    """CRC-32 of all outputs of a step but their time and number, bit for bit; what seldom changes is encoded when it
-    does.
+def result_crc(result: StepResult) -> int:
+    """CRC-32 of what a step has come to, bit for bit: velocities before and after the safety stage and of the joints,
+    the goal's error, events, what the driver is asked for. What else there is in outputs follows from the state, which
+    checkpoints hold.
     """
-
-    def __init__(self) -> None:
-        self._known: tuple[Any, ...] | None = None
-        self._health: Health | None = None
-        self._crc = 0
-
-    def of(self, outputs: StepOutputs) -> int:
-        """The checksum."""
-        status = outputs.status
-        words, health = _words(status), status.health
-        # Words compare as they are encoded. Numbers do not (0.0 == -0.0), but the health is one object till it changes.
-        if words != self._known or health is not self._health:
-            self._known, self._health, self._crc = words, health, zlib.crc32(encode((words, health)))
-        numbers = [*_numbers(status), *status.innovation_px.values()]
-        if None in numbers:
-            numbers = [ABSENT if value is None else value for value in numbers]
-        parts: list[Any] = [outputs.command, *_arrays(status), struct.pack(f"<{len(numbers)}d", *numbers)]
-        if any(part is None for part in parts):
-            parts = [_NONE if part is None else part for part in parts]
-        for prior in outputs.priors:
-            parts += (prior.camera.encode(), prior.ids, prior.pixels, prior.velocities, prior.covariances)
-        if status.reasons or outputs.events or outputs.driver_request:
-            parts.append(encode((status.reasons, outputs.events, outputs.driver_request)))
-        return zlib.crc32(_joined(parts), self._crc)
+    command, error_px = result.command, result.error_px
+    crc = zlib.crc32(_error(ABSENT if error_px is None else error_px))
+    for array in (result.raw, result.velocities, _NONE if command is None else command):
+        crc = zlib.crc32(array, crc)  # type: ignore[arg-type]
+    events, request = result.events, result.driver_request
+    return zlib.crc32(encode((events, request)), crc) if events or request else crc
 
 
 def outputs_crc(outputs: StepOutputs, layout: int = LAYOUT) -> int:
-    """CRC-32 of all outputs, as a record of this ``layout`` has it (1: of their encoding in msgpack)."""
-    return zlib.crc32(encode(outputs)) if layout == 1 else OutputsChecksum().of(outputs)
+    """CRC-32 of a step's outputs, as a record of this ``layout`` has it (1: of their encoding in msgpack; 2: of all
+    outputs but time and number; 3: `result_crc`).
+    """
+    if layout == 1:
+        return zlib.crc32(encode(outputs))
+    return result_crc(outputs) if layout == LAYOUT else _all_outputs_crc(outputs)
 
 
-class StepEncoder:
-    """Writes records. One thread at a time."""
+def _all_outputs_crc(outputs: StepOutputs) -> int:
+    """CRC-32 of all outputs of a step but their time and number, bit for bit."""
+    status = outputs.status
+    numbers = [*_numbers(status), *status.innovation_px.values()]
+    numbers = [ABSENT if value is None else value for value in numbers]
+    parts: list[Any] = [outputs.command, *_arrays(status), struct.pack(f"<{len(numbers)}d", *numbers)]
+    parts = [_NONE if part is None else part for part in parts]
+    for prior in outputs.priors:
+        parts += (prior.camera.encode(), prior.ids, prior.pixels, prior.velocities, prior.covariances)
+    if status.reasons or outputs.events or outputs.driver_request:
+        parts.append(encode((status.reasons, outputs.events, outputs.driver_request)))
+    return zlib.crc32(_joined(parts), zlib.crc32(encode((_words(status), status.health))))
 
-    def __init__(self) -> None:
-        self._checksum = OutputsChecksum()
 
-    def encode(self, inputs: StepInputs, outputs: StepOutputs) -> bytes:
-        """The record of a step, as bytes."""
-        status, command, joints, seen = outputs.status, outputs.command, inputs.joints, inputs.observations
-        raw = status.command_raw
-        flags = (
-            inputs.stop | inputs.driver_configured << 1 | inputs.driver_active << 2 | inputs.compiling << 3
-        )
-        parts: list[Any] = [b"", raw]
-        if command is not None:
-            flags |= COMMAND
-            parts.append(command)
-        n = 0 if joints is None else _add_sample(parts, joints, inputs.now_ns)
-        if n:
-            flags |= JOINTS
-            if joints.efforts is not None:  # type: ignore[union-attr]
-                flags |= EFFORTS
-            if joints.following_errors is not None:  # type: ignore[union-attr]
-                flags |= FOLLOWING
-        usual = not seen or _add_sights(parts, seen, inputs.now_ns)
-        mark = zlib.crc32("\0".join([one.camera for one in seen]).encode()) & 0xFFFF if seen else 0
-        rest = b""
-        rare = inputs.requests or inputs.model_update or inputs.driver_fault or inputs.sent is not None
-        if rare or not usual or (joints is not None and not n):
-            rest = _rest(inputs, joints=n == 0, observations=not usual)
-            parts.append(rest)
-        parts[0] = _head(
-            LAYOUT, flags, len(raw), len(seen) if usual else 0, self._checksum.of(outputs), status.step,
-            inputs.now_ns, inputs.period_ns, inputs.parameter_epoch, len(rest), n, mark,
-        )  # fmt: skip
-        return _joined(parts)
+def encode_step(inputs: StepInputs, result: StepResult) -> bytes:
+    """The record of a step, as bytes."""
+    command, joints, seen = result.command, inputs.joints, inputs.observations
+    raw = result.raw
+    flags = inputs.stop | inputs.driver_configured << 1 | inputs.driver_active << 2 | inputs.compiling << 3
+    parts: list[Any] = [b"", raw]
+    if command is not None:
+        flags |= COMMAND
+        parts.append(command)
+    n = 0 if joints is None else _add_sample(parts, joints, inputs.now_ns)
+    if n:
+        flags |= JOINTS
+        if joints.efforts is not None:  # type: ignore[union-attr]
+            flags |= EFFORTS
+        if joints.following_errors is not None:  # type: ignore[union-attr]
+            flags |= FOLLOWING
+    usual = not seen or _add_sights(parts, seen, inputs.now_ns)
+    mark = zlib.crc32("\0".join([one.camera for one in seen]).encode()) & 0xFFFF if seen else 0
+    rest = b""
+    rare = inputs.requests or inputs.model_update or inputs.driver_fault or inputs.sent is not None
+    if rare or not usual or (joints is not None and not n):
+        rest = _rest(inputs, joints=n == 0, observations=not usual)
+        parts.append(rest)
+    parts[0] = _head(
+        LAYOUT, flags, len(raw), len(seen) if usual else 0, result_crc(result), result.step, inputs.now_ns,
+        inputs.period_ns, inputs.parameter_epoch, len(rest), n, mark,
+    )  # fmt: skip
+    return _joined(parts)
 
 
 def _joined(parts: list[Any]) -> bytes:
@@ -246,10 +240,10 @@ def form_of(record: bytes) -> int:
 
 def decode_step(data: bytes) -> StepRecord:
     """A record of this layout or the one before. Raises msgspec.MsgspecError, ValueError."""
-    if data[:1] != bytes((LAYOUT,)):
+    if data[:1] not in (b"\2", bytes((LAYOUT,))):
         return _old_decoder.decode(data)
     reader = _Reader(data)
-    _, flags, m, cameras, crc, step, now_ns, period_ns, epoch, rest, n, _ = reader.unpack(HEAD)
+    layout, flags, m, cameras, crc, step, now_ns, period_ns, epoch, rest, n, _ = reader.unpack(HEAD)
     raw = reader.array(np.float64, m)
     command = reader.array(np.float64, m) if flags & COMMAND else None
     joints = _read_joints(reader, flags, n, now_ns) if flags & JOINTS else None
@@ -267,7 +261,7 @@ def decode_step(data: bytes) -> StepRecord:
         inputs = msgspec.structs.replace(
             rare, joints=joints or rare.joints, observations=observations or rare.observations
         )
-    return StepRecord(step, inputs, command, raw, crc, LAYOUT)
+    return StepRecord(step, inputs, command, raw, crc, layout)
 
 
 def _read_joints(reader: _Reader, flags: int, n: int, now_ns: int) -> JointState:

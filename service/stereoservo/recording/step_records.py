@@ -16,11 +16,11 @@ import numpy as np
 
 import stereoservo
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.cycle import StepInputs, StepOutputs
+from stereoservo.core.cycle import StepInputs, StepResult
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state_encoding import encode_state
-from stereoservo.recording.step_layout import StepEncoder
+from stereoservo.recording.step_layout import encode_step
 
 
 class Fingerprint(msgspec.Struct, frozen=True):
@@ -128,7 +128,6 @@ class StepStream:
         self._try_again = max(1, round(TRY_AGAIN_S * rate_hz))
         self._pause = 0
         self._lost = 0
-        self._encoder = StepEncoder()
         self.dropped = 0
 
     def before(self, sink: StepSink | None, core: ServoCore, now_ns: int) -> None:
@@ -148,13 +147,11 @@ class StepStream:
             else:
                 self._pause = self._try_again
 
-    def after(self, inputs: StepInputs, outputs: StepOutputs) -> None:
+    def after(self, inputs: StepInputs, result: StepResult) -> None:
         """Send the step's record."""
         if self._sink is None:
             return
         self._since_checkpoint += 1
-        if self._lost or not self._sink.send(
-            RecordedStep(inputs.now_ns, self._encoder.encode(inputs, outputs))
-        ):
+        if self._lost or not self._sink.send(RecordedStep(inputs.now_ns, encode_step(inputs, result))):
             self._lost += 1
             self.dropped += 1

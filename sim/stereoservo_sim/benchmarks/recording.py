@@ -23,7 +23,7 @@ from stereoservo.messages.goals import Enable, Jog
 from stereoservo.recording.compression import StepBlocks
 from stereoservo.recording.flight_recorder import CHUNK_S
 from stereoservo.recording.replay import replay
-from stereoservo.recording.step_layout import StepEncoder, StepRecord
+from stereoservo.recording.step_layout import StepRecord, encode_step
 from stereoservo.recording.step_records import RecordedStep
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import demo_cell_path
@@ -89,7 +89,7 @@ def _former(inputs: StepInputs, outputs: StepOutputs) -> bytes:
 
 def _costs(log: Steps, folder: Path, repetitions: int) -> dict[str, Any]:
     """Microseconds of CPU a step: in the loop by ring and, as before, by msgpack and a socket; in the gateway."""
-    encoder, ring = StepEncoder(), RingWriter(folder / "steps.ring")
+    ring = RingWriter(folder / "steps.ring")
     reader = RingReader(folder / "steps.ring")
     reader.attach()
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -97,7 +97,7 @@ def _costs(log: Steps, folder: Path, repetitions: int) -> dict[str, Any]:
     rows: dict[str, list[float]] = {"ring": [], "msgpack_and_socket": [], "gateway_take": []}
 
     def by_ring(inputs: StepInputs, outputs: StepOutputs) -> None:
-        ring.write(pack_step_message(RecordedStep(inputs.now_ns, encoder.encode(inputs, outputs))))
+        ring.write(pack_step_message(RecordedStep(inputs.now_ns, encode_step(inputs, outputs))))
 
     def by_socket(inputs: StepInputs, outputs: StepOutputs) -> None:
         ours.send(encode(RecordedStep(inputs.now_ns, _former(inputs, outputs))))
@@ -121,13 +121,13 @@ def _costs(log: Steps, folder: Path, repetitions: int) -> dict[str, Any]:
     theirs.close()
     found: dict[str, Any] = {name: summary(times, 1e6) for name, times in rows.items()}
     found["former_over_ring"] = float(np.median(rows["msgpack_and_socket"]) / np.median(rows["ring"]))
-    found["gateway_compress"] = _compression(log, encoder)
+    found["gateway_compress"] = _compression(log)
     return found
 
 
-def _compression(log: Steps, encoder: StepEncoder) -> float:
+def _compression(log: Steps) -> float:
     """Microseconds of CPU that compressing a step takes, in blocks as a recorder makes them."""
-    records = [encoder.encode(inputs, outputs) for inputs, outputs in log]
+    records = [encode_step(inputs, outputs) for inputs, outputs in log]
     block = round(CHUNK_S * 1e9 / log[0][0].period_ns)
     blocks = StepBlocks()
     at = time.process_time()
