@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CameraSection, check_joints, load_cell_file
 from stereoservo.messages.directories import CELL_NAME
 from stereoservo.messages.goals import DEFAULT_LAW
@@ -125,7 +126,9 @@ def toml_options(given: list[str]) -> str:
         except tomllib.TOMLDecodeError:
             line = f"{key} = {json_text(value)}"
         if not found or not OPTION_KEY.fullmatch(key):
-            raise CommandError("argument", f"--option {text!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0")
+            raise CommandError(
+                "argument", f"--option {Address(text)!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0"
+            )
         lines.append(line)
     try:
         tomllib.loads("\n".join(lines))
