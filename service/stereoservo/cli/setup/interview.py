@@ -81,7 +81,9 @@ def _cameras(dialogue: Dialogue) -> list[CameraSection]:
         found = finder.find_cameras()
     for k, camera in enumerate(found):
         modes = ", ".join(f"{w}x{h} at {rate:g} Hz" for w, h, rate in camera.modes[:3])
-        dialogue.say(f"   {k}: {camera.name}, {Address(str(camera.options['source']))}; {modes or 'modes unknown'}")
+        dialogue.say(
+            f"   {k}: {camera.name}, {Address(str(camera.options['source']))}; {modes or 'modes unknown'}"
+        )
     if not found:
         dialogue.say(
             "   no camera is at this computer's ports; network cameras have an address (http://, rtsp://, genicam://)"
