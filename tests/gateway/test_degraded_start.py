@@ -397,4 +397,4 @@ def test_what_a_driver_leaves_out_is_a_note_of_the_whole_run_and_an_event() -> N
     notes = KeeperNotes(log, ("joint 'gripper' is left out",))
     notes.tell("journal", "records left out")
     assert notes.texts == ("joint 'gripper' is left out", "records left out")
-    assert [event.message for event in log.since(1).events][0] == "joint 'gripper' is left out"
+    assert next(event.message for event in log.since(1).events) == "joint 'gripper' is left out"
