@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.settings import CoreSettings, core_settings
-from stereoservo.messages.cell_file import CellFileError, RecordingSection, load_cell_file
+from stereoservo.messages.cell_file import CellFileError, RecordingSection, check_cell, load_cell_file
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointSpec
 
 GOOD = """
