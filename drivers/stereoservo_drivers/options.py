@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
+from stereoservo.messages.addresses import without_secrets
 from stereoservo.ports.devices import DriverError
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -32,7 +33,7 @@ def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
             "option",
             f"driver {driver!r}: {invalid(kind, options, error)}",
             driver=driver,
-            options=dict(options),
+            options=without_secrets(options),
         ) from error
 
 
@@ -124,7 +125,8 @@ def _instead(name: str, wanted: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A value as a cell file writes it."""
+    """A value as a cell file writes it, without secrets."""
+    value = without_secrets(value)
     if isinstance(value, bool):
         return "true" if value else "false"
     text = f'"{value}"' if isinstance(value, str) else f"{value!r}"

@@ -124,6 +124,7 @@ class SimulatedArm:
             home=tuple(self._start.tolist()),
             auxiliary=self._options.auxiliary,
             simulated=True,
+            notes=() if self._robot is None else self._robot.notes,
         )
 
     def configure(self) -> None:

@@ -225,7 +225,9 @@ class TwistJointDriver(CartesianJointDriver):
             self.driver, limits_of(decoded, cell), rate_hz=decoded.rate_hz, timeout_s=decoded.command_timeout_s,
             budget_us=inner.call_budget_us + CONTROLLER_US, home=tuple(home.tolist()), simulated=True,
         )  # fmt: skip
-        description = msgspec.structs.replace(description, auxiliary=decoded.auxiliary)
+        description = msgspec.structs.replace(
+            description, auxiliary=decoded.auxiliary, notes=cell.robot.notes
+        )
         super().__init__(
             SimulatedController(decoded, inner, cell.robot, context), description, attitude, decoded.frame
         )

@@ -148,6 +148,33 @@ def test_doctor_takes_the_name_of_a_shipped_cell_and_lists_them(run: Run) -> Non
     assert "no cell 'gantri' is shipped; there are demo, " in " ".join(err.split())
 
 
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ('"http://operator:Tulpe#77@127.0.0.1:9/video.mjpg"', "http://***@127.0.0.1:9/video.mjpg: nobody"),
+        ('"http://operator:Tulpe77@127.0.0.1:9/straße.mjpg"', "http://***@127.0.0.1:9/straße.mjpg: nobody"),
+        ('"http://operator:Tulpe/77@127.0.0.1:9/v"', "http://***@127.0.0.1:9/v: nobody"),
+        ('"http://127.0.0.1:9/v?user=me&pwd=Tulpe"', "http://127.0.0.1:9/v?***: nobody"),
+        ('"http://operator:12/Tulpe@127.0.0.1:9/v"', "in user and password '@' is written %40, '/' %2F"),
+        ('"ftp://operator:Tulpe@127.0.0.1/v"', "http://, https:// (MJPEG)"),
+        ('"operator:Tulpe@127.0.0.1/v.mp4"', "a URL begins with http://"),
+        ('["http://operator:Tulpe@127.0.0.1:9/v"]', "an integer or a text in quotes"),
+        ('"http://operator:Tulpe"', "not a URL"),
+    ],
+)  # fmt: skip
+def test_doctor_shows_no_cameras_password(source: str, told: str, run: Run, cell: Path) -> None:
+    text = cell.read_text().replace('driver = "fake"\nmount', 'driver = "video"\ndetector = "dots"\nmount', 1)
+    options = f"\n[camera.options]\nsource = {source}\nwidth = 64\nheight = 48\nopen_timeout_s = 0.5\n"
+    second = '\n[[camera]]\nname = "right"'
+    cell.write_text(text.replace(second, options + second, 1))
+    code, result, err = run("doctor", str(cell), "--seconds", "0.1")
+    assert code == 1
+    shown = json.dumps(result, ensure_ascii=False) + err
+    assert "Tulpe" not in shown
+    assert "operator" not in shown.replace("http://operator:***", "")
+    assert told in shown
+
+
 @pytest.mark.parametrize("command", ["doctor", "run"])
 def test_an_unknown_key_is_named_with_the_known_ones(command: str, run: Run, cell: Path) -> None:
     code, result, err = run(command, edited(cell, "[servo]", "[servo]\nspeed = 3"))

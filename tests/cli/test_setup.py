@@ -21,12 +21,19 @@ from stereoservo.cli.doctor.view_consistency import same_camera_twice
 from stereoservo.cli.output import CommandError, shipped_or_path
 from stereoservo.cli.setup.commissioning import eye_finding
 from stereoservo.cli.setup.dialogue import Dialogue
-from stereoservo.cli.setup.interview import chosen_cameras, chosen_order, chosen_ranges, joint_position
+from stereoservo.cli.setup.interview import (
+    chosen_cameras,
+    chosen_order,
+    chosen_ranges,
+    interview,
+    joint_position,
+)
 from stereoservo.messages.cell_file import load_cell_file
-from stereoservo.ports.devices import CameraDescription, CameraObservation
+from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverError
 from stereoservo.ports.discovery import BusScan, FoundCamera, FoundDrive, JointChoice
 from stereoservo_drivers.canopen.nodes import found_buses, proposed_options, stated_limits
 from stereoservo_drivers.video.discovery import found_cameras, modes_told, usual_rate
+from stereoservo_drivers.video.driver import VideoCameraDriver
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell
 
 SIGMA_PX = 0.05
@@ -255,6 +262,34 @@ def joint(address: int, limits: tuple[int, int] | None = None) -> JointChoice:
     return JointChoice(
         f"j{address}", drive(address, limits), "revolute", 65536.0, 100.0, None, -1.0, 1.0, 0.5
     )
+
+
+def test_addresses_of_cameras_are_taken_whole_and_told_without_passwords(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    sources = ["http://me:Tul,pe #7@cam/a", "rtsp://10.0.0.1/b?user=me&pwd=Tulpe"]
+    chosen = chosen_cameras(f"{sources[0]} , {sources[1]}", ())
+    assert [camera.options["source"] for camera in chosen] == sources
+    assert "pe" not in repr([camera.name for camera in chosen])
+    with pytest.raises(ValueError, match="valid: an address") as caught:
+        chosen_cameras("me:Tulpe@cam/a", ())
+    assert "Tulpe" not in str(caught.value)
+
+    def nobody(options: object) -> None:
+        raise DriverError("refused", "nobody listens")
+
+    monkeypatch.setattr(VideoCameraDriver, "probe_camera", staticmethod(nobody))
+    monkeypatch.setattr(VideoCameraDriver, "find_cameras", staticmethod(tuple))
+    out = io.StringIO()
+    with (
+        pytest.raises(CommandError) as failed,
+        Dialogue(out, {"plate": "yes", "cameras": " ".join(sources)}) as dialogue,
+    ):
+        interview(tmp_path / "mine.toml", dialogue, {})
+    assert str(failed.value) == "camera 'left': nobody listens"
+    assert "http://***@cam/a rtsp://10.0.0.1/b?***" in out.getvalue()
+    assert "pe #7" not in out.getvalue() + str(failed.value)
+    assert dialogue.asked["cameras"] == " ".join(sources)
 
 
 def test_answers_that_cannot_be_are_refused_with_what_can() -> None:

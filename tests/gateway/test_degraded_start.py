@@ -390,3 +390,11 @@ def test_a_note_is_one_event_however_often_it_changes(bench: Bench) -> None:
     bench.notes.tell("journal", "")
     bench.notes.tell("journal", "again")
     assert len(bench.events) == 2
+
+
+def test_what_a_driver_leaves_out_is_a_note_of_the_whole_run_and_an_event() -> None:
+    log = EventLog("boot", lambda _: None)
+    notes = KeeperNotes(log, ("joint 'gripper' is left out",))
+    notes.tell("journal", "records left out")
+    assert notes.texts == ("joint 'gripper' is left out", "records left out")
+    assert next(event.message for event in log.since(1).events) == "joint 'gripper' is left out"

@@ -261,3 +261,12 @@ def test_a_clients_tls_files_are_looked_for_before_it_connects(tmp_path: Path) -
         (tmp_path / name).touch()
     tls = client_config("tls/10.0.0.1:7447", tmp_path)["transport"]["link"]["tls"]
     assert tls["connect_private_key"] == str(tmp_path / "key.pem")
+
+
+def test_an_endpoint_is_told_without_a_password() -> None:
+    with pytest.raises(SessionError, match="valid are unixsock-stream") as caught:
+        gateway_config(cell(endpoints=["tls/operator:Tulpe@router:7447"]), Path("/"), SOCKET)
+    assert "Tulpe" not in str(caught.value)
+    with pytest.raises(SessionError, match="cannot connect to") as failed:
+        open_session(client_config("tcp/operator:Tulpe@127.0.0.1:1"))
+    assert "Tulpe" not in str(failed.value)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.settings import CoreSettings, core_settings
-from stereoservo.messages.cell_file import CellFileError, RecordingSection, load_cell_file
+from stereoservo.messages.cell_file import CellFileError, RecordingSection, check_cell, load_cell_file
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointSpec
 
 GOOD = """
@@ -280,3 +280,12 @@ def test_a_cell_has_limits_of_size(tmp_path: Path) -> None:
     thirteen = msgspec.structs.replace(DRIVE, joints=DRIVE.joints * 13)
     with pytest.raises(CellFileError, match="driver 'fake' has 13 joints; a cell has at most 12"):
         core_settings(cell, thirteen, (CAMERA,))
+
+
+def test_a_value_that_is_refused_is_told_without_a_password() -> None:
+    tree = {
+        "schema": 1, "cell": {"name": "x"}, "joints": {"driver": "fake"}, "camera": [{"name": "a", "driver": "fake"}],
+        "safety": {}, "zenoh": {"endpoints": "tls/operator:Tulpe@router:7447"},
+    }  # fmt: skip
+    with pytest.raises(CellFileError, match=r"zenoh.endpoints.*got '\*\*\*@router:7447'"):
+        check_cell(tree)

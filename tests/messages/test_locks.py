@@ -143,3 +143,22 @@ def test_a_lock_file_on_a_read_only_disk_is_as_good(tmp_path: Path, monkeypatch:
     assert holder(path) is None
     with pytest.raises(FileNotFoundError):
         FileLock(tmp_path / "none.lock", "it")
+
+
+def test_a_channels_lock_is_named_without_its_password(tmp_path: Path) -> None:
+    """Nor do two streams of one server share a lock, or one stream have two by its passwords."""
+
+    def lock(source: str) -> Path:
+        path = hardware_lock_path(tmp_path, "video", {"source": source})
+        assert path is not None
+        assert "Tulpe" not in path.name
+        return path
+
+    for form in ("http://me:{}@cam/s?channel={}", "http://cam/s?user=me&pwd={}&channel={}"):
+        assert (
+            lock(form.format("Tulpe", 1)) == lock(form.format("Tulpe7", 1)) != lock(form.format("Tulpe", 2))
+        )
+    dvr = "rtsp://10.0.0.1:554/user=admin_password={}_channel={}_stream=0.sdp"
+    assert lock(dvr.format("Tulpe", 1)) == lock(dvr.format("Tulpe7", 1)) != lock(dvr.format("Tulpe", 2))
+    lock("http://me:Tulpe#77@cam/s")
+    lock("http://me:12/Tulpe@cam/s")

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import can
 import msgspec
 
+from stereoservo.messages.addresses import Address
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can import socketcan
 from stereoservo_drivers.can.bus_errors import BUS_OFF, BusError, bus_error
@@ -82,7 +83,9 @@ class Channel:
     """
 
     def __init__(self, options: ChannelOptions, *, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
-        self.name = f"CAN interface {options.interface!r}, channel {options.channel!r}"
+        channel = options.channel
+        self._shown = Address(channel) if isinstance(channel, str) else channel
+        self.name = f"CAN interface {options.interface!r}, channel {self._shown!r}"
         self.frames_sent = 0
         self.frames_received = 0
         self._options = options
@@ -209,7 +212,7 @@ class Channel:
                 "No permission: is this user in group dialout (`id`)? The udev rules in deploy/can set it"
             )
         elif number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-            remedy = f"Somebody else has it: `fuser -v {self._options.channel}`; another daemon on this cell?"
+            remedy = f"Somebody else has it: `fuser -v {self._shown}`; another daemon on this cell?"
         elif number == errno.ECONNREFUSED:
             remedy = (
                 "Nobody listens there: is `stereoservo emulate drives CELL` or the adapter's server running?"
@@ -217,7 +220,7 @@ class Channel:
         elif socketcan_name and number == errno.EAFNOSUPPORT:
             remedy = "This kernel has no CAN: `modprobe can_raw`; in a container, on the host"
         elif socketcan_name:
-            remedy = f"Check `ip link show {self._options.channel}`; deploy/can sets interfaces up"
+            remedy = f"Check `ip link show {self._shown}`; deploy/can sets interfaces up"
         elif number in (errno.EISDIR, errno.ENOTTY):
             remedy = "That is no serial port; they are listed by `ls -l /dev/serial/by-id`"
         elif isinstance(error.__cause__ or error, socket.gaierror):
@@ -272,18 +275,19 @@ class Channel:
 
     def _where_it_went(self) -> str:
         if self._options.interface == "socketcan":
-            return f"Check `ip -details link show {self._options.channel}` and the adapter's plug"
+            return f"Check `ip -details link show {self._shown}` and the adapter's plug"
         if "://" in str(self._options.channel):
             return "The other side has closed: is it still running?"
         return "Is the adapter still plugged in (`dmesg | tail`)?"
 
     def _error(self, code: str, text: str, *, retry: bool = False, **data: Any) -> DriverError:
+        told = self._shown.hidden_in(text) if isinstance(self._shown, Address) else text
         return DriverError(
             code,
-            f"{self.name}: {text}",
+            f"{self.name}: {told}",
             retry=retry,
             interface=self._options.interface,
-            channel=self._options.channel,
+            channel=str(self._shown) if isinstance(self._shown, Address) else self._shown,
             bitrate=self._options.bitrate,
             **data,
         )

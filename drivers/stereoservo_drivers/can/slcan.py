@@ -15,6 +15,7 @@ from typing import Any
 
 import can
 
+from stereoservo.messages.addresses import Address
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.messages import from_message, to_message
 from stereoservo_drivers.can.slcan_lines import (
@@ -90,13 +91,15 @@ class SlcanBus(can.BusABC):
                 str(channel), tty_baudrate, rtscts=rtscts, connect_timeout_s=connect_timeout_s
             )
         except OSError as error:
-            raise can.CanInitializationError(f"cannot open {channel}: {error}") from error
-        self.channel_info = f"serial-line CAN on {channel}"
+            raise can.CanInitializationError(f"cannot open {Address(str(channel))}: {error}") from error
+        self.channel_info = f"serial-line CAN on {Address(str(channel))}"
         try:
             self._begin([*set_up, "L" if listen_only else "O"])
         except can.CanOperationError as error:
             self._port.close()
-            raise can.CanInitializationError(f"no serial-line CAN on {channel}: {error}") from error
+            raise can.CanInitializationError(
+                f"no serial-line CAN on {Address(str(channel))}: {error}"
+            ) from error
         super().__init__(channel, can_filters)
 
     def _begin(self, commands: list[str]) -> None:

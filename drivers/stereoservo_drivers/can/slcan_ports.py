@@ -12,6 +12,8 @@ from typing import Protocol
 
 import serial
 
+from stereoservo.messages.addresses import Address
+
 CHUNK = 8192
 DISCONNECTED = (errno.EIO, errno.ENODEV, errno.ENXIO, errno.EBADF, errno.EPIPE, errno.ECONNRESET)
 _URL = re.compile(r"socket://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):(?P<port>[0-9]{1,5})")
@@ -114,7 +116,7 @@ def _connect(channel: str, timeout_s: float) -> SlcanPort:
     match = _URL.fullmatch(channel)
     if match is None or not 0 < int(match["port"]) < 65536:
         raise ValueError(
-            f"channel {channel!r} is no address; valid: socket://HOST:PORT, for instance socket://127.0.0.1:5400"
+            f"channel {Address(channel)!r} is no address; valid: socket://HOST:PORT, for instance socket://127.0.0.1:5400"
         )
     connection = socket.create_connection((match["host"].strip("[]"), int(match["port"])), timeout_s)
     connection.setblocking(False)

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from stereoservo.messages.addresses import without_secrets
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.load import BusLoad, cycle_load, refusal
 from stereoservo_drivers.canopen.cia402 import FEEDBACK_OBJECTS, tpdo_feedback
@@ -247,6 +248,7 @@ def _check_sdo(joint: CanJoint, key: str, value: int) -> None:
 
 def _refusal(option: str, value: object, valid: str, joint: CanJoint | None = None) -> DriverError:
     where = f"joint {joint.name!r}: " if joint is not None else ""
+    value = without_secrets(value)
     text = f"{value}" if isinstance(value, str) else f"{value!r}"
     return DriverError(
         "option",

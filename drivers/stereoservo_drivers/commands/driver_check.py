@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.ports import plugins
 from stereoservo.ports.devices import DriverContext, JointDriver
@@ -160,7 +161,7 @@ def _options(text: str, cell: CellFile | None) -> dict[str, Any]:
         raise DriverCheckError("argument", f"--options is no JSON: {error}") from error
     if not isinstance(found, dict):
         raise DriverCheckError(
-            "argument", f'--options {text!r}; an object, {{"port": "/dev/ttyACM0"}}, is valid'
+            "argument", f'--options {Address(text)!r}; an object, {{"port": "/dev/ttyACM0"}}, is valid'
         )
     return found
 

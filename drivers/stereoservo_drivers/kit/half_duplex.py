@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
+from stereoservo.messages.addresses import Address
 from stereoservo.ports.devices import DriverError
 
 TAKE_BYTES = 4096
@@ -38,12 +39,13 @@ def open_serial(url: str, baudrate: int) -> ByteStream:
             url, baudrate=baudrate, timeout=0, write_timeout=0.1, exclusive=True
         )
     except (OSError, ValueError) as error:
+        shown = Address(url)
         raise DriverError(
             "connection",
-            f"serial port {url!r}: {error}; is the adapter plugged in (`ls -l /dev/serial/by-id`), is this user in "
-            "group dialout, does nobody else have it?",
+            f"serial port {shown!r}: {shown.hidden_in(str(error))}; is the adapter plugged in "
+            "(`ls -l /dev/serial/by-id`), is this user in group dialout, does nobody else have it?",
             retry=True,
-            port=url,
+            port=str(shown),
         ) from error
     return stream
 

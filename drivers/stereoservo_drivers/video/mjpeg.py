@@ -7,18 +7,21 @@ a JPEG that was cut off: decoders behind `cv2.VideoCapture` report neither and i
 from __future__ import annotations
 
 import base64
+import hashlib
 import http.client
 import select
 import socket
 import ssl
 import urllib.request
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from urllib.parse import SplitResult, unquote, urljoin, urlunsplit
+from urllib.parse import SplitResult, unquote_to_bytes, urljoin, urlunsplit
 
 import cv2
 import numpy as np
 
+from stereoservo.messages.addresses import Address
 from stereoservo.ports.devices import Clock, DriverError
 from stereoservo_drivers.video.chunked import ChunkedDecoder
 from stereoservo_drivers.video.multipart import MultipartError, MultipartParser, MultipartPart, number_in
@@ -76,12 +79,13 @@ class MjpegSource:
             self._socket.settimeout(self._options.read_timeout_s)
 
     def _sent_on(self, url: SplitResult, location: str) -> SplitResult:
+        shown = Address(location)
         try:
             target = place_of(urljoin(url.geturl(), location), Path())
         except (DriverError, ValueError) as error:
-            raise self._place.error("http", f"sent on to {location!r}, which is no address") from error
+            raise self._place.error("http", f"sent on to {shown!r}, which is no address") from error
         if target.kind != "http":
-            raise self._place.error("http", f"sent on to {location!r}, which is no address of HTTP")
+            raise self._place.error("http", f"sent on to {shown!r}, which is no address of HTTP")
         return target.url
 
     def _request(self, url: SplitResult, challenge: str = "") -> http.client.HTTPResponse:
@@ -89,7 +93,7 @@ class MjpegSource:
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         connection = kind(url.hostname or "", url.port, timeout=self._options.open_timeout_s)
         headers = {"Accept": "multipart/x-mixed-replace, */*", "Connection": "close"}
-        if url.username:
+        if url.username or url.password:
             headers["Authorization"] = authorization(url, challenge)
         try:
             begun_ns = self._clock.now_ns()
@@ -107,7 +111,12 @@ class MjpegSource:
             connection.close()
             raise
         asked = response.getheader("WWW-Authenticate", "")
-        if response.status == 401 and url.username and not challenge and asked.lower().startswith("digest "):
+        if (
+            response.status == 401
+            and "Authorization" in headers
+            and not challenge
+            and asked.lower().startswith("digest ")
+        ):
             response.close()
             return self._request(url, asked)
         return response
@@ -115,7 +124,8 @@ class MjpegSource:
     def _boundary(self, response: http.client.HTTPResponse) -> str:
         if response.status != 200:
             remedy = {
-                401: "Put user and password into the URL: http://user:password@host/...",
+                401: "Put user and password into the URL: http://user:password@host/... (a '/' in them is written "
+                "%2F, an '@' %40, a '%' %25)",
                 403: "Look at the rights of the camera's user",
                 404: "Look up the path of its MJPEG stream",
             }.get(response.status, "Look at the camera's own page")
@@ -240,17 +250,33 @@ def _target(url: SplitResult) -> str:
 
 def authorization(url: SplitResult, challenge: str = "") -> str:
     """Authorization header for the user in ``url``: Basic, or Digest where the server's ``challenge`` requires it
-    (RFC 7617, 7616).
+    (RFC 7617, 7616), letters beyond ASCII as UTF-8.
     """
-    user, password = unquote(url.username or ""), unquote(url.password or "")
+    user, password = unquote_to_bytes(url.username or ""), unquote_to_bytes(url.password or "")
     if not challenge:
-        return "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
+        return "Basic " + base64.b64encode(user + b":" + password).decode()
     plain = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))
     known = urllib.request.HTTPPasswordMgrWithDefaultRealm()
-    known.add_password(None, plain, user, password)
+    known.add_password(
+        None, plain, user.decode("latin-1"), password.decode("latin-1")
+    )  # its bytes, see _Digest
     told = urllib.request.parse_keqv_list(urllib.request.parse_http_list(challenge.partition(" ")[2]))
     request = urllib.request.Request(plain)
-    return f"Digest {urllib.request.AbstractDigestAuthHandler(known).get_authorization(request, told)}"
+    return f"Digest {_Digest(known).get_authorization(request, told)}"
+
+
+class _Digest(urllib.request.AbstractDigestAuthHandler):
+    """Python's, with user and password as bytes in the form of Latin-1: it takes ASCII alone."""
+
+    def get_algorithm_impls(self, algorithm: str) -> tuple[Callable[[str], str], Callable[[str, str], str]]:
+        digest = {"MD5": hashlib.md5, "SHA": hashlib.sha1}.get(algorithm.upper())
+        if digest is None:
+            raise ValueError(f"it asks for a digest by {algorithm!r}; MD5 and SHA are known")
+
+        def hashed(text: str) -> str:
+            return digest(text.encode("latin-1")).hexdigest()
+
+        return hashed, lambda secret, data: hashed(f"{secret}:{data}")
 
 
 def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:

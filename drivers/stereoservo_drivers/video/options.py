@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from urllib.parse import SplitResult, urlsplit, urlunsplit
+from urllib.parse import SplitResult
 
 import msgspec
 from msgspec import Meta
 
+from stereoservo.messages.addresses import Address, AddressError, without_secrets
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.episodes import EpisodeNumber
 from stereoservo_drivers.options import decode_options
@@ -29,7 +30,7 @@ PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 LIVE_FROZEN_FRAMES = 10
 _DEVICE = re.compile(r"/dev/video(\d+)")
 _NUMBER = re.compile(r"%(0\d+)?d")
-_NO_URL = urlsplit("")
+_NO_URL = SplitResult("", "", "", "", "")
 VALID_SOURCES = (
     "a device number (0) or path (/dev/video0), a file (.avi, .mkv, .mp4), numbered pictures (left-%04d.png), "
     "http://, https:// (MJPEG), rtsp://, genicam:// (GigE Vision, USB3 Vision), or, with `episode`, the folder of a "
@@ -94,10 +95,14 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     episode: EpisodeNumber | None = None
     feature: str = ""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.source, str) and "://" in self.source:
+            msgspec.structs.force_setattr(self, "source", Address(self.source))
+
 
 @dataclass(frozen=True)
 class Place:
-    """A parsed ``source``. ``shown``: for messages, without a password."""
+    """A parsed ``source``. ``shown``: for messages; of a URL an `Address`."""
 
     kind: SourceKind
     shown: str
@@ -112,7 +117,7 @@ class Place:
 
     def error(self, code: str, what: str, *, retry: bool = False, **data: Any) -> DriverError:
         """A DriverError about this source."""
-        return DriverError(code, f"{self.shown}: {what}", retry=retry, source=self.shown, **data)
+        return DriverError(code, f"{self.shown}: {what}", retry=retry, source=str(self.shown), **data)
 
 
 def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[VideoOptions, Place]:
@@ -181,9 +186,11 @@ def place_of(source: int | str, cell_dir: Path) -> Place:
         number = _DEVICE.fullmatch(source)
         return Place("device", source, device=int(number[1]) if number else source)
     if "://" in source:
-        return _url(source)
+        return _url(Address(source))
     path = cell_dir / source
     suffix = path.suffix.lower()
+    if Address(source) != source and not (path.parent if "%" in source else path).exists():
+        raise _wrong("source", source, "valid: a URL begins with http://, https:// or rtsp://")
     if "%" in source:
         if len(_NUMBER.findall(path.name)) != 1 or source.count("%") != 1:
             raise _wrong("source", source, "valid: one %d or %04d, in the name of the file")
@@ -196,27 +203,22 @@ def place_of(source: int | str, cell_dir: Path) -> Place:
     raise _wrong("source", source, f"valid: {VALID_SOURCES}{hint}")
 
 
-def _url(source: str) -> Place:
+def _url(source: Address) -> Place:
     try:
-        url = urlsplit(source)
-        host, _port = url.hostname, url.port
-    except ValueError as error:
-        raise _wrong("source", source, f"not a URL ({error})") from error
-    if not source.isascii() or not source.isprintable() or " " in source:
-        raise _wrong("source", source, "valid: a URL of ASCII characters, others written as %20 and the like")
-    if not host:
-        raise _wrong("source", source, "valid: a URL with a host, such as http://camera.local:8080/stream")
-    shown = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))
+        url = source.parsed()
+    except AddressError as error:
+        raise _wrong("source", source, str(error)) from error
     if url.scheme in ("http", "https"):
-        return Place("http", shown, url=url)
+        return Place("http", source, url=url)
     if url.scheme == "genicam":
-        return Place("genicam", shown, url=url)
+        return Place("genicam", source, url=url)
     if url.scheme in ("rtsp", "rtsps"):
-        return Place("rtsp", shown, url=url)
-    raise _wrong("source", shown, f"valid: {VALID_SOURCES}")
+        return Place("rtsp", source, url=url)
+    raise _wrong("source", source, f"valid: {VALID_SOURCES}")
 
 
 def _wrong(option: str, value: object, what: str) -> DriverError:
+    value = without_secrets(value)
     shown = f'"{value}"' if isinstance(value, str) else str(value).lower()
     return DriverError(
         "option", f"driver {DRIVER!r}: {option} = {shown}; {what}", driver=DRIVER, option=option, value=value

@@ -13,7 +13,8 @@ from typing import Annotated, Any
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, shipped_or_path
+from stereoservo.cli.output import CommandError, JsonOption, emit, note, shipped_or_path
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CameraSection, check_joints, load_cell_file
 from stereoservo.messages.directories import CELL_NAME
 from stereoservo.messages.goals import DEFAULT_LAW
@@ -90,6 +91,8 @@ def init(
     except OSError as error:
         raise CommandError("file", f"{file}: {error.strerror}") from error
     check_joints(load_cell_file(file), tuple(joint.name for joint in joints.joints), file)
+    for text in joints.notes:
+        note(text)
     emit({"cell": cell, "file": str(file)}, f"wrote {file}; next: stereoservo doctor {file}", json)
 
 
@@ -125,7 +128,9 @@ def toml_options(given: list[str]) -> str:
         except tomllib.TOMLDecodeError:
             line = f"{key} = {json_text(value)}"
         if not found or not OPTION_KEY.fullmatch(key):
-            raise CommandError("argument", f"--option {text!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0")
+            raise CommandError(
+                "argument", f"--option {Address(text)!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0"
+            )
         lines.append(line)
     try:
         tomllib.loads("\n".join(lines))

@@ -14,6 +14,7 @@ import msgspec
 import zenoh
 
 from stereoservo.client.errors import ClientError
+from stereoservo.messages.addresses import Address
 
 MAX_MESSAGE_BYTES = 1 << 18
 MAX_SESSIONS = 64
@@ -90,12 +91,15 @@ def client_config(endpoint: str, tls: Path | None = None) -> dict[str, Any]:
 def open_session(config: dict[str, Any]) -> Any:
     """Open a session. Raises SessionError."""
     zenoh.init_log_from_env_or("error")
-    where = ", ".join(config["listen"]["endpoints"] or config["connect"]["endpoints"])
+    endpoints = [Address(each) for each in config["listen"]["endpoints"] or config["connect"]["endpoints"]]
+    where = ", ".join(endpoints)
     try:
         return zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(config).decode()))
     except zenoh.ZError as error:
         verb = "listen on" if config["mode"] == "router" else "connect to"
         cause = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))  # zenoh's own source line
+        for endpoint in endpoints:
+            cause = endpoint.hidden_in(cause)
         raise SessionError(f"cannot {verb} {where}: {cause}{_certificate_hint(config, where)}") from error
 
 

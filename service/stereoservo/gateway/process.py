@@ -139,7 +139,7 @@ class Gateway:
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.goals = OpenGoalRecord(directories, plan.boot)
         self.log = EventLog(self.boot, self._publish_event, self._observe_event)
-        self._notes = KeeperNotes(self.log)
+        self._notes = KeeperNotes(self.log, plan.joints.notes)
         self._servo = ServoConnection(directories)
         self._replies = ReplyThread()
         self._calibration = CalibrationJobs(

@@ -144,11 +144,15 @@ def core_event_fields(event: Event) -> dict[str, Any]:
 
 
 class KeeperNotes:
-    """Notes for the cell's keeper, one a topic, shown in the state; a new one is also reported by one event."""
+    """Notes for the cell's keeper, one a topic, shown in the state; a new one is also reported by one event.
+    ``standing``: those of the whole run.
+    """
 
-    def __init__(self, log: EventLog) -> None:
+    def __init__(self, log: EventLog, standing: tuple[str, ...] = ()) -> None:
         self._log = log
         self._texts: dict[str, str] = {}
+        for text in standing:
+            self.tell(text, text)
 
     @property
     def texts(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stereoservo.client.session import SessionError, base_config, client_config, client_mode
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CellFile, TlsSection
 from stereoservo.messages.directories import check_socket_path
 
@@ -99,22 +100,22 @@ def check_endpoint(endpoint: str, tls: TlsSection | None) -> None:
     match = _NETWORK_ENDPOINT.fullmatch(endpoint)
     if match is None:
         raise SessionError(
-            f"zenoh.endpoints: {endpoint!r}; valid are unixsock-stream/PATH, tcp/127.0.0.1:PORT, or "
+            f"zenoh.endpoints: {Address(endpoint)!r}; valid are unixsock-stream/PATH, tcp/127.0.0.1:PORT, or "
             "tls/HOST:PORT with [zenoh.tls], without ? or # parameters"
         )
     local = is_loopback(match["host"])
     if match["protocol"] == "tcp":
         if not local:
             raise SessionError(
-                f"zenoh.endpoints: {endpoint!r}: without TLS every host on the way could command the arm; "
+                f"zenoh.endpoints: {Address(endpoint)!r}: without TLS every host on the way could command the arm; "
                 "use tcp on 127.0.0.1, [::1] or localhost, or tls/HOST:PORT with [zenoh.tls]"
             )
     elif tls is None:
-        raise SessionError(f"zenoh.endpoints: {endpoint!r} needs [zenoh.tls]")
+        raise SessionError(f"zenoh.endpoints: {Address(endpoint)!r} needs [zenoh.tls]")
     elif not tls.enable_mtls and not local:
         raise SessionError(
-            f"zenoh.tls.enable_mtls = false with zenoh.endpoints {endpoint!r}: every host could command the arm "
-            "without a certificate; leave enable_mtls out, or use tls on 127.0.0.1, [::1] or localhost"
+            f"zenoh.tls.enable_mtls = false with zenoh.endpoints {Address(endpoint)!r}: every host could command the "
+            "arm without a certificate; leave enable_mtls out, or use tls on 127.0.0.1, [::1] or localhost"
         )
 
 

@@ -13,6 +13,7 @@ import msgspec
 import msgspec.inspect
 from msgspec import Meta
 
+from stereoservo.messages.addresses import without_secrets
 from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
 from stereoservo.messages.known_length import known_length_of
 
@@ -461,7 +462,7 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
             value = value[int(part.strip("[]"))] if part.startswith("[") else value[part]
         except (KeyError, IndexError, TypeError, ValueError):
             return ""
-    return f", got {value!r}" if not isinstance(value, dict | list) else ""
+    return f", got {without_secrets(value)!r}" if not isinstance(value, dict | list) else ""
 
 
 def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:

@@ -17,6 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from stereoservo.messages.addresses import Address
+
 CHANNEL_OPTIONS = ("channel", "device", "port", "source", "address")
 
 
@@ -159,6 +161,8 @@ def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> P
                 value = f"/dev/video{value}"
             if isinstance(value, str) and value.startswith("/dev/"):
                 value = os.path.realpath(value)
+            elif isinstance(value, str) and (shown := Address(value)) != value:
+                value = f"{shown}-{shown.digest()}"  # the name is shown to others, and told
             safe = re.sub(r"[^A-Za-z0-9]+", "-", f"{driver}-{value}").strip("-")
             return root / f"channel-{safe}.lock"
     return None

@@ -75,7 +75,8 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
     ``simulated``: nothing real moves; then a cell file may leave limits and base out, and has these and ``home``.
     ``lacks``: which of ``efforts`` and ``following_errors`` its samples do not carry, as far as it is known beforehand.
-    ``auxiliary``: joints and outputs beside them, of an :class:`AuxiliaryDriver`.
+    ``auxiliary``: joints and outputs beside them, of an :class:`AuxiliaryDriver`. ``notes``: what the driver takes
+    otherwise than a person may think, such as joints of a file that it leaves out; told where a cell is checked or run.
     """
 
     driver: str
@@ -89,6 +90,7 @@ class JointDriverDescription(msgspec.Struct, frozen=True):
     lacks: tuple[Literal["efforts", "following_errors"], ...] = ()
     auxiliary: tuple[AuxiliarySpec, ...] = ()
     simulated: bool = False
+    notes: tuple[str, ...] = ()
 
 
 class CameraDescription(msgspec.Struct, frozen=True):

@@ -71,7 +71,7 @@ def conduct_lockstep(
     goals: Sequence[ShownGoal] | None = None,
 ) -> Demonstration:
     """Run in one process in virtual time; deterministic given the seed. ``goals``: by default those of the arm."""
-    cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals)
+    cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals, stage)
     with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
         history = TrueJointHistory.in_memory(len(truth.base), capacity=1 << 16)
         with LockstepCell(
@@ -98,11 +98,13 @@ def conduct_lockstep(
 
 
 def _shown(
-    cell_path: Path, out: Path, goals: Sequence[ShownGoal] | None
+    cell_path: Path, out: Path, goals: Sequence[ShownGoal] | None, stage: DemonstrationProgress
 ) -> tuple[CellFile, SimulatedCell, Conveyor | None, Sequence[ShownGoal], Path]:
     """A cell with its truth, its conveyor, the goals that it is shown, and the place of a recording, which is free."""
     cell = load_cell_file(cell_path)
     truth, conveyor, recording = true_cell(cell, cell_path.parent), conveyor_of(cell), out / "flight.mcap"
+    for text in truth.robot.notes:
+        stage.tell(text)
     recording.unlink(missing_ok=True)  # of an earlier demonstration
     shown = shown_goals(truth, on_belt=conveyor is not None) if goals is None else goals
     return cell, truth, conveyor, shown, recording
@@ -136,7 +138,7 @@ def conduct_live(
     """Run with real processes: a daemon in directories of its own, and a client over zenoh. ``goals``: by default those
     of the arm.
     """
-    cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals)
+    cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals, stage)
     configurations = shown_positions(cell, truth)
     with ExitStack() as ends:
         scratch = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="stereoservo-")))

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
 
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CameraSection, CellFile
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_drivers.twist import TwistJointDriver, virtual_positions
@@ -71,7 +71,7 @@ def _simulated_options(section: CameraSection, cell: CellFile) -> Mapping[str, A
         settings = cameras_of_cell(cell)
     except EmulationError as error:
         raise ValueError(str(error)) from error
-    path = urlsplit(str(section.options.get("source", ""))).path
+    path = Address(str(section.options.get("source", ""))).parsed().path
     stream = next((stream for stream in settings.camera if stream.stream == path), None)
     if stream is None:
         streams = ", ".join(stream.stream for stream in settings.camera)

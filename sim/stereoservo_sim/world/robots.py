@@ -34,7 +34,7 @@ class Robot:
     ``base`` (4, 4): the first joint's frame in the world at its zero. ``links`` (n, 4, 4): from each joint's frame,
     moved, to the next one's at its zero, the last to the flange. ``masses`` (n,) [kg] and ``centres`` (n, 3) [m] of the
     links in their joints' frames. Shapes of link 0 are in the world. ``file``: the URDF that it was read from, mounted
-    at ``mounted`` (4, 4) in the world, with the flange at its link ``flange``.
+    at ``mounted`` (4, 4) in the world, with the flange at its link ``flange``; ``notes``: what of it is left out.
     """
 
     name: str
@@ -47,6 +47,7 @@ class Robot:
     file: Path | None = None
     mounted: FloatArray = field(default_factory=lambda: np.eye(4))
     flange: str = "flange"
+    notes: tuple[str, ...] = ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -353,3 +353,10 @@ def test_a_host_that_is_not_known(monkeypatch):
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
     assert "No such host" in str(refused(ChannelSettings("stereoservo_slcan", "socket://nobody:5400")))
+
+
+def test_a_channel_on_a_network_is_told_without_its_password():
+    with pytest.raises(DriverError) as caught:
+        Channel(ChannelSettings("stereoservo_slcan", "socket://operator:Tulpe@127.0.0.1:1"))
+    assert "Tulpe" not in str(caught.value) + repr(caught.value.data)
+    assert "socket://***@127.0.0.1:1" in str(caught.value)

@@ -6,7 +6,7 @@ import pytest
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.kit import half_duplex
-from stereoservo_drivers.kit.half_duplex import HalfDuplexBus
+from stereoservo_drivers.kit.half_duplex import HalfDuplexBus, open_serial
 
 ANSWER_S = 0.05
 
@@ -64,3 +64,10 @@ def test_a_servo_that_does_not_answer_is_left_out_and_a_dead_line_is_told(passin
     assert bus.ask(b"?", 3) == [b"a"] * 2
     with pytest.raises(DriverError, match="3 questions in a row without all 3 answers, the last had 2"):
         bus.ask(b"?", 3)
+
+
+def test_a_serial_port_on_a_network_is_told_without_its_password() -> None:
+    with pytest.raises(DriverError, match="serial port") as caught:
+        open_serial("socket://operator:Tulpe@127.0.0.1:1", 115200)
+    assert "Tulpe" not in str(caught.value) + repr(caught.value.data)
+    assert caught.value.data["port"] == "socket://***@127.0.0.1:1"

@@ -102,7 +102,7 @@ class MjpegServer:
 
     def authorised(self, header: str) -> bool:
         """RFC 7616, 3.4.1, with MD5 and ``qop=auth``."""
-        told = dict(re.findall(r'(\w+)="?([^",]+)', header))
+        told = dict(re.findall(r'(\w+)="?([^",]+)', header.encode("latin-1").decode()))
 
         def md5(*texts: str) -> str:
             return hashlib.md5(":".join(texts).encode()).hexdigest()

@@ -57,9 +57,10 @@ def test_a_device_path_is_its_number():
         ({"source": "0"}, ('source = "0"', "source = 0")),
         ({"source": "left.txt"}, ('source = "left.txt"', ".avi, .mkv, .mp4")),
         ({"source": "ftp://cam/x"}, ("ftp://cam/x", "https://")),
-        ({"source": "http://cam/a b"}, ("http://cam/a b", "%20")),
         ({"source": "http:///x"}, ("http:///x", "with a host")),
-        ({"source": "http://cam:port/x"}, ("http://cam:port/x", "not a URL")),
+        ({"source": "http://cam:port/x"}, ("http://cam:***", "not a URL")),
+        ({"source": "http://operator:12/34@cam/x"}, ("http://***", "%2F")),
+        ({"source": "operator:Tulpe@cam/v.mp4"}, ("***@cam/v.mp4", "begins with http://")),
         ({"source": "p%04d%d.png"}, ("p%04d%d.png", "one %d")),
         ({"source": "d%d/left.png"}, ("d%d/left.png", "in the name of the file")),
         ({"source": "p%s.png"}, ("p%s.png", "one %d")),
@@ -79,7 +80,7 @@ def test_wrong_options_are_told_with_value_and_what_is_valid(options, parts):
 
 def test_a_password_is_not_shown():
     _, place = decode(source="http://user:secret@cam:81/s")
-    assert place.shown == "http://cam:81/s"
+    assert place.shown == "http://***@cam:81/s"
     with pytest.raises(DriverError) as caught:
         decode(source="gopher://user:secret@cam/s")
     assert "secret" not in str(caught.value)

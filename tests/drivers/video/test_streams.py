@@ -295,6 +295,28 @@ def test_a_camera_that_asks_for_a_digest_gets_it(camera, server):
     assert (error.code, error.data["status"]) == ("http_status", 401)
 
 
+@pytest.mark.parametrize("password", ["a#b", "a@b", "a:b", "50%", "Tür pe", "日本", 'a"b', "[a"])
+def test_a_password_as_people_write_it_is_sent(camera, server, password):
+    """In user and password, raw, with an accent in the path; by both schemes."""
+    url = server.url.replace("//", f"//mé:{password}@").replace("stream", "straße")
+    poll_until(start(camera(url)), 1)
+    told = base64.b64decode(server.headers[0]["Authorization"].removeprefix("Basic ")).decode()
+    assert told == f"mé:{password}"
+    assert server.requests[0] == "/stra%C3%9Fe"
+    server.digest = ("mé", password)
+    poll_until(start(camera(server.url.replace("//", f"//mé:{password}@"))), 1)
+    server.status = 404
+    assert password not in (text := str(refused(camera(url))))
+    assert "***@127.0.0.1" in text
+
+
+def test_an_address_that_a_server_sends_on_to_is_told_without_secrets(camera, server):
+    for location in ("ftp://me:secret@x/", "http://x:port/?token=secret", "http://x/?pwd=secret"):
+        server.status, server.reply = 302, {"Location": location}
+        error = refused(camera(server.url))
+        assert "secret" not in str(error) + repr(error.data)
+
+
 def test_a_password_stays_with_its_host(camera, server):
     server.status, server.reply = 302, {"Location": server.url.replace("127.0.0.1", "localhost")}
     refused(camera(server.url.replace("//", "//me:secret@")))

@@ -99,6 +99,8 @@ def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPla
     create_directories(directories)
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
     yield ExaminationFinding("drivers", True, _drivers(plan))
+    for text in plan.joints.notes:
+        yield ExaminationFinding("arm", None, text)
     for check in CHECKS:
         yield check(plan, directories)
     return plan, directories

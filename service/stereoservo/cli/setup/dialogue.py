@@ -72,20 +72,27 @@ class Dialogue:
         """What is under way from now on, in place of what was."""
         self._doing = what
 
-    def ask(self, key: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
+    def ask(
+        self,
+        key: str,
+        question: str,
+        default: str | None,
+        parse: Callable[[str], T],
+        shown: Callable[[str], str] = str,
+    ) -> T:
         """The answer to a question, as ``parse`` understands it, which raises ValueError with what would be valid.
 
-        ``default``: what an empty answer means. Raises CommandError: no terminal and no answer, a scripted answer that
-        is not valid.
+        ``default``: what an empty answer means; ``shown``: an answer as it is told again. Raises CommandError: no
+        terminal and no answer, a scripted answer that is not valid.
         """
-        shown = f"{question}{'' if default is None else f' [{default}]'}: "
+        prompt = f"{question}{'' if default is None else f' [{default}]'}: "
         while True:
-            text = self._answer(key, shown, default)
+            text = self._answer(key, prompt, default, shown)
             try:
                 understood = parse(text)
             except ValueError as error:
                 if self._scripted(key):
-                    raise CommandError("answer", f"answer {key} = {text!r}: {error}") from error
+                    raise CommandError("answer", f"answer {key} = {shown(text)!r}: {error}") from error
                 self.say(f"   {error}")
                 continue
             self.asked[key] = text
@@ -99,13 +106,13 @@ class Dialogue:
         """Whether a question is answered by the answers that were given, and what they lack by its default."""
         return self._answers is not None and (key in self._answers or not sys.stdin.isatty())
 
-    def _answer(self, key: str, shown: str, default: str | None) -> str:
+    def _answer(self, key: str, prompt: str, default: str | None, shown: Callable[[str], str]) -> str:
         if self._scripted(key):
             assert self._answers is not None
             text = self._answers.get(key, default)
             if text is None:
-                raise CommandError("answer", f"the answers have no {key!r}, and it has no default: {shown}")
-            self.say(f"?  {shown}{text}")
+                raise CommandError("answer", f"the answers have no {key!r}, and it has no default: {prompt}")
+            self.say(f"?  {prompt}{shown(text)}")
             return text
         if not sys.stdin.isatty():
             raise CommandError(
@@ -113,7 +120,7 @@ class Dialogue:
                 "setup asks on the terminal, and there is none; --answers FILE answers for a person",
             )
         with self._lock:
-            self._write(f"?  {shown}", end="")
+            self._write(f"?  {prompt}", end="")
             self._waits = True
         try:
             line = sys.stdin.readline()
@@ -121,7 +128,7 @@ class Dialogue:
             self._waits = False
             self._said_s = time.monotonic()
         if not line:
-            raise CommandError("terminal", f"the terminal was closed before this was answered: {shown}")
+            raise CommandError("terminal", f"the terminal was closed before this was answered: {prompt}")
         return line.strip() or (default if default is not None else "")
 
     def _write(self, text: str, end: str = "\n") -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
 from io import StringIO
@@ -16,6 +17,7 @@ from stereoservo.cli.doctor.command import line_of
 from stereoservo.cli.init import cell_text, toml_lines
 from stereoservo.cli.output import CommandError, note
 from stereoservo.cli.setup.dialogue import Dialogue
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CameraSection, load_cell_file
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
@@ -38,6 +40,7 @@ AROUND_DEG = 40.0
 MARGIN = 5.0
 """[degrees or mm] The arm begins its trial motions where it stands: so far from every limit at least."""
 NAMES = ("left", "right")
+_NEXT_CAMERA = re.compile(r"[\s,]+(?=[A-Za-z][A-Za-z0-9+.-]*://|/dev/|[0-9]+(?:[\s,]|$))")
 
 
 def interview(file: Path, dialogue: Dialogue, extra: dict[str, Any]) -> None:
@@ -78,7 +81,9 @@ def _cameras(dialogue: Dialogue) -> list[CameraSection]:
         found = finder.find_cameras()
     for k, camera in enumerate(found):
         modes = ", ".join(f"{w}x{h} at {rate:g} Hz" for w, h, rate in camera.modes[:3])
-        dialogue.say(f"   {k}: {camera.name}, {camera.options['source']}; {modes or 'modes unknown'}")
+        dialogue.say(
+            f"   {k}: {camera.name}, {Address(str(camera.options['source']))}; {modes or 'modes unknown'}"
+        )
     if not found:
         dialogue.say(
             "   no camera is at this computer's ports; network cameras have an address (http://, rtsp://, genicam://)"
@@ -89,6 +94,7 @@ def _cameras(dialogue: Dialogue) -> list[CameraSection]:
         "Which two cameras see the arm, the left one first, as seen from behind them: numbers from above, or addresses",
         default,
         lambda text: chosen_cameras(text, found),
+        lambda text: " ".join(map(Address, _camera_words(text))),
     )
     names = NAMES if len(chosen) == len(NAMES) else tuple(f"camera{k + 1}" for k in range(len(chosen)))
     sections = []
@@ -96,35 +102,39 @@ def _cameras(dialogue: Dialogue) -> list[CameraSection]:
         options = dict(camera.options)
         if camera.modes:
             options |= dict(zip(("width", "height", "rate_hz"), camera.modes[0], strict=True))
-        with dialogue.doing(f"opening {camera.options['source']}"):
+        source = Address(str(camera.options["source"]))
+        with dialogue.doing(f"opening {source}"):
             try:
                 width, height, rate = finder.probe_camera(options)
             except DriverError as error:
                 raise CommandError("camera", f"camera {name!r}: {error}") from error
-        dialogue.say(
-            f"   {name}: {camera.options['source']} gives pictures of {width}x{height} at {rate:g} Hz"
-        )
+        dialogue.say(f"   {name}: {source} gives pictures of {width}x{height} at {rate:g} Hz")
         options |= {"width": width, "height": height, "rate_hz": rate}
         sections.append(CameraSection(name, CAMERA_DRIVER, DETECTOR, options=options))
     return sections
 
 
 def chosen_cameras(text: str, found: Sequence[FoundCamera]) -> list[FoundCamera]:
-    """Parse numbers of found cameras and addresses, by spaces. Raises ValueError."""
+    """Parse numbers of found cameras and addresses, by blanks or commas. Raises ValueError."""
     chosen = []
-    for word in text.replace(",", " ").split():
+    for word in _camera_words(text):
         if word.isdecimal() and int(word) < len(found):
             chosen.append(found[int(word)])
         elif "://" in word or word.startswith("/dev/"):
-            chosen.append(FoundCamera(word, {"source": word}))
+            chosen.append(FoundCamera(Address(word), {"source": word}))
         else:
             known = f"0 to {len(found) - 1}, " if found else ""
-            raise ValueError(f"{word!r}; valid: {known}an address with ://, a device /dev/video0")
+            raise ValueError(f"{Address(word)!r}; valid: {known}an address with ://, a device /dev/video0")
     if len(chosen) < 2:
         raise ValueError(f"{len(chosen)} camera; a cell needs two: one alone tells nothing of depth")
     if len({str(camera.options["source"]) for camera in chosen}) < len(chosen):
         raise ValueError("one camera is given twice; each must be another")
     return chosen
+
+
+def _camera_words(text: str) -> list[str]:
+    """Numbers and addresses of an answer; blanks and commas in a password part nothing."""
+    return [word for word in _NEXT_CAMERA.split(text.strip(" \t,")) if word]
 
 
 # -- drives --------------------------------------------------------------------------------------------------------

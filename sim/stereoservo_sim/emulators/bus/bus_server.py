@@ -13,6 +13,7 @@ from typing import Self
 
 import msgspec
 
+from stereoservo.messages.addresses import Address
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator, BusEvent
@@ -278,15 +279,16 @@ def open_endpoint(channel: str, bus_bitrate: int) -> Endpoint:
         host, _, port = channel.removeprefix("socket://").rpartition(":")
         if host not in ("127.0.0.1", "localhost") or not port.isdecimal() or int(port) > 65_535:
             raise EndpointError(
-                f"channel {channel!r}: emulated drives listen on this host only: socket://127.0.0.1:PORT (0: free)"
+                f"channel {Address(channel)!r}: emulated drives listen on this host only: "
+                "socket://127.0.0.1:PORT (0: free)"
             )
         return SlcanTcp(int(port), bus_bitrate)
     interface, separator, name = channel.partition(":")
     if separator and interface and name:
         return PythonCanEndpoint(interface, name)
     raise EndpointError(
-        f"channel {channel!r} cannot be served; valid: socket://127.0.0.1:PORT (0: a free one), pty, or a python-can "
-        "interface as INTERFACE:CHANNEL, e.g. socketcan:vcan0"
+        f"channel {Address(channel)!r} cannot be served; valid: socket://127.0.0.1:PORT (0: a free one), pty, or a "
+        "python-can interface as INTERFACE:CHANNEL, e.g. socketcan:vcan0"
     )
 
 
@@ -297,7 +299,7 @@ def served_channel(options: CanOptions) -> str:
         return channel
     if options.interface in ("stereoservo_slcan", "slcan", "virtual"):
         raise EndpointError(
-            f"the cell's channel is {options.interface} {channel!r}, which another process cannot stand in for; give "
-            "--channel pty or --channel socket://127.0.0.1:0, and the cell the channel that is then printed"
+            f"the cell's channel is {options.interface} {Address(channel)!r}, which another process cannot stand in for"
+            "; give --channel pty or --channel socket://127.0.0.1:0, and the cell the channel that is then printed"
         )
     return f"{options.interface}:{channel}"

@@ -175,7 +175,7 @@ def _arm(options: CanOptions, settings: DrivesSettings, mount: Mount, cell_dir: 
         )
         raise EmulationError(
             f"{what} is the simulated arm with joints {has}; this cell has {', '.join(names)}: name them so, or take "
-            "plant = 'ideal'"
+            "plant = 'ideal'" + "".join(f". {note}" for note in cell.robot.notes)
         )
     return cell
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CellFile
 from stereoservo.messages.goals import Name
 from stereoservo_drivers.options import invalid
@@ -100,6 +101,6 @@ def port_of(channel: str) -> int:
     port = channel.removeprefix(CHANNEL).rstrip("/")
     if not channel.startswith(CHANNEL) or not port.isdecimal() or int(port) > 65_535:
         raise EmulationError(
-            f"channel {channel!r}: emulated cameras listen on this host only: {CHANNEL}PORT (0: a free one)"
+            f"channel {Address(channel)!r}: emulated cameras listen on this host only: {CHANNEL}PORT (0: a free one)"
         )
     return int(port)

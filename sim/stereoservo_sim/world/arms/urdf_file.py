@@ -1,13 +1,12 @@
 """Reads an arm from a URDF file: the chain from its root to the flange, with joints' limits, masses and shapes.
 
 Joints beside the chain, such as a gripper's, stay at zero, or at the nearest position that they can take; what they
-carry belongs to the link that carries them.
+carry belongs to the link that carries them. Which these are is told (``Robot.notes``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,13 +15,18 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from stereoservo.messages.decoding import decoding
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName, JointSpec
+from stereoservo_sim.world.arms.urdf_chain import UrdfError, UrdfJoint, UrdfTree, chain_to_flange
 from stereoservo_sim.world.robots import Capsule, Robot
 
 MOVING: dict[str, JointKindName] = {
     "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
 }  # fmt: skip
+LARGEST = 1e6
+"""Beyond, a number is a damaged one [m, kg, rad]; but for limits, where large ones mean none."""
+NO_LIMIT = 1e39
 FASTEST: dict[JointKindName, float] = {"revolute": 1.0, "prismatic": 0.4}
 """At most so fast a simulated joint is [rad/s or m/s]: a file states what the motor can, or nothing."""
 ACCELERATION: dict[JointKindName, float] = {"revolute": 4.0, "prismatic": 2.0}
@@ -31,36 +35,6 @@ ENDLESS = float(2.0 * np.pi)
 """Range to either side of a joint that turns without end [rad]."""
 SHORTEST = 1e-3
 """Between the ends of a capsule [m]: of a ball it is a short one."""
-
-
-class UrdfError(ValueError):
-    """A URDF file cannot be used; the text names the file, the cause and what would be valid."""
-
-
-@dataclass(frozen=True)
-class _Joint:
-    name: str
-    kind: str
-    parent: str
-    child: str
-    origin: FloatArray
-    axis: FloatArray
-    element: Element
-
-
-@dataclass(frozen=True)
-class _Tree:
-    path: Path
-    name: str
-    links: dict[str, Element]
-    joints: tuple[_Joint, ...]
-
-    def below(self, link: str) -> list[_Joint]:
-        return [joint for joint in self.joints if joint.parent == link]
-
-    def moves(self, joint: _Joint) -> bool:
-        """Whether the joint, or one beyond it, moves."""
-        return joint.kind in MOVING or any(self.moves(one) for one in self.below(joint.child))
 
 
 def urdf_path(named: str, folder: Path) -> Path:
@@ -85,37 +59,37 @@ def load_urdf(path: Path, *, flange: str = "", mounted: FloatArray | None = None
     """The arm of a URDF file, its root link at ``mounted`` (4, 4) in the world.
 
     ``flange``: the link that carries the body; default: the last before nothing moves any more, or before the tree
-    branches into several moving joints (a gripper's fingers). Raises UrdfError.
+    branches into several moving joints (a gripper's fingers), or before a gripper's single jaw. What of the file is
+    left out, and how it is included, is in the robot's ``notes``. Raises UrdfError.
     """
-    tree = _read(path)
-    chain = _chain(tree, flange)
-    pose = np.eye(4) if mounted is None else mounted
+    with decoding(lambda cause: UrdfError(f"{path}: {cause}"), passed=(UrdfError,)):
+        return _robot(_read(path), flange, np.eye(4) if mounted is None else mounted)
+
+
+def _robot(tree: UrdfTree, flange: str, pose: FloatArray) -> Robot:
+    chain, notes = chain_to_flange(tree, flange)
     fixed, links, specs = pose, [], []
     for joint in chain:
         fixed = fixed @ joint.origin
-        if joint.kind not in MOVING:
+        if not joint.moves:
             continue
         turn = _to_axis(joint.axis)
         links.append(fixed @ turn)
-        specs.append(_spec(joint, path))
+        specs.append(_spec(joint, tree.path))
         fixed = turn.T
-    if not specs:
-        raise UrdfError(
-            f"{path}: no joint moves between {chain[0].parent if chain else 'the root'!r} and the flange"
-        )
     parts = _rigid_parts(tree, chain, pose)
-    masses, centres = zip(*(_weight(part) for part in parts[1:]), strict=True)
+    masses, centres = zip(*(_weight(part, tree.path) for part in parts[1:]), strict=True)
     return Robot(
         name=tree.name, base=links[0], links=np.stack([*links[1:], fixed]), joints=tuple(specs),
-        masses=np.array(masses), centres=np.array(centres), shapes=tuple(_shapes(parts, path)), file=path,
-        mounted=pose, flange=chain[-1].child,
+        masses=np.array(masses), centres=np.array(centres), shapes=tuple(_shapes(parts, tree.path)), file=tree.path,
+        mounted=pose, flange=chain[-1].child, notes=notes,
     )  # fmt: skip
 
 
 # -- the tree -------------------------------------------------------------------------------------------------
 
 
-def _read(path: Path) -> _Tree:
+def _read(path: Path) -> UrdfTree:
     try:
         root = ElementTree.parse(path).getroot()
     except OSError as error:
@@ -124,9 +98,12 @@ def _read(path: Path) -> _Tree:
         raise UrdfError(f"{path}: is not XML: {error} (a .xacro is first to be expanded)") from error
     if root.tag != "robot":
         raise UrdfError(f"{path}: its outermost element is <{root.tag}>; a URDF's is <robot>")
-    links = {_name(link, path): link for link in root.findall("link")}
+    links: dict[str, Element] = {}
+    for link in root.findall("link"):
+        if links.setdefault(_name(link, path), link) is not link:
+            raise UrdfError(f"{path}: two links are named {link.get('name')!r}; each needs a name of its own")
     joints = tuple(_joint(element, links, path) for element in root.findall("joint"))
-    return _Tree(path, root.get("name", path.stem), links, joints)
+    return UrdfTree(path, root.get("name") or path.stem, links, joints)
 
 
 def _name(element: Element, path: Path) -> str:
@@ -136,11 +113,12 @@ def _name(element: Element, path: Path) -> str:
     return name
 
 
-def _joint(element: Element, links: dict[str, Element], path: Path) -> _Joint:
+def _joint(element: Element, links: dict[str, Element], path: Path) -> UrdfJoint:
     name, kind = _name(element, path), element.get("type", "")
     if kind not in (*MOVING, "fixed"):
         raise UrdfError(
-            f"{path}: joint {name!r} is of type {kind!r}; {', '.join((*MOVING, 'fixed'))} can be simulated"
+            f"{path}: joint {name!r} is of type {kind!r}; {', '.join((*MOVING, 'fixed'))} can be simulated: make it "
+            'type="fixed" where it stands still'
         )
     ends = []
     for tag in ("parent", "child"):
@@ -153,9 +131,42 @@ def _joint(element: Element, links: dict[str, Element], path: Path) -> _Joint:
         ends.append(end)
     axis = element.find("axis")
     direction = np.array([1.0, 0.0, 0.0]) if axis is None else _vector(axis, "xyz", path)
-    if kind in MOVING and not np.linalg.norm(direction) > 0.0:
+    if kind in MOVING and not np.linalg.norm(direction) > 1e-6:
         raise UrdfError(f"{path}: joint {name!r}: its axis is {direction.tolist()}; a direction is needed")
-    return _Joint(name, kind, ends[0], ends[1], _origin(element, path), direction, element)
+    mimic, mimics = element.find("mimic"), ""
+    if mimic is not None and kind in MOVING:
+        mimics = mimic.get("joint", "")
+        if not mimics:
+            raise UrdfError(f'{path}: joint {name!r}: its <mimic> names no joint; joint="NAME" is needed')
+        for key, default in (("multiplier", "1"), ("offset", "0")):
+            _number(mimic, key, path, default)
+    return UrdfJoint(name, kind, ends[0], ends[1], _origin(element, path), direction, element, mimics)
+
+
+def _number(
+    element: Element,
+    key: str,
+    path: Path,
+    default: str = "0",
+    least: float = -LARGEST,
+    most: float = LARGEST,
+) -> float:
+    text = element.get(key, default)
+    try:
+        found = float(text)
+    except ValueError:
+        found = float("nan")
+    if not least <= found <= most:
+        raise UrdfError(
+            f"{path}: <{element.tag} {key}={text!r}>; a number from {least:g} to {most:g} is needed"
+        )
+    return found
+
+
+def _range(limit: Element, path: Path) -> tuple[float, float]:
+    """Lowest and highest position of a joint [rad or m]."""
+    low, high = (_number(limit, key, path, least=-NO_LIMIT, most=NO_LIMIT) for key in ("lower", "upper"))
+    return low, high
 
 
 def _vector(element: Element, key: str, path: Path, default: str = "0 0 0") -> FloatArray:
@@ -164,8 +175,10 @@ def _vector(element: Element, key: str, path: Path, default: str = "0 0 0") -> F
         found = np.array([float(word) for word in text.split()])
     except ValueError:
         found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise UrdfError(f"{path}: <{element.tag} {key}={text!r}>; three numbers are needed")
+    if found.shape != (3,) or not np.abs(found).max() <= LARGEST:
+        raise UrdfError(
+            f"{path}: <{element.tag} {key}={text!r}>; three numbers are needed, up to {LARGEST:g}"
+        )
     return found
 
 
@@ -184,32 +197,6 @@ def _origin(element: Element, path: Path) -> FloatArray:
     return pose
 
 
-def _chain(tree: _Tree, flange: str) -> list[_Joint]:
-    """Joints from the root to the flange, fixed ones included."""
-    children = {joint.child: joint for joint in tree.joints}
-    if flange:
-        if flange not in tree.links:
-            raise UrdfError(f"{tree.path}: flange {flange!r} is no link; links: {', '.join(tree.links)}")
-        chain, link = [], flange
-        while link in children and len(chain) <= len(tree.joints):
-            chain.insert(0, children[link])
-            link = children[link].parent
-        return chain
-    roots = [link for link in tree.links if link not in children]
-    if len(roots) != 1:
-        raise UrdfError(f"{tree.path}: {len(roots)} links without a parent; a tree has one root")
-    chain, link = [], roots[0]
-    while len(moving := [joint for joint in tree.below(link) if tree.moves(joint)]) == 1:
-        chain.append(moving[0])
-        link = moving[0].child
-    ahead = tree.below(link)  # a tool's frame behind the last joint, where it is the only one
-    while len(ahead) == 1 and ahead[0].kind == "fixed":
-        chain.append(ahead[0])
-        link = ahead[0].child
-        ahead = tree.below(link)
-    return chain
-
-
 def _to_axis(axis: FloatArray) -> FloatArray:
     """Rotation (4, 4) whose z is along ``axis``."""
     z = axis / np.linalg.norm(axis)
@@ -222,21 +209,18 @@ def _to_axis(axis: FloatArray) -> FloatArray:
     return turn
 
 
-def _spec(joint: _Joint, path: Path) -> JointSpec:
+def _spec(joint: UrdfJoint, path: Path) -> JointSpec:
     kind = MOVING[joint.kind]
     limit = joint.element.find("limit")
     low, high, speed = -ENDLESS, ENDLESS, FASTEST[kind]
     if limit is not None:
-        try:
-            stated = float(limit.get("velocity", "0"))
-            if joint.kind != "continuous":
-                low, high = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
-        except ValueError as error:
-            raise UrdfError(f"{path}: joint {joint.name!r}: its <limit> has no number: {error}") from error
+        stated = _number(limit, "velocity", path, least=-NO_LIMIT, most=NO_LIMIT)
+        if joint.kind != "continuous":
+            low, high = _range(limit, path)
         speed = min(speed, stated) if stated > 0.0 else speed
     elif joint.kind != "continuous":
         raise UrdfError(f"{path}: joint {joint.name!r} is {joint.kind} and has no <limit lower=… upper=…>")
-    if not -np.inf < low < high < np.inf:
+    if not low < high:
         raise UrdfError(
             f"{path}: joint {joint.name!r}: limits {low:g} to {high:g}; the lower must be below the upper"
         )
@@ -249,38 +233,37 @@ Part = list[tuple[FloatArray, Element]]
 """Links that move as one, each with its pose (4, 4) in their joint's frame."""
 
 
-def _rigid_parts(tree: _Tree, chain: list[_Joint], mounted: FloatArray) -> list[Part]:
+def _rigid_parts(tree: UrdfTree, chain: list[UrdfJoint], mounted: FloatArray) -> list[Part]:
     """Of the base, in the world, and of every moving joint of the chain, in its frame."""
-    along = {joint.name for joint in chain if joint.kind in MOVING}
-    root = chain[0].parent
+    along = {joint.name for joint in chain if joint.moves}
     parts: list[Part] = [[]]
-
-    def collect(link: str, pose: FloatArray, part: Part) -> None:
-        part.append((pose, tree.links[link]))
-        for joint in tree.below(link):
+    waiting = [(chain[0].parent, mounted, 0)]  # depth first, in the file's order
+    while waiting:
+        link, pose, part = waiting.pop()
+        if part == len(parts):
+            parts.append([])
+        parts[part].append((pose, tree.links[link]))
+        for joint in reversed(tree.below(link)):
             if joint.name in along:
-                parts.append([])
-                collect(joint.child, _to_axis(joint.axis).T, parts[-1])
+                waiting.append((joint.child, _to_axis(joint.axis).T, part + 1))
             else:
-                collect(joint.child, pose @ joint.origin @ _resting(joint), part)
-
-    collect(root, mounted, parts[0])
+                waiting.append((joint.child, pose @ joint.origin @ _resting(joint, tree.path), part))
     return parts
 
 
-def _resting(joint: _Joint) -> FloatArray:
+def _resting(joint: UrdfJoint, path: Path) -> FloatArray:
     """Motion (4, 4) of a joint beside the chain to where it rests."""
-    return (
-        motion(joint.kind, joint.axis, resting_position(joint.element)) if joint.kind in MOVING else np.eye(4)
-    )
+    if not joint.moves:
+        return np.eye(4)
+    return motion(joint.kind, joint.axis, resting_position(joint.element, path))
 
 
-def resting_position(element: Element) -> float:
+def resting_position(element: Element, path: Path) -> float:
     """Zero, or what of a joint's range is nearest to it [rad or m]."""
     limit = element.find("limit")
     if limit is None or element.get("type") == "continuous":
         return 0.0
-    return float(np.clip(0.0, float(limit.get("lower", "0")), float(limit.get("upper", "0"))))
+    return float(np.clip(0.0, *_range(limit, path)))
 
 
 def motion(kind: str, axis: FloatArray, value: float) -> FloatArray:
@@ -294,7 +277,7 @@ def motion(kind: str, axis: FloatArray, value: float) -> FloatArray:
     return turn @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]) @ turn.T
 
 
-def _weight(part: Part) -> tuple[float, FloatArray]:
+def _weight(part: Part, path: Path) -> tuple[float, FloatArray]:
     """Mass [kg] and its centre (3,) [m] of a part."""
     mass, moment = 0.0, np.zeros(3)
     for pose, link in part:
@@ -302,9 +285,9 @@ def _weight(part: Part) -> tuple[float, FloatArray]:
         stated = None if inertial is None else inertial.find("mass")
         if inertial is None or stated is None:
             continue
-        own = float(stated.get("value", "0"))
+        own = _number(stated, "value", path, least=0.0)
         mass += own
-        moment += own * (pose @ _origin(inertial, Path()))[:3, 3]
+        moment += own * (pose @ _origin(inertial, path))[:3, 3]
     return mass, moment / mass if mass > 0.0 else moment
 
 
@@ -329,7 +312,7 @@ def _corners(geometry: Element | None, path: Path) -> FloatArray:
     cube = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1.0)])
     if shape.tag == "box":
         return 0.5 * cube * _vector(shape, "size", path)
-    radius, length = float(shape.get("radius", "0")), float(shape.get("length", "0"))
+    radius, length = (_number(shape, key, path, least=0.0) for key in ("radius", "length"))
     if shape.tag == "sphere":
         return radius * cube / np.sqrt(3.0)
     angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
@@ -341,12 +324,21 @@ def _corners(geometry: Element | None, path: Path) -> FloatArray:
 def _mesh_points(named: str, path: Path) -> FloatArray:
     """Vertices (k, 3) of an .obj or .stl file; none of another, or where it is not found."""
     bare = named.split("://", 1)[-1]
-    places = [parent / bare for parent in path.parents]
-    file = next((place for place in places if place.is_file()), None)
+    try:
+        file = next((place for parent in path.parents if (place := parent / bare).is_file()), None)
+    except OSError:  # a name that no file can have
+        return np.zeros((0, 3))
     if file is None or file.suffix.lower() not in (".obj", ".stl"):
         return np.zeros((0, 3))
-    data = file.read_bytes()
-    if file.suffix.lower() == ".obj":
+    with decoding(lambda cause: UrdfError(f"{path}: its mesh {file}: {cause}")):
+        points = _vertices(file.read_bytes(), file.suffix.lower() == ".obj")
+    if not np.abs(points).max(initial=0.0) <= LARGEST:
+        raise UrdfError(f"{path}: its mesh {file} has vertices that are no number, or beyond {LARGEST:g}")
+    return points
+
+
+def _vertices(data: bytes, obj: bool) -> FloatArray:
+    if obj:
         rows = [line.split()[1:4] for line in data.splitlines() if line.startswith(b"v ")]
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
     count = int.from_bytes(data[80:84], "little")
@@ -356,7 +348,8 @@ def _mesh_points(named: str, path: Path) -> FloatArray:
     facets = np.frombuffer(
         data, dtype=np.dtype([("numbers", "<f4", 12), ("end", "<u2")]), offset=84, count=count
     )
-    return facets["numbers"][:, 3:].reshape(-1, 3).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # what is no number is refused with its name
+        return facets["numbers"][:, 3:].reshape(-1, 3).astype(np.float64)
 
 
 def _capsule(link: int, points: FloatArray) -> Capsule:

@@ -14,6 +14,7 @@ from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_bus_emulator
 from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of
+from stereoservo_sim.world.arms.urdf_file import urdf_path
 
 SCARA = cell_of(ArmPlace(urdf="scara.urdf"), "eye_to_hand", Path())
 
@@ -59,3 +60,21 @@ def test_joints_that_are_not_the_urdfs_are_named() -> None:
         EmulationError, match=r"gantry\.urdf' is the simulated arm with joints x \(prismatic\), z"
     ):
         make_bus_emulator(options, settings, t_ns=0)
+
+
+def test_joints_that_differ_are_told_with_what_the_file_leaves_out(tmp_path: Path) -> None:
+    """Of a gripper's jaw, for which the cell has a drive as for a joint of the arm."""
+    source = urdf_path("scara.urdf", tmp_path).read_text(encoding="utf-8")
+    jaw = (
+        '<link name="jaw"/><joint name="grip" type="revolute"><parent link="flange"/><child link="jaw"/>'
+        '<limit lower="0" upper="1" velocity="1" effort="1"/></joint></robot>'
+    )
+    (tmp_path / "mine.urdf").write_text(source.replace("</robot>", jaw))
+    cell = scara_on_a_bus(urdf="mine.urdf", plant="ideal")
+    joints = cell.joints.options["joint"]
+    joints.append({**joints[-1], "name": "grip", "node_id": len(joints) + 1})
+    options, drives = drives_of_cell(cell, tmp_path)
+    with pytest.raises(
+        EmulationError, match=r"this cell has .*grip.*flange = 'jaw' makes it a joint of the arm"
+    ):
+        make_bus_emulator(options, drives, t_ns=0, cell_dir=tmp_path)
