@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from stereoservo.cli.status import describe
-from stereoservo.messages.status import CameraHealth, Health, RefinementState
+from stereoservo.messages.status import CameraHealth, Halt, Health, RefinementState
 from stereoservo.messages.wire import LoopInfo, StateMessage, decode, encode
 
 STATE = StateMessage(
@@ -61,6 +61,29 @@ def test_the_models_health_is_told_camera_by_camera() -> None:
     assert "  model   camera moved: left 42.00 px  up 0.02 px (moving)" in told
     assert "          camera left moved by 42 px rms" in told
     assert "          camera up: is late" in told
+
+
+def test_what_is_shown_carries_its_age_and_is_unknown_without_a_source() -> None:
+    ages = {"left": 0.021, "right": 3.21, "up": None}
+    told = said(joints_age_s=0.004, visible={"left": 14}, camera_age_s=ages)
+    assert "  joints  j1 +0.1000 (+5.7°) (4 ms old)" in told
+    assert (
+        "  markers left 14 (21 ms old)  right unknown (no frame for 3.2 s)  up unknown (no frame yet)" in told
+    )
+    assert "  joints  unknown: no sample for 3.0 s" in said(joints={}, joints_age_s=3.0)
+    assert "  joints  unknown: no sample yet" in said(joints={})
+    told = said(health=Health("unknown", text="no camera delivers frames"))
+    assert told[told.index("  model   unknown") + 1] == "          no camera delivers frames"
+
+
+def test_the_markers_of_a_daemon_that_tells_no_ages_are_shown_as_before() -> None:
+    assert "  markers left 14" in said(visible={"left": 14})
+
+
+def test_who_stopped_the_arm_is_told() -> None:
+    assert not any(line.startswith("  halt") for line in said())
+    (line,) = (line for line in said(halt=Halt("stopped by ann", 1.0)) if line.startswith("  halt"))
+    assert line.startswith("  halt    stopped by ann, ")
 
 
 def test_messages_that_could_not_be_taken_are_counted() -> None:

@@ -26,6 +26,7 @@ class NoLink:
     """A `CellLink` to no cell."""
 
     cell = "none"
+    silent_s = 0.0
 
     def __init__(self, publish: Any) -> None:
         self.watched = Event()

@@ -259,7 +259,7 @@ def test_a_process_number_that_is_another_users_by_now_is_no_plant(
     def refused(pid: int, number: int) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr("stereoservo.daemon.plant_driver.os.kill", refused)
+    monkeypatch.setattr("stereoservo.daemon.seqlock.os.kill", refused)
     cell.clock.sleep(1.0)
     with pytest.raises(DriverError) as caught:
         cell.driver.read_state()

@@ -235,6 +235,30 @@ def test_looking_around_with_a_wildcard_reads_everything_and_stops_nothing(clien
 def test_a_put_stops_too(client: Client) -> None:
     client.session.put(client.keys.stop, b"")
     eventually("stopped", lambda: "STOPPED" in {reason.code for reason in client.status().reasons})
+    halt = client.status().halt
+    assert halt is not None
+    assert halt.words == "stopped by a client that gives no name"
+    client.resume()
+
+
+def test_whoever_stopped_or_held_the_arm_is_named(client: Client) -> None:
+    def words() -> str | None:
+        halt = client.status().halt
+        return None if halt is None else halt.words
+
+    assert words() is None
+    with EventWatch(client) as watch:
+        client.stop("viewer 2")
+        event = watch.wait(lambda e: e.kind == "stopped", "the stop", 10.0)
+        assert event.operator == "viewer 2"
+    eventually("it is named", lambda: words() == "stopped by viewer 2")
+    client.resume()
+    eventually("it is over", lambda: words() is None)
+    assert cli.invoke(["stop", CELL]) == 0
+    eventually("over no wire", lambda: words() == "stopped on the cell's host")
+    client.resume()
+    client.hold()
+    eventually("held", lambda: words() == f"held by {client.operator}")
     client.resume()
 
 

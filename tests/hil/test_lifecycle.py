@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from stereoservo.cli.status import describe
 from stereoservo.client import (
     Client,
     DaemonLostError,
@@ -173,8 +174,39 @@ def test_a_killed_vision_process_comes_back(own: Client, directories: CellDirect
         event = watch.wait(lambda e: e.kind == "process_ended", "the report", 20.0)
         assert "vision-left ended by signal SIGKILL" in event.message
     eventually("a new one", lambda: processes(directories).get("vision-left", old) != old)
-    eventually("it sees", lambda: own.status().visible["left"] > 0)
+    eventually("it sees", lambda: own.status().visible.get("left", 0) > 0)
     own.goal("park", tolerance_px=0.5, hold_frames=3).reached(60.0)
+
+
+def test_a_dead_camera_process_is_a_reason_at_once_and_what_it_saw_is_unknown(
+    own: Client, directories: CellDirectories
+) -> None:
+    def silent() -> dict[str, str]:
+        return {r.subject: r.hint for r in own.status().reasons if r.code == "CAMERA_SILENT"}
+
+    def both_see() -> bool:
+        state = own.status()
+        return set(state.visible) == {"left", "right"} and state.health.verdict == "ok" and not silent()
+
+    eventually("both see", both_see, 60.0)
+    assert not own.status().goal
+    os.kill(processes(directories)["vision-left"], signal.SIGKILL)
+    eventually("it is named", lambda: "its process has ended" in silent().get("left", ""))
+    eventually("it sees again", both_see, 60.0)
+    both = [processes(directories)[f"vision-{name}"] for name in ("left", "right")]
+    for pid in both:
+        os.kill(pid, signal.SIGSTOP)  # until the supervisor kills them
+
+    def blind() -> bool:
+        state = own.status()
+        return (state.visible, state.innovation_px, state.health.verdict) == ({}, {}, "unknown")
+
+    eventually("nobody sees the arm", blind)
+    state = own.status()
+    assert {r.subject for r in state.reasons if r.code == "CAMERA_SILENT"} == {"left", "right"}
+    assert state.level != "ok"
+    assert "left unknown (no frame for" in describe(state)
+    eventually("both see again", both_see, 60.0)
 
 
 def test_a_killed_servo_process_ends_everything_with_an_error(

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.client import Client
+from stereoservo.cli.status import describe
+from stereoservo.client import Client, ClientError
 from stereoservo.daemon.plant_driver import PLANT_STATE_LAYOUT
 from stereoservo.daemon.seqlock import SlotReader
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.discovery import DaemonProcess
+from stereoservo.messages.servo_state import STALE_S
 from stereoservo_sim.world.history import FILE_NAME, TrueJointHistory
 
 from .conftest import CELL, eventually, processes
@@ -45,6 +47,15 @@ def test_a_killed_plant_is_a_fault_that_is_named_and_comes_back_where_it_was(
         eventually("the fault", lambda: told("fault", "the process of the simulated drives ended"))
         eventually("the report", lambda: told("process_ended", "plant ended by signal SIGKILL"))
         assert client.status().lifecycle == "fault"
+        assert any(reason.level == "fault" for reason in client.status().reasons)
+        eventually("its joints are unknown", lambda: not client.status().joints)
+        state = client.status()
+        assert state.velocities == {}, "and no speed is shown"
+        assert state.joints_age_s is not None
+        assert state.joints_age_s > STALE_S
+        assert "joints  unknown: no sample for" in describe(state)
+        with pytest.raises(ClientError, match="where the joints are is unknown"):
+            client.joints()
         with SlotReader(directories.plant_state_slot, PLANT_STATE_LAYOUT) as slot:
             eventually("a new plant", lambda: slot.writer_pid != found["plant"], 60.0)
         assert processes(directories)["plant"] != found["plant"]

@@ -52,7 +52,7 @@ class ClientOfCell:
     def declare_subscriber(self, *arguments: Any) -> None:
         raise self._of.fails
 
-    def stop(self) -> Reply:
+    def stop(self, operator: str) -> Reply:
         self.stopped += 1
         return self._of.stops() if self._first else Reply(True, "stopped")
 
@@ -97,7 +97,7 @@ def test_where_the_link_is_down_the_arm_is_stopped_over_a_session_of_its_own(
     try:
         assert down.wait(10)
         assert told in why[0]
-        assert link.stop().message == "stopped"
+        assert link.stop("ann").message == "stopped"
         with pytest.raises(LinkDownError):
             link.client.enable()
     finally:
@@ -116,7 +116,7 @@ def test_a_stop_without_an_answer_is_given_again_over_a_fresh_session(
 
     cell = Cell(ClientError("not read here"), stops)
     link, _, _ = link_of(cell, monkeypatch)
-    assert link.stop().message == "stopped"
+    assert link.stop("ann").message == "stopped"
     assert [client.stopped for client in cell.clients] == [1, 1]
 
 
@@ -128,4 +128,4 @@ def test_where_there_is_no_daemon_the_stop_says_so(monkeypatch: pytest.MonkeyPat
     cell = Cell(ClientError("not read here"), stops)
     link, _, _ = link_of(cell, monkeypatch)
     with pytest.raises(NotRunningError, match="no daemon runs"):
-        link.stop()
+        link.stop("ann")

@@ -1,14 +1,11 @@
 """What the page's server lets through, over real sockets, to a link that notes it."""
 
-import asyncio
 import http.client
 import json
 import random
 import socket
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from threading import Event, Thread
+from threading import Event
 from typing import Any, cast
 
 import msgspec
@@ -23,10 +20,8 @@ from stereoservo.client import Client, ClientError
 from stereoservo.messages.goals import Goal, TaughtTarget
 from stereoservo.messages.wire import Reply
 from stereoservo.web import server as page_server
-from stereoservo.web.cell_link import CellLink, Publish
-from stereoservo.web.model_view import ModelView
 from stereoservo.web.requests import PageRequest
-from stereoservo.web.server import PageServer
+from web.page_bench import serving
 
 EXAMPLE = Client.make_goal(TaughtTarget("a"))
 VERBS = [kind.__struct_config__.tag for kind in PageRequest.__args__]
@@ -39,70 +34,6 @@ NEEDED: dict[str, dict[str, Any]] = {
     "seek": {"at": 1.0},
 }
 """What a request must hold beside its verb."""
-
-
-class NotedClient:
-    """Notes the name of every method that is called."""
-
-    def __init__(self, calls: list[str]) -> None:
-        self._calls = calls
-
-    def __getattr__(self, name: str) -> Callable[..., Reply]:
-        def call(*arguments: Any, **named: Any) -> Reply:
-            self._calls.append(name)
-            return Reply(True, name)
-
-        return call
-
-
-class NotedLink(NotedClient):
-    """A `CellLink` without a cell."""
-
-    cell = "noted"
-    recording = False
-    view = ModelView()
-    publish: Publish
-
-    def __init__(self, calls: list[str]) -> None:
-        super().__init__(calls)
-        self.client = NotedClient(calls)
-        self.watched = Event()
-        self.ended = 0
-
-    def start(self) -> None: ...
-
-    def close(self) -> None: ...
-
-    def end_leases(self) -> None:
-        self.ended += 1
-
-    def taught_goal(self, name: str) -> Goal:
-        return cast(Goal, None)
-
-
-@contextmanager
-def serving(operator: str | None) -> Iterator[tuple[int, list[str], list[str], NotedLink]]:
-    """A server in a thread: its port, the calls that reach the cell, the tokens, its link."""
-    calls: list[str] = []
-    tokens: list[str] = []
-    link = NotedLink(calls)
-
-    def make_link(publish: Publish) -> CellLink:
-        link.publish = publish
-        return cast(CellLink, link)
-
-    server = PageServer(make_link, operator, tokens.append)
-    loop = asyncio.new_event_loop()
-    thread = Thread(target=loop.run_forever, daemon=True)
-    thread.start()
-    try:
-        port = asyncio.run_coroutine_threadsafe(server.start("127.0.0.1", 0), loop).result(10)
-        yield port, calls, tokens, link
-    finally:
-        asyncio.run_coroutine_threadsafe(server.close(), loop).result(10)
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()
-        loop.close()
 
 
 def answer(page: ClientConnection, request: Any, n: int) -> dict[str, Any]:
@@ -210,6 +141,34 @@ def test_a_page_that_does_not_read_is_sent_no_more_pictures_until_it_has() -> No
         while not isinstance(message := page.recv(timeout=10), bytes):
             pass
         assert int.from_bytes(message[:4], "little") == count - 1, "the newest of all"
+
+
+def test_pages_are_told_that_the_server_lives_and_for_how_long_the_cell_has_been_silent() -> None:
+    with serving(None) as (port, _, _, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
+
+        def tick() -> dict[str, Any]:
+            while "tick" not in (message := msgspec.json.decode(page.recv(timeout=10))):
+                pass
+            return cast(dict[str, Any], message["tick"])
+
+        assert tick()["silent_s"] == 0.0
+        link.silent_s = 7.25
+        while tick()["silent_s"] != 7.25:
+            pass
+
+
+def test_a_stop_names_the_page_that_asked_for_it() -> None:
+    with serving("ann") as (port, _, tokens, link):
+        stopped: list[str] = []
+        link.stop = lambda operator: stopped.append(operator) or Reply(True, "stopped")
+        with (
+            connect(f"ws://127.0.0.1:{port}/socket") as first,
+            connect(f"ws://127.0.0.1:{port}/socket") as second,
+        ):
+            assert answer(first, {"do": "take", "token": tokens[0]}, 1)["ok"]
+            for n, page in enumerate((first, second), 2):
+                assert answer(page, {"do": "stop"}, n)["ok"]
+        assert stopped == ["ann", "viewer 2"]
 
 
 def frame(text: str) -> bytes:

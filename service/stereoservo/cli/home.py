@@ -131,7 +131,7 @@ def _look(client: Client, arm: LearntArm) -> Look:
     total, variance, count = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape)
     frames = dict.fromkeys(cameras, 0)
     time.sleep(SETTLE_S)
-    before = dict(client.status().joints)
+    before = client.joints()
     until = time.monotonic() + LOOK_S
     for message in client.watch(features=True):
         interruption.check()
@@ -153,7 +153,7 @@ def _look(client: Client, arm: LearntArm) -> Look:
             f"no camera sees a marker of the body ({told}): bring it into view by `stereoservo jog {client.cell}`, or "
             "look at the light",
         )
-    readings = client.status().joints
+    readings = client.joints()
     moved = max(abs(readings[name] - before[name]) for name in model.joint_names)
     if moved > 1e-2:
         raise CommandError("moving", f"the arm moved by {moved:.3f} rad or m during the look: it must rest")

@@ -55,7 +55,10 @@ def _silent(directories: CellDirectories, process: str, usual_s: float) -> str:
 
 
 def newest_state(directories: CellDirectories) -> StateMessage | None:
-    """The newest state that the servo process wrote, as the gateway would tell it; None where it cannot be read."""
+    """The newest state that the servo process wrote, as the gateway would tell it; None where it cannot be read.
+
+    Of a silent servo process: as it was when it wrote it.
+    """
     try:
         run = read_run(directories.runtime)
         reader = SlotReader(directories.state_slot, STATE_LAYOUT)
@@ -67,4 +70,5 @@ def newest_state(directories: CellDirectories) -> StateMessage | None:
     except (OSError, ValueError, SlotError, msgspec.MsgspecError):
         return None
     alive = not servo_silence(directories)
-    return state_message(run, run.boot, state, servo_alive=alive, last_event=0)
+    now_ns = time.monotonic_ns() if alive else state.status.t_ns
+    return state_message(run, run.boot, state, now_ns=now_ns, servo_alive=alive, last_event=0)

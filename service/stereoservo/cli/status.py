@@ -85,23 +85,25 @@ def _failure(code: str, words: str, state: StateMessage | None, as_json: bool) -
     if state is None:
         return CommandError(code, words)
     if not as_json:
-        emit(None, f"the last that is known:\n{describe(state)}", False)
+        age_s = max(0.0, time.time() - state.t_wall)
+        emit(None, f"the last that is known, {age_s:.1f} s old:\n{describe(state)}", False)
     return CommandError(code, words, state=state)
 
 
 def describe(state: StateMessage) -> str:
     """A state as some lines of text."""
-    joints = "  ".join(
-        f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items()
-    )
     lines = [
         f"{state.cell}: {state.lifecycle}, model {state.model} (epoch {state.model_epoch}), {state.source}",
-        f"  joints  {joints}",
+        f"  joints  {_joints(state)}",
         f"  loop    {state.loop.rate_hz:g} Hz, {state.loop.cycles} cycles, {state.loop.overruns} "
         f"overruns, lateness p99 "
         f"{state.loop.lateness_us['p99']:.0f} us, max {state.loop.lateness_us['max']:.0f} us",
-        "  markers " + "  ".join(f"{camera} {count}" for camera, count in state.visible.items()),
+        f"  markers {_markers(state)}",
     ]
+    if state.halt is not None:
+        lines.append(
+            f"  halt    {state.halt.words}, {time.strftime('%H:%M:%S', time.localtime(state.halt.t_wall))}"
+        )
     lines += _health(state)
     if state.efforts or state.following_errors:
         lines.append("  loads   " + _loads(state))
@@ -129,6 +131,36 @@ def describe(state: StateMessage) -> str:
     return "\n".join(lines)
 
 
+def _joints(state: StateMessage) -> str:
+    """Text: positions of the joints and their age, or that they are unknown."""
+    if not state.joints:
+        return f"unknown: {_silence('sample', state.joints_age_s)}"
+    positions = "  ".join(
+        f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items()
+    )
+    return positions + _age(state.joints_age_s)
+
+
+def _markers(state: StateMessage) -> str:
+    """Text: number of markers that each camera sees and the age of its frame, or that it is unknown."""
+    words = []
+    for camera in state.camera_age_s or state.visible:  # a daemon of before tells no ages
+        age_s = state.camera_age_s.get(camera)
+        if camera in state.visible:
+            words.append(f"{camera} {state.visible[camera]}{_age(age_s)}")
+        else:
+            words.append(f"{camera} unknown ({_silence('frame', age_s)})")
+    return "  ".join(words)
+
+
+def _age(age_s: float | None) -> str:
+    return "" if age_s is None else f" ({1e3 * age_s:.0f} ms old)"
+
+
+def _silence(what: str, age_s: float | None) -> str:
+    return f"no {what} yet" if age_s is None else f"no {what} for {age_s:.1f} s"
+
+
 def progress_words(state: StateMessage) -> str:
     """Progress of the active goal as text; empty where it is unknown."""
     words = []
@@ -144,13 +176,13 @@ def progress_words(state: StateMessage) -> str:
 def _health(state: StateMessage) -> list[str]:
     """Text: agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
     health = state.health
-    if health.verdict == "unknown":
+    if health.verdict == "unknown" and not health.text:
         return []
     agreement = "  ".join(
         f"{name} {camera.rms_px:.2f} px" + (f" ({camera.place})" if camera.place else "")
         for name, camera in health.cameras.items()
     )
-    lines = [f"  model   {health.verdict.replace('_', ' ')}: {agreement}"]
+    lines = [f"  model   {health.verdict.replace('_', ' ')}" + (f": {agreement}" if agreement else "")]
     lines += [f"          {health.text}"] if health.text else []
     lines += [f"          camera {name}: {c.timing}" for name, c in health.cameras.items() if c.timing]
     return lines

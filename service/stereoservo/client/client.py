@@ -33,6 +33,7 @@ from stereoservo.messages.goals import (
     OrderAuxiliary,
     Reset,
     Resume,
+    Stop,
     Target,
     Teach,
 )
@@ -82,9 +83,26 @@ class Client(Connection):
         """The JSON Schema of a message."""
         return self.query(self.keys.schema(name))
 
-    def stop(self) -> Reply:
-        """Stop the arm. Raises RefusedError where the servo process did not acknowledge it, NoReplyError."""
-        return self.request("stop", self.keys.stop, b"{}")
+    def stop(self, operator: str | None = None) -> Reply:
+        """Stop the arm, in the name of ``operator`` (default: this client's).
+
+        Raises RefusedError where the servo process did not acknowledge it, NoReplyError.
+        """
+        stop = Stop(self.operator if operator is None else operator)
+        return self.request("stop", self.keys.stop, encode(stop))
+
+    def joints(self) -> dict[str, float]:
+        """Positions of the joints by name [rad or m]. Raises ClientError where they are unknown: the drives tell
+        none.
+        """
+        state = self.status()
+        if not state.joints:
+            age = "" if state.joints_age_s is None else f"; the last ones are {state.joints_age_s:.1f} s old"
+            raise ClientError(
+                f"where the joints are is unknown: the drives tell no positions{age}. See `stereoservo status "
+                f"{self.cell}`"
+            )
+        return state.joints
 
     def enable(self, timeout_s: float = 10.0) -> None:
         """Let the arm move; returns once it is ACTIVE. Raises RefusedError, TimedOutError."""

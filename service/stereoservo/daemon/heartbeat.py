@@ -92,6 +92,10 @@ class HeartbeatReader:
         record = self._slot.newest()
         return None if record is None else Beat(*_RECORD.unpack(record))
 
+    def process_lives(self) -> bool:
+        """Whether the process that beats, or may hang, is there at all; False before its start."""
+        return self._slot.writer_lives()
+
     def close(self) -> None:
         """Release the slot. Idempotent."""
         self._slot.close()

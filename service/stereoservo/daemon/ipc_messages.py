@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from stereoservo.core.cycle import Event, Status, decode_array, encode
+from stereoservo.core.cycle import Event, Status, StepInputs, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import CameraSection, CellFile
@@ -122,6 +122,26 @@ class ServoState(msgspec.Struct, frozen=True, eq=False):
     notes: tuple[str, ...] = ()
     """Records of other processes that could not be read and were left out, by source."""
     auxiliary: dict[str, float] = {}
+    joints_ns: int = 0
+    """Stamp of the newest joint sample; 0: there was none yet."""
+    frames_ns: dict[str, int] = {}
+    """Stamp of the shutter of each camera's newest frame, but of none of the future."""
+
+
+def newest_stamps(
+    inputs: StepInputs, joints_ns: int, frames_ns: dict[str, int]
+) -> tuple[int, dict[str, int]]:
+    """Stamps of the newest joint sample and of each camera's newest frame [ns], given those before this step.
+
+    A stamp of the future tells no age.
+    """
+    sample = inputs.joints
+    if sample is not None and joints_ns < sample.t_ns <= inputs.now_ns:
+        joints_ns = sample.t_ns
+    for seen in inputs.observations:
+        if seen.t_shutter_ns <= inputs.now_ns:
+            frames_ns = {**frames_ns, seen.camera: seen.t_shutter_ns}
+    return joints_ns, frames_ns
 
 
 class Report(msgspec.Struct, frozen=True):

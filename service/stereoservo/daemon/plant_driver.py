@@ -7,7 +7,6 @@ missed is missing later; a plant obeys those that are addressed to its own sessi
 
 from __future__ import annotations
 
-import os
 import struct
 import time
 from collections.abc import Callable, Mapping
@@ -326,11 +325,7 @@ class PlantDriver:
         state = self._state
         if state is not None and self._clock.now_ns() - state.t_ns < SILENT_NS:
             return True
-        try:
-            os.kill(self._reader.writer_pid, 0)
-        except (ProcessLookupError, PermissionError):  # its number may be another user's by now
-            return False
-        return True
+        return self._reader.writer_lives()
 
     def _raise_failure(self, state: PlantState) -> None:
         """Raise the drives' newest failure, once."""

@@ -208,6 +208,17 @@ class SlotReader:
         """The process of its newest writer; 0 before the first."""
         return int(self._mapping.words[_PID_WORD])
 
+    def writer_lives(self) -> bool:
+        """Whether the process of its newest writer lives."""
+        pid = self.writer_pid
+        if pid == 0:
+            return False
+        try:
+            os.kill(pid, 0)
+        except (ProcessLookupError, PermissionError):  # its number may be another user's by now
+            return False
+        return True
+
     def poll(self) -> bytes | None:
         """The newest record unless it was read before, else None."""
         return self._read(skip=self._seen)

@@ -19,7 +19,7 @@ import numpy as np
 from stereoservo.core.cycle import DriverFault, StepInputs
 from stereoservo.core.servo_core import NewestStep, ServoCore
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S, HeartbeatWriter
-from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan
+from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load_plan, newest_stamps
 from stereoservo.daemon.kernel_compilation import (
     KernelLoader,
     kernels_to_come,
@@ -99,6 +99,8 @@ class ServoProcess:
         self._moving = False
         self._differences: tuple[str, ...] = ()
         self._sent: FloatArray | None = None
+        self._joints_ns = 0
+        self._frames_ns: dict[str, int] = {}
         self._state_every = max(1, round(rate_hz / STATE_RATE_HZ))
         self._statistics_every = max(1, round(rate_hz * STATISTICS_EVERY_S))
         self._cycles = 0
@@ -238,6 +240,8 @@ class ServoProcess:
                 records_dropped=self._stream.dropped,
                 differences=self._differences,
                 auxiliary=self._auxiliary_values(),
+                joints_ns=self._joints_ns,
+                frames_ns=self._frames_ns,
             )
             self._links.publish_state(state)
         self._cycles += 1
@@ -266,6 +270,7 @@ class ServoProcess:
             compiling=self._kernels is not None,
             sent=self._sent,
         )
+        self._joints_ns, self._frames_ns = newest_stamps(inputs, self._joints_ns, self._frames_ns)
         self._stream.before(self._links.step_recorder(), self.core, now_ns)
         self.core.advance(inputs)
         newest = self.core.newest

@@ -43,6 +43,7 @@ from stereoservo.daemon.process_control import Termination, die_with_parent, wri
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.daemon.seqpacket import ChannelServer
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
+from stereoservo.gateway.cell_state import CellState
 from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
 from stereoservo.gateway.intake import Intake, payload_of
 from stereoservo.gateway.model_updates import RefinementJobs, RelocalizationJobs
@@ -77,7 +78,6 @@ from stereoservo.messages.discovery import DaemonInfo
 from stereoservo.messages.files import write_atomically
 from stereoservo.messages.keys import VERBS, KeySpace
 from stereoservo.messages.run_record import read_run
-from stereoservo.messages.servo_state import state_message
 from stereoservo.messages.wire import (
     CellInfo,
     EventMessage,
@@ -103,7 +103,6 @@ REST_AFTER_S = 1.0
 FINAL_PASSES = 100
 LAST_EVENTS_S = 3.0
 """A servo process whose supervisor was killed brings the arm to rest before it ends: its last events are waited for."""
-SERVO_STALE_S = 0.5
 DRAIN = 32
 ANNOUNCE_AGAIN_S = 1.0
 EXIT_SETUP = 3
@@ -176,8 +175,7 @@ class Gateway:
         self._stop = StopThread(
             stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot
         )
-        self._state: StateMessage | None = None
-        self._state_heard = 0.0
+        self._state = CellState(plan, self.boot, self._servo)
         self._state_sent = self._steps_taken = 0.0
         self._recordings = Recordings(plan, self.log, self._notes.tell)
         self._servo.records = self._recordings.wants_steps
@@ -256,9 +254,9 @@ class Gateway:
     def run_once(self) -> bool:
         """Run one pass; returns whether there was anything to do."""
         self._servo.poll_connection()
-        if self._servo.connected and self._state is not None and not self._greeted:
+        if self._servo.connected and self._state.newest is not None and not self._greeted:
             self._greeted = True
-            self._calibration.load(self._state.model_epoch)
+            self._calibration.load(self._state.newest.status.model_epoch)
             self._refinement.complete_hand_over()
         events = self._servo.events()
         if events:  # who hears of one finds no older state
@@ -365,10 +363,10 @@ class Gateway:
         return encode(self.log.since(int(number)))
 
     def _newest_state(self, query: Any) -> bytes:
-        self._read_state()
-        if self._state is None:
+        state = self._newest_message()
+        if state is None:
             return encode(Reply(False, "the servo process has shown no state yet", boot=self.boot))
-        return encode(self._state)
+        return encode(state)
 
     def _schema(self, query: Any) -> bytes:
         return schema(self.keys.schema_of(str(query.key_expr)), tuple(LAWS))
@@ -403,8 +401,10 @@ class Gateway:
         # A restarted gateway is sent the servo process's events again.
         fresh = not self._handled.is_acted_on(event)
         self._repeated = self._handled.is_journaled(event)
+        operator = self._stop.stopped_by(event.t_ns) if event.kind == "stopped" else ""
+        self._state.take_event(event, operator, repeated=self._repeated)
         if event.kind != "taught" or not fresh or self._teaching.taught(event):
-            self.log.add_core(event)
+            self.log.add_core(event, operator=operator)
         self._repeated = False
         if event.kind == "fault" and fresh:
             self._recordings.keep_ring(event.t_ns)
@@ -428,29 +428,20 @@ class Gateway:
                     publisher.put(encode(features_message(observation)))
 
     def _read_state(self) -> None:
-        now = time.monotonic()
-        state = self._servo.state()
+        state = self._state.read()
         if state is not None:
-            self._state_heard = now
             self._refinement.take_state(state.status)
-            self._collect_notes()
-            self._state = state_message(
-                self.plan,
-                self.boot,
-                state,
-                servo_alive=True,
-                last_event=self.log.last,
-                notes=(*self._calibration.notes, *self._notes.texts),
-                refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
-                refinement=self._refinement.state(),
-            )
-        elif (
-            self._state is not None
-            and self._state.servo_alive
-            and now - self._state_heard > SERVO_STALE_S
-            and not self._servo.announced_silence()
-        ):
-            self._state = msgspec.structs.replace(self._state, servo_alive=False)
+
+    def _newest_message(self) -> StateMessage | None:
+        """The state as of now; None before the first."""
+        self._read_state()
+        self._collect_notes()
+        return self._state.message(
+            last_event=self.log.last,
+            notes=(*self._calibration.notes, *self._notes.texts),
+            refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
+            refinement=self._refinement.state(),
+        )
 
     def _collect_notes(self) -> None:
         """Bring the notes on what was left out up to date."""
@@ -467,9 +458,9 @@ class Gateway:
         if now - self._state_sent < STATE_EVERY_S:
             return
         self._state_sent = now
-        self._read_state()
-        if self._state is not None and self._publishers.state.matching_status.matching:
-            self._publishers.state.put(encode(self._state))
+        state = self._newest_message()
+        if state is not None and self._publishers.state.matching_status.matching:
+            self._publishers.state.put(encode(state))
 
     def _read_reports(self) -> None:
         self._reports.accept()
@@ -544,6 +535,7 @@ class Gateway:
             close_session(self._network, [])
         close_session(self._session, declared)
         self._servo.close()
+        self._state.close()
         self._previews.close()
         self._reports.close()
         self._journal.close()

@@ -10,6 +10,7 @@ from collections import deque
 from functools import partial
 from typing import Any
 
+import msgspec
 import zenoh
 from zenoh.handlers import RingChannel
 
@@ -17,12 +18,25 @@ from stereoservo.client.session import close_session, open_session
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.gateway.boundary import Boundary
+from stereoservo.gateway.intake import payload_of
 from stereoservo.gateway.publisher import ReplyThread
+from stereoservo.messages.goals import Stop
 from stereoservo.messages.keys import KeySpace
 from stereoservo.messages.wire import Reply, encode
 
 STOP_POLL_S = 0.002
 ACKNOWLEDGE_S = 0.1
+
+
+NAMELESS = "a client that gives no name"
+
+
+def sender(message: Any) -> str:
+    """Who stops the arm, by the payload of a sample or query on ``command/stop``."""
+    try:
+        return msgspec.json.decode(payload_of(message), type=Stop).operator
+    except Exception:  # whatever the payload is, the arm is stopped
+        return NAMELESS
 
 
 class StopThread:
@@ -41,9 +55,15 @@ class StopThread:
         self._replies = ReplyThread()
         self._boundary = Boundary(boot)
         self.enables: deque[Any] = deque(maxlen=16)
+        self._asked: tuple[str, int] | None = None
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._work, name="stop", daemon=True)
         self._thread.start()
+
+    def stopped_by(self, t_ns: int) -> str:
+        """Who sent the stop that the core took at ``t_ns``, once; '' where it did not come over the wire."""
+        asked, self._asked = self._asked, None
+        return asked[0] if asked is not None and asked[1] <= t_ns else ""
 
     @property
     def refused(self) -> int:
@@ -56,7 +76,7 @@ class StopThread:
                 # Only the exact key: looking around with a wildcard must not stop the arm.
                 while (sample := self._puts.try_recv()) is not None:
                     if str(sample.key_expr) == self._key:
-                        self._slot.raise_stop()
+                        self._raise_stop(sample)
                 while (query := self._stops.try_recv()) is not None:
                     if str(query.key_expr) == self._key:
                         self._boundary.take(
@@ -70,8 +90,13 @@ class StopThread:
                 return
             self._ending.wait(STOP_POLL_S)
 
+    def _raise_stop(self, message: Any) -> int:
+        """Raise the stop; ``message``: the sample or query that asks for it."""
+        self._asked = sender(message), time.monotonic_ns()  # before its event can come
+        return self._slot.raise_stop()
+
     def _stop(self, query: Any) -> None:
-        word = self._slot.raise_stop()
+        word = self._raise_stop(query)
         until = time.monotonic() + ACKNOWLEDGE_S
         while not self._slot.acknowledged(word) and time.monotonic() < until:
             time.sleep(0.001)

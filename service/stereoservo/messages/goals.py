@@ -280,6 +280,12 @@ class CancelGoal(msgspec.Struct, frozen=True, tag="cancel", tag_field="command",
     id: GoalId
 
 
+class Stop(msgspec.Struct, frozen=True):
+    """Payload of ``command/stop``: who stops the arm, for people. Any other payload stops it as well."""
+
+    operator: Annotated[str, Meta(pattern="^[A-Za-z0-9_. -]{1,64}$")]
+
+
 class Hold(msgspec.Struct, frozen=True, tag="hold", tag_field="command", forbid_unknown_fields=True):
     """Decelerate and hold; the goal is kept and may be resumed."""
 

@@ -15,12 +15,17 @@ import msgspec
 
 from stereoservo.messages.files import read_bounded
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Health, RefinementState
+from stereoservo.messages.status import Halt, Health, RefinementState
 from stereoservo.messages.wire import LoopInfo, StateMessage
 
 STATE_LAYOUT = "ServoState.1"
 """Of the records of `daemon.ipc_messages.ServoState` in their slot."""
 MAX_PLAN_BYTES = 1 << 24
+STALE_S = 0.6
+"""A source that delivers nothing for so long, and a camera for ``STALE_PERIODS`` of its periods, too, is gone: what is
+known from it is unknown from then on."""
+STALE_PERIODS = 3.0
+NO_CAMERA = "no camera delivers frames: whether the model still holds is unknown"
 COMMISSIONING_SPEED = 0.05
 """Share of the cell's speed that `run --commissioning` leaves."""
 
@@ -86,6 +91,8 @@ class StateRecord(msgspec.Struct):
     differences: tuple[str, ...]
     notes: tuple[str, ...] = ()
     auxiliary: dict[str, float] = {}
+    joints_ns: int = 0
+    frames_ns: dict[str, int] = {}
 
 
 class _Name(msgspec.Struct):
@@ -100,12 +107,18 @@ class _Joints(msgspec.Struct):
     joints: tuple[_Name, ...]
 
 
+class _Camera(msgspec.Struct):
+    name: str
+    rate_hz: float
+
+
 class RunRecord(msgspec.Struct):
     """What of a `daemon.ipc_messages.RunPlan` goes into the state's message."""
 
     cell: _Cell
     boot: str
     joints: _Joints
+    cameras: tuple[_Camera, ...]
     dry_run: bool = False
 
 
@@ -141,24 +154,30 @@ def state_message(
     boot: str,
     state: Any,
     *,
+    now_ns: int,
     servo_alive: bool,
     last_event: int,
     notes: tuple[str, ...] = (),
     refused_messages: int = 0,
     refinement: RefinementState | None = None,
+    halt: Halt | None = None,
 ) -> StateMessage:
-    """The state in the clients' format; numbers that are not finite are left out.
+    """The state in the clients' format, with the ages of its sources at ``now_ns``.
 
-    ``run``: a `RunRecord` or the run plan itself; ``state``: a `StateRecord` or the servo process's own `ServoState`.
+    Numbers that are not finite, and what has lost its source, are left out. ``run``: a `RunRecord` or the run plan
+    itself; ``state``: a `StateRecord` or the servo process's own `ServoState`.
     """
     status, loop = state.status, state.loop
+    joints_age_s = _age_s(state.joints_ns, now_ns)
+    measured = _fresh(joints_age_s)
     names = tuple(joint.name for joint in run.joints.joints)
-    now_ns = time.monotonic_ns()
+    cameras = {camera.name: _age_s(state.frames_ns.get(camera.name, 0), now_ns) for camera in run.cameras}
+    fresh = {camera.name for camera in run.cameras if _fresh(cameras[camera.name], camera.rate_hz)}
     return StateMessage(
         cell=run.cell.cell.name,
         boot=boot,
         t_ns=status.t_ns,
-        t_wall=time.time() - (now_ns - status.t_ns) * 1e-9,
+        t_wall=time.time() - (time.monotonic_ns() - status.t_ns) * 1e-9,
         lifecycle=status.lifecycle,
         model=status.model,
         model_epoch=status.model_epoch,
@@ -167,13 +186,17 @@ def state_message(
         law=status.law,
         level=status.level,
         reasons=tuple(status.reasons),
-        joints=_finite(names, status.positions),
-        velocities=_finite(names, status.velocities),
+        joints=_finite(names, status.positions if measured else None),
+        velocities=_finite(names, status.velocities if measured else None),
         command=_finite(names, status.command),
-        error_px=_number(status.error_px),
+        error_px=_number(status.error_px) if fresh else None,
         task_error=tuple(float(x) for x in status.task_error if math.isfinite(x)),
-        innovation_px={name: value for name, value in status.innovation_px.items() if math.isfinite(value)},
-        visible=status.visible,
+        innovation_px={
+            name: value
+            for name, value in status.innovation_px.items()
+            if name in fresh and math.isfinite(value)
+        },
+        visible={name: count for name, count in status.visible.items() if name in fresh},
         loop=LoopInfo(
             rate_hz=loop.rate_hz,
             cycles=loop.cycles,
@@ -193,13 +216,41 @@ def state_message(
         refinement=refinement,
         progress=_number(status.progress),
         seconds_left=_number(status.seconds_left),
-        efforts=_finite(names, status.efforts),
-        following_errors=_finite(names, status.following_errors),
+        efforts=_finite(names, status.efforts if measured else None),
+        following_errors=_finite(names, status.following_errors if measured else None),
         effort_limits=_finite(names, status.effort_limits),
         following_limits=_finite(names, status.following_limits),
-        health=status.health,
-        auxiliary={name: value for name, value in state.auxiliary.items() if math.isfinite(value)},
+        health=_health(status.health, fresh),
+        auxiliary={
+            name: value for name, value in state.auxiliary.items() if measured and math.isfinite(value)
+        },
+        joints_age_s=joints_age_s,
+        camera_age_s=cameras,
+        halt=halt,
     )
+
+
+def _age_s(t_ns: int, now_ns: int) -> float | None:
+    """Age [s] of what has the stamp ``t_ns``, to the millisecond; None for 0: there is nothing yet."""
+    return round((now_ns - t_ns) * 1e-9, 3) if t_ns else None
+
+
+def _fresh(age_s: float | None, rate_hz: float = math.inf) -> bool:
+    """Whether a source that delivers at ``rate_hz`` is there."""
+    return age_s is not None and age_s <= silence_limit_s(rate_hz)
+
+
+def silence_limit_s(rate_hz: float) -> float:
+    """Age [s] from which on a source that delivers at ``rate_hz`` is gone."""
+    return max(STALE_S, STALE_PERIODS / rate_hz)
+
+
+def _health(health: Health, fresh: set[str]) -> Health:
+    """The health of the model as the ``fresh`` cameras show it; a verdict that is not ``ok`` stays."""
+    cameras = {name: camera for name, camera in health.cameras.items() if name in fresh}
+    if not fresh and health.verdict == "ok":
+        return msgspec.structs.replace(health, verdict="unknown", text=NO_CAMERA, cameras=cameras)
+    return msgspec.structs.replace(health, cameras=cameras)
 
 
 def _number(value: float | None) -> float | None:

@@ -61,6 +61,13 @@ class Health(msgspec.Struct, frozen=True):
     reanchoring: str = ""
 
 
+class Halt(msgspec.Struct, frozen=True):
+    """Who stopped or held the arm, in words ("stopped by ann"), and when [s since 1970]."""
+
+    words: str
+    t_wall: float
+
+
 class RefinementState(msgspec.Struct, frozen=True):
     """How far on-line refinement of the model in use is."""
 

@@ -32,12 +32,13 @@ from stereoservo.messages.goals import (
     RenewGoal,
     Reset,
     Resume,
+    Stop,
     Teach,
     UpdateGoal,
 )
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.recording_request import ImagesRecorded
-from stereoservo.messages.status import Health, RefinementState
+from stereoservo.messages.status import Halt, Health, RefinementState
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
@@ -179,7 +180,12 @@ class LoopInfo(msgspec.Struct, frozen=True):
 
 
 class StateMessage(msgspec.Struct, frozen=True):
-    """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970]."""
+    """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970].
+
+    What has lost its source is left out: of joints ``joints``, ``velocities``, ``efforts``, ``following_errors`` and
+    ``auxiliary``; of a camera its entry in ``visible``, ``innovation_px`` and ``health.cameras``. Without any camera
+    ``error_px`` is None and an ``ok`` verdict on the model becomes ``unknown``.
+    """
 
     cell: str
     boot: str
@@ -227,6 +233,12 @@ class StateMessage(msgspec.Struct, frozen=True):
     """Messages that the gateway could not take since its start: not JSON, of a wrong shape, on a wrong key."""
     refinement: RefinementState | None = None
     """With `[calibration] refine`; None: nothing is refined on-line."""
+    joints_age_s: float | None = None
+    """Age of the newest joint sample [s]; None: there was none yet."""
+    camera_age_s: dict[str, float | None] = {}
+    """Of each camera, time [s] since the shutter of its newest frame; None: there was none yet."""
+    halt: Halt | None = None
+    """While the arm is stopped or held at somebody's request: whose."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):
@@ -362,6 +374,7 @@ SCHEMAS: dict[str, Any] = {
     "info": CellInfo,
     "reply": Reply,
     "command-record": Record,
+    "command-stop": Stop,
     "command-synthesise": Synthesise,
     "command-restore": Restore,
     **{f"command-{verb}": kind for verb, kind in COMMANDS.items()},

@@ -72,6 +72,7 @@ class CellLink:
         self._epoch = -1
         self._seen: dict[str, FeaturesMessage] = {}
         self._state: StateMessage | None = None
+        self._heard_s = time.monotonic()
         self._goal = ""
         self._leases = Leases(lambda: self._client)
         self._why = ""
@@ -93,6 +94,11 @@ class CellLink:
             self._thread.join(CLOSING_S)
         elif self._client is not None:  # never started
             self._client.close()
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the cell's newest state [s]."""
+        return time.monotonic() - self._heard_s
 
     # -- reading ----------------------------------------------------------------------------------------------
 
@@ -153,7 +159,7 @@ class CellLink:
 
     def _take_state(self, client: Client, data: bytes) -> None:
         state = read_message("state", data, StateMessage)
-        self._state = state
+        self._state, self._heard_s = state, time.monotonic()
         if state.model_epoch != self._epoch:
             self._load_model(client, state.model_epoch)
         refinement = "" if state.refinement is None else state.refinement.text
@@ -228,6 +234,8 @@ class CellLink:
         """Joint positions (n,) of the newest state. Raises LinkDownError."""
         if self._state is None:
             raise LinkDownError("the cell has shown no state yet")
+        if not self._state.joints:
+            raise LinkDownError("where the joints are is unknown: the drives tell no positions")
         return np.array(list(self._state.joints.values()))
 
     def dragged_goal(self, joints: FloatArray) -> Goal:
@@ -282,17 +290,18 @@ class CellLink:
         with self._leases.held(command.id):
             return client.command("calibrate", command)
 
-    def stop(self) -> Reply:
-        """Stop the arm, over a session of its own where the link's is down, closed or does not answer.
+    def stop(self, operator: str) -> Reply:
+        """Stop the arm in the name of ``operator``, over a session of its own where the link's is down, closed or does
+        not answer.
 
         Raises ClientError, NotRunningError, SessionError.
         """
         client = self._client
         if client is not None:
             with suppress(NoReplyError, ZError):
-                return client.stop()
+                return client.stop(operator)
         with self._connect() as fresh:
-            return fresh.stop()
+            return fresh.stop(operator)
 
     def cancel(self) -> Reply:
         """Cancel the active goal. Raises ClientError, LinkDownError."""

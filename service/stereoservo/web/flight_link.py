@@ -49,6 +49,11 @@ class FlightLink:
         self.watched = threading.Event()
         """Set by every page that is opened: it is sent what there is now."""
 
+    @property
+    def silent_s(self) -> float:
+        """A recording is never silent: 0."""
+        return 0.0
+
     def start(self) -> None:
         """Begin to read and to play."""
         for thread in self._threads:

@@ -18,7 +18,7 @@ import numpy as np
 from stereoservo.client.goal_handle import TERMINAL
 from stereoservo.core.cycle import Event, Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
-from stereoservo.daemon.ipc_messages import ServoState
+from stereoservo.daemon.ipc_messages import ServoState, newest_stamps
 from stereoservo.daemon.preview import EVERY_NS, encode_jpeg
 from stereoservo.gateway.publisher import cell_info, core_event_fields, features_message
 from stereoservo.messages.goals import Goal, PlanReport, RunGoal, UpdateGoal
@@ -60,7 +60,12 @@ class Timeline:
             self._end += len(data)
 
     def add_row(
-        self, t_ns: int, error: float | None, late_us: float, velocities: list[float], codes: tuple[str, ...]
+        self,
+        t_ns: int,
+        error: float | None,
+        late_us: float,
+        velocities: list[float | None],
+        codes: tuple[str, ...],
     ) -> None:
         """Append what is plotted of one state; ``codes``: of its reasons."""
         with self._lock:
@@ -116,7 +121,8 @@ class FlightReader:
         self._view, self._epoch = ModelView(), 0
         self._goals: dict[str, tuple[Goal, PlanReport | None]] = {}
         self._requests: dict[int, str] = {}
-        self._last_ns = self._state_ns = 0
+        self._last_ns = self._state_ns = self._joints_ns = 0
+        self._frames_ns: dict[str, int] = {}
         self._late: deque[float] = deque(maxlen=250)
         self._videos: list[_Video] = []
         self.ended = threading.Event()
@@ -153,8 +159,12 @@ class FlightReader:
         self._info = cell_info(settings, "", None, None, {}, str(self._path), None)
         joints = [{"name": name} for name in settings.joint_names]
         self._run = msgspec.convert(
-            {"cell": {"cell": {"name": settings.cell}}, "boot": "", "joints": {"joints": joints}}, RunRecord
-        )
+            {
+                "cell": {"cell": {"name": settings.cell}}, "boot": "", "joints": {"joints": joints},
+                "cameras": [{"name": camera.name, "rate_hz": camera.rate_hz} for camera in settings.cameras],
+            },
+            RunRecord,
+        )  # fmt: skip
         self._tell("info", self._span.first_ns, {"info": self._info})
         self._tell("goal", self._span.first_ns, no_goal())
 
@@ -167,6 +177,7 @@ class FlightReader:
         self._last_ns = now_ns
         if inputs.model_update is not None:
             self._models[inputs.model_update.model.epoch] = inputs.model_update.model
+        self._joints_ns, self._frames_ns = newest_stamps(inputs, self._joints_ns, self._frames_ns)
         self._take_goals(inputs, outputs)
         for event in outputs.events:
             if event.kind != "reply":
@@ -238,14 +249,18 @@ class FlightReader:
             self._view = ModelView() if model is None else ModelView.of(model, self._info)
         p50, p99, worst = np.percentile(self._late, [50, 99, 100]).tolist() if self._late else (0.0, 0.0, 0.0)
         loop = LoopStatistics(1e9 / inputs.period_ns, status.step, 0, 0, p50, p99, worst, 0.0, 0.0, 0.0)
-        state = ServoState(status, loop, inputs.driver_configured, inputs.driver_active, True, 0, ())
+        state = ServoState(
+            status, loop, inputs.driver_configured, inputs.driver_active, True, 0, (),
+            joints_ns=self._joints_ns, frames_ns=self._frames_ns,
+        )  # fmt: skip
         message = msgspec.structs.replace(
-            state_message(self._run, "", state, servo_alive=True, last_event=0),
+            state_message(self._run, "", state, now_ns=inputs.now_ns, servo_alive=True, last_event=0),
             t_wall=(status.t_ns + self._span.shift_ns) * 1e-9,
         )
         self._tell("state", inputs.now_ns, {"state": message, **self._view.at(message)})
         codes = tuple(reason.code for reason in status.reasons)
-        self._timeline.add_row(inputs.now_ns, message.error_px, p99, list(message.velocities.values()), codes)
+        velocities = [message.velocities.get(joint.name) for joint in self._info.joints]
+        self._timeline.add_row(inputs.now_ns, message.error_px, p99, velocities, codes)
 
     def _tell(self, slot: str, t_ns: int, tree: dict[str, Any]) -> None:
         self._timeline.add(slot, t_ns, msgspec.json.encode(tree))

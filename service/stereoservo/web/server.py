@@ -5,6 +5,7 @@ their rights allow. `docs/web.md` has the messages.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import ssl
 import threading
 import time
@@ -50,6 +51,8 @@ POLICY = (
 MAX_PAGES = 16
 MAX_REQUEST_BYTES = 1 << 14
 MAX_WAITING = 512
+TICK_S = 0.2
+"""How often pages are told that the server lives, and since when the cell is silent."""
 MAX_UNDER_WAY, MAX_STOPS = 8, 32
 """Requests of a page that are carried out at a time, and stops, which wait for none of them."""
 EVENTS_KEPT = 100
@@ -78,6 +81,10 @@ class RecordedLink(Protocol):
     view: ModelView
     watched: threading.Event
 
+    @property
+    def silent_s(self) -> float:
+        """A recording is never silent: 0."""
+
     def start(self) -> None:
         """Begin to publish."""
 
@@ -95,9 +102,10 @@ class RecordedLink(Protocol):
 
 
 class Page:
-    """One open page: what waits to be sent to it, and the goal that it is making."""
+    """One open page: what waits to be sent to it, and the goal that it is making; ``name``: by which it stops."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.newest: dict[str, bytes] = {}
         self.waiting: deque[bytes] = deque(maxlen=MAX_WAITING)
         self.wake = asyncio.Event()
@@ -150,6 +158,7 @@ class PageServer:
     ) -> None:
         self.holder = ArmHolder(operator, announce)
         self._pages: set[Page] = set()
+        self._numbers = itertools.count(1)
         self._kept: dict[str, bytes] = {}
         self._events: deque[bytes] = deque(maxlen=EVENTS_KEPT)
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -183,10 +192,12 @@ class PageServer:
         found: int = self._server.sockets[0].getsockname()[1]
         self._hosts, self._port = allowed_hosts(address, found, names), found
         self.link.start()
+        self._ticks = asyncio.create_task(self._tick())
         return found
 
     async def close(self) -> None:
         """Close all pages, end their goals' leases, leave the daemon. Idempotent."""
+        self._ticks.cancel()
         self._server.close()
         with suppress(TimeoutError):  # whoever keeps a connection open must not keep the server
             await asyncio.wait_for(self._server.wait_closed(), CLOSING_S)
@@ -234,8 +245,14 @@ class PageServer:
         for page in self._pages:
             page.put(slot, data)
 
+    async def _tick(self) -> None:
+        while True:
+            tick = {"t_wall": time.time(), "silent_s": round(self.link.silent_s, 3)}
+            self._spread("tick", msgspec.json.encode({"tick": tick}), False)
+            await asyncio.sleep(TICK_S)
+
     async def _session(self, connection: ServerConnection) -> None:
-        page = Page()
+        page = Page(f"viewer {next(self._numbers)}")
         self._pages.add(page)
         self.link.watched.set()
         self._tell_rights(page)
@@ -272,6 +289,7 @@ class PageServer:
                     "holds": self.holder.holds(page),
                     "taken": self.holder.taken,
                     "cell": self.link.cell,
+                    "name": page.name,
                 }
             }
         )
@@ -321,7 +339,8 @@ class PageServer:
         link = self._cell_link
         match request:
             case ask.Stop():
-                return _told(link.stop())
+                operator = self.holder.operator
+                return _told(link.stop(operator if operator and self.holder.holds(page) else page.name))
             case ask.Take():
                 self.holder.take(page, request.token)
                 self._rights_changed()

@@ -83,7 +83,7 @@ class LiveDemonstrator:
 
     def joints(self) -> npt.NDArray[np.float64]:
         """Measured joint positions (n,)."""
-        return np.array(list(self._client.status().joints.values()))
+        return np.array(list(self._client.joints().values()))
 
     def sights(self, frames: int) -> MarkerSights:
         """What the cameras see, so many frames of each."""

@@ -112,10 +112,10 @@ def _goal_name(text: str) -> str:
 
 def away(client: Client) -> dict[str, float]:
     """Joint positions [rad or m] a little off the present ones, each joint towards the middle of its range."""
-    info, state = client.info(), client.status()
+    info, joints = client.info(), client.joints()
     targets = {}
     for joint in info.joints:
-        q = state.joints[joint.name]
+        q = joints[joint.name]
         way = min(AWAY_SHARE * 0.5 * (joint.position_max - joint.position_min), AWAY_MOST[joint.kind])
         targets[joint.name] = q + (way if q < 0.5 * (joint.position_min + joint.position_max) else -way)
     return targets

@@ -98,7 +98,7 @@ def _line(message: StateMessage | EventMessage | FeaturesMessage) -> str:
     if isinstance(message, FeaturesMessage):
         return f"      {message.camera} frame {message.seq}: {len(message.ids)} markers"
     parts = [message.lifecycle, message.source, progress_words(message)]
-    parts.append(" ".join(f"{q:+.3f}" for q in message.joints.values()))
+    parts.append(" ".join(f"{q:+.3f}" for q in message.joints.values()) or "joints unknown")
     return (
         "      " + ", ".join(filter(None, parts)) + "".join(f"; {_why(reason)}" for reason in message.reasons)
     )

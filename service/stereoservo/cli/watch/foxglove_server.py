@@ -80,11 +80,12 @@ class FoxgloveServer:
 def state_channels(state: StateMessage, t_ns: int) -> list[Published]:
     """Joints, command and status of a live cell."""
     names = list(state.joints)
+    velocities = [state.velocities[name] for name in names] if len(state.velocities) == len(names) else None
     efforts = [state.efforts[name] for name in names] if len(state.efforts) == len(names) else None
     return [
         joints(
             "/joints", t_ns, names, positions=list(state.joints.values()),
-            velocities=[state.velocities[name] for name in names], efforts=efforts,
+            velocities=velocities, efforts=efforts,
         ),
         joints("/command", t_ns, list(state.command), velocities=list(state.command.values())),
         Published("/status", t_ns, cell_status(state)),

@@ -14,6 +14,11 @@ stats.middle = (camera) => {
 };
 let socket, number = 0, rights = {}, state, scene, sceneGoal = null, joints = [], turn = [0.6, 0.4], drag = null, hasDraft = false, lastCamera = null, flight = null, arrived = 0, sought = null;
 let drawDue = false;
+const LOST_S = 0.6, HUNG_S = 5, STOP_S = 0.5, AGAIN_S = 0.5;
+// Of the link, in ms of performance.now(): when the server was heard last, when it said for how long the cell had been
+// silent [s], when it was connected to, and when the page looked at all this last; by how much this computer's clock is ahead of the server's [ms].
+const link = { heard: performance.now(), ticked: 0, silent: 0, opened: 0, looked: 0, closed: true, why: "", lost: false, ahead: [] };
+let stopping = null; // a stop that is not confirmed yet
 
 function view(camera) {
   if (views.has(camera)) return views.get(camera);
@@ -24,8 +29,8 @@ function view(camera) {
   figure.append(canvas, caption);
   canvas.dataset.camera = camera;
   $("pictures").append(figure);
-  const made = { camera, canvas, note, width: 640, height: 480, image: null, features: [], ids: new Set(), predicted: [],
-    byMarker: {}, setPoints: [], path: [], draft: null, lines: null, drawn: 0 };
+  const made = { camera, figure, canvas, note, width: 640, height: 480, image: null, features: [], ids: new Set(), predicted: [],
+    setPoints: [], path: [], draft: null, lines: null, frame: "", rate: 30, shot: 0, heard: 0, seen: 0 };
   views.set(camera, made);
   listen(made);
   return made;
@@ -43,28 +48,61 @@ function redraw() {
 // -- the link ------------------------------------------------------------------------------------------------------
 
 function connect() {
-  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
-  socket.binaryType = "arraybuffer";
-  socket.onmessage = ({ data }) => (typeof data === "string" ? take(JSON.parse(data)) : picture(data));
-  socket.onclose = () => {
-    banner("link", "The page's server does not answer. What it shows is old; stop the arm with `stereoservo stop` or the emergency stop.", true);
-    rights = {};
-    state = undefined;
-    $("events").replaceChildren(); // they are all told again
-    showRights();
-    for (const settle of answers.values()) settle({ ok: false, message: "the page's server does not answer" });
-    answers.clear();
-    setTimeout(connect, 1000);
+  const made = socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket`);
+  link.opened = performance.now();
+  made.binaryType = "arraybuffer";
+  made.onmessage = ({ data }) => {
+    if (socket !== made) return;
+    link.heard = performance.now();
+    link.closed = false;
+    typeof data === "string" ? take(JSON.parse(data)) : picture(data);
   };
+  made.onclose = () => { if (socket === made) disconnect(); };
+}
+
+function disconnect() {
+  const old = socket;
+  socket = null;
+  old.close();
+  link.closed = true;
+  link.why = "";
+  rights = {};
+  state = undefined;
+  $("events").replaceChildren(); // they are all told again
+  showRights();
+  for (const settle of answers.values()) settle({ ok: false, message: "the page's server does not answer" });
+  answers.clear();
+  watch();
+  setTimeout(connect, 1000);
 }
 
 function request(tree) {
   return new Promise((settle) => {
-    if (socket.readyState !== WebSocket.OPEN) return settle({ ok: false, message: "the page's server does not answer" });
+    if (socket?.readyState !== WebSocket.OPEN) return settle({ ok: false, message: "the page's server does not answer" });
     const n = ++number;
     answers.set(n, settle);
     socket.send(JSON.stringify({ ...tree, n }));
   });
+}
+
+function watch() {
+  // What is shown grows old where nothing comes: it says so, and counts on.
+  const now = performance.now(), server = (now - link.heard) / 1000;
+  if (now - link.looked > 2000) link.opened = now; // this page itself stood still
+  link.looked = now;
+  const hung = Math.min(server, (now - link.opened) / 1000);
+  const cell = link.ticked && !flight ? link.silent + (now - link.ticked) / 1000 : 0;
+  link.lost = link.closed ? link.ticked > 0 || server > LOST_S : Math.max(server, cell) > LOST_S;
+  link.age = Math.max(server, cell);
+  const means = flight ? "" : ": what is shown is old. Stop the arm with the emergency stop, or `stereoservo stop`.";
+  banner("link", link.why ? `The daemon does not answer: ${link.why}` : !link.lost ? ""
+    : server > LOST_S ? `No word from the page's server${means}` : `No word from the cell${means}`, true);
+  document.body.classList.toggle("lost", link.lost);
+  $("commands").disabled = !rights.holds || link.lost;
+  showHead();
+  for (const v of views.values()) showCaption(v, now);
+  if (socket && hung > HUNG_S) disconnect(); // a connection that hangs may do so for minutes
+  watchStop(now);
 }
 
 async function command(tree) {
@@ -78,7 +116,7 @@ async function command(tree) {
 }
 
 function banner(id, text, bad) {
-  $(id).textContent = text;
+  if ($(id).textContent !== text) $(id).textContent = text;
   $(id).hidden = !text;
   $(id).className = `banner ${bad ? "bad" : "good"}`;
 }
@@ -92,12 +130,26 @@ async function picture(buffer) {
   if (k < v.arrived) return image.close();
   v.image?.close();
   Object.assign(v, { image, arrived: k, t_ns: info.t_shutter_ns, width: info.width, height: info.height });
-  const late = Date.now() - 1000 * info.t_wall;
+  const late = Date.now() - (link.ahead.length ? Math.min(...link.ahead) : 0) - 1000 * info.t_wall;
   stats.pictures += 1;
   stats.latencies.push(late);
   if (stats.latencies.length > 600) stats.latencies.shift();
-  v.note.textContent = `frame ${info.seq}, ${flight ? "" : `${late.toFixed(0)} ms old, `}${v.features.length} markers`;
+  v.heard = performance.now();
+  v.shot = v.heard - late;
+  v.frame = `frame ${info.seq}, `;
+  showCaption(v, v.heard);
   redraw();
+}
+
+function showCaption(v, now) {
+  // A camera that delivers nothing any more: its last picture grows old, and its markers are nowhere.
+  const limit = Math.max(LOST_S, 3 / v.rate), told = state?.camera_age_s?.[v.camera] ?? 0;
+  const since = (t) => (flight || !t ? 0 : Math.max((now - t) / 1000, told));
+  const silent = since(v.image ? v.heard : v.seen), old = silent > limit;
+  v.figure.classList.toggle("old", old);
+  if (since(v.seen) > limit && v.features.length) { v.features = []; redraw(); }
+  v.note.textContent = !v.heard && !v.seen ? "no picture yet" : old ? `nothing for ${silent.toFixed(1)} s: what is shown is old`
+    : `${v.frame}${flight || !v.shot ? "" : `${(now - v.shot).toFixed(0)} ms old, `}${v.features.length} markers`;
 }
 
 // -- what the cell says --------------------------------------------------------------------------------------------
@@ -112,6 +164,8 @@ function take(message) {
     if (flight && v.image && Math.abs(t_shutter_ns - v.t_ns) > 1e9) { v.image.close(); v.image = null; } // none was recorded there
     v.features = ids.map((id, i) => [id, ...pixels[i]]);
     v.ids = new Set(ids);
+    v.seen = performance.now();
+    if (!v.image) v.frame = `frame ${message.features.seq}, `;
     redraw();
   } else if (message.info) showInfo(message.info);
   else if (message.event) showEvent(message.event);
@@ -123,14 +177,18 @@ function take(message) {
     $("calibration").textContent = "";
     for (const { event } of message.events) showEvent(event);
   }
-  else if ("up" in message) banner("link", message.up ? "" : `The daemon does not answer: ${message.why}`, true);
+  else if (message.tick) {
+    Object.assign(link, { ticked: performance.now(), silent: message.tick.silent_s });
+    link.ahead.push(Date.now() - 1000 * message.tick.t_wall);
+    if (link.ahead.length > 50) link.ahead.shift();
+  }
+  else if ("up" in message) { link.why = message.up ? "" : message.why; watch(); }
   else if (message.notice) showNotice(message);
 }
 
 function showRights() {
   $("cell").textContent = rights.cell ?? "stereoservo";
-  document.title = `${rights.cell ?? ""} stereoservo`;
-  $("commands").disabled = !rights.holds;
+  $("commands").disabled = !rights.holds || link.lost;
   $("take").hidden = !rights.operator || rights.holds;
   $("rights-text").textContent = rights.holds ? `This page holds the arm as ${rights.operator}.`
     : !rights.operator ? "This page is read-only: it may stop the arm, nothing else."
@@ -138,41 +196,62 @@ function showRights() {
     : "Give the token that stands in the terminal to command the arm; stop works without.";
 }
 
-function badge(id, text, kind = "") { $(id).textContent = text; $(id).className = `badge ${kind}`; }
+function badge(id, text, kind = "") {
+  if ($(id).textContent !== text) $(id).textContent = text; // a screen reader says what changes
+  $(id).className = `badge ${kind}`;
+}
 
 function showState({ state: s, predicted, scene: shape, refinement }) {
   state = s;
-  badge("lifecycle", s.dry_run ? `${s.lifecycle}, dry run` : s.lifecycle, { active: "good", fault: "bad" }[s.lifecycle]);
-  badge("model", `model ${s.model}`, { valid: "good", suspect: "warn" }[s.model]);
-  badge("error", s.error_px === null ? "no error" : `error ${s.error_px.toFixed(2)} px`);
+  showHead();
+  const unseen = s.health.verdict === "unknown" && s.health.text;
+  badge("model", `model ${s.model}${unseen ? ", unseen" : ""}`, unseen ? "warn" : { valid: "good", suspect: "warn" }[s.model]);
+  badge("error", s.error_px !== null ? `error ${s.error_px.toFixed(2)} px` : s.goal ? "error unknown" : "no error");
   badge("activity", s.goal ? `${s.source} ${s.progress === null ? "" : Math.round(100 * s.progress) + " %"}` : s.source);
-  const texts = s.reasons.map((r) => `${r.code}: ${r.hint}`).concat(s.notes, s.health.text && s.health.verdict !== "ok" ? [s.health.text] : []);
+  const texts = s.reasons.map((r) => `${r.code}${r.subject ? ` ${r.subject}` : ""}: ${r.hint}`).concat(s.notes, s.health.text && s.health.verdict !== "ok" ? [s.health.text] : []);
   if ($("reasons").dataset.shown !== texts.join("\n")) {
     $("reasons").dataset.shown = texts.join("\n");
     $("reasons").replaceChildren(...(texts.length ? texts : ["none"]).map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   }
   $("refinement").textContent = refinement ? `Refinement: ${refinement}` : ""; // a flight tells none
   $("refinement").hidden = !refinement;
-  const t = s.t_ns * 1e-9;
-  const last = history.error.at(-1);
-  if (last && t <= last[0]) return redraw(); // the plots hold it
-  joints = Object.keys(s.velocities);
-  history.error.push([t, s.error_px]);
-  history.velocity.push([t, ...Object.values(s.velocities)]);
-  history.loop.push([t, s.loop.lateness_us.p99 ?? null]);
-  history.reasons.push([t, s.reasons.map((r) => r.code)]);
-  for (const rows of Object.values(history)) if (rows.length > 1300) rows.splice(0, rows.length - 1300);
-  for (const [camera, markers] of Object.entries(predicted)) {
-    const v = view(camera);
-    v.byMarker = markers;
-    v.predicted = Object.entries(markers).filter(([id]) => !v.ids.size || v.ids.has(Number(id))).map(([, p]) => p);
+  for (const v of views.values()) {
+    const markers = Object.entries(predicted[v.camera] ?? {}); // none where the joints are unknown
+    v.predicted = markers.filter(([id]) => !v.ids.size || v.ids.has(Number(id))).map(([, p]) => p);
   }
   scene = shape;
   redraw();
+  const t = s.t_ns * 1e-9;
+  const last = history.error.at(-1);
+  if (last && t <= last[0]) return; // the plots hold it
+  history.error.push([t, s.error_px]);
+  history.velocity.push([t, ...joints.map((name) => s.velocities[name] ?? null)]);
+  history.loop.push([t, s.loop.lateness_us.p99 ?? null]);
+  history.reasons.push([t, s.reasons.map((r) => r.code)]);
+  for (const rows of Object.values(history)) if (rows.length > 1300) rows.splice(0, rows.length - 1300);
+}
+
+function showHead() {
+  const cell = `${rights.cell ?? ""} stereoservo`, s = state;
+  let text = "no state yet", kind = "", title = "";
+  if (link.lost) [text, kind, title] = [`LOST for ${link.age.toFixed(1)} s`, "bad", "LOST "];
+  else if (s?.servo_alive === false) [text, kind, title] = ["UNKNOWN: the servo process is silent", "bad", "UNKNOWN "];
+  else if (s) {
+    const codes = s.reasons.map((r) => r.code), halted = ["STOPPED", "HELD"].find((code) => codes.includes(code));
+    text = s.dry_run ? `${s.lifecycle}, dry run` : s.lifecycle;
+    kind = { active: s.level === "hold" || codes.includes("CAMERA_SILENT") ? "warn" : "good", fault: "bad" }[s.lifecycle];
+    if (halted && s.lifecycle === "active") {
+      [text, kind, title] = [halted, halted === "STOPPED" ? "bad" : "warn", `${halted} `];
+      if (s.halt) text = `${s.halt.words.replace(/^[a-z]+/, (word) => word.toUpperCase())}, ${new Date(1000 * s.halt.t_wall).toLocaleTimeString()}`;
+    }
+  }
+  badge("lifecycle", text, kind);
+  document.title = title + cell;
 }
 
 function showInfo(info) {
-  for (const camera of info.cameras) Object.assign(view(camera.name), { width: camera.width, height: camera.height });
+  joints = info.joints.map((joint) => joint.name);
+  for (const { name, width, height, rate_hz: rate } of info.cameras) Object.assign(view(name), { width, height, rate });
   $("taught").replaceChildren(...info.taught.map((goal) => {
     const button = document.createElement("button");
     button.textContent = `Check “${goal.name}”`;
@@ -201,7 +280,8 @@ function showNotice({ notice, t_wall }) {
 
 function showEvent(event) {
   const reasons = event.reasons.map((r) => `${r.code}${r.subject ? ` ${r.subject}` : ""}${r.hint && r.hint !== event.message ? `: ${r.hint}` : ""}`);
-  const why = [...new Set([event.message, ...reasons])].filter(Boolean).join("\n") ||
+  const by = event.kind === "stopped" && event.operator ? `by ${event.operator}` : "";
+  const why = [...new Set([by, event.message, ...reasons])].filter(Boolean).join("\n") ||
     (/_aborted$|_failed$/.test(event.kind) ? "the daemon gave no reason, which is a fault of it" : "");
   const what = `${event.kind.replaceAll("_", " ")} ${event.id.slice(0, 8)}`;
   list(event.t_wall, `${what} ${why}`, { value: event.seq });
@@ -343,8 +423,35 @@ async function go() {
 
 // -- the controls --------------------------------------------------------------------------------------------------
 
-const stop = () => command({ do: "stop" });
-$("stop").onclick = stop;
+async function stop() {
+  stopping ??= { since: performance.now(), why: "", asked: 0, answered: 0 };
+  const mine = stopping;
+  mine.asked += 1;
+  setTimeout(watch, 1000 * STOP_S);
+  const answer = await command({ do: "stop" });
+  if (answer.ok) stopping = null;
+  else Object.assign(mine, { why: answer.message, answered: performance.now() });
+  mine.asked -= 1;
+  watch();
+}
+
+function watchStop(now) {
+  // A stop is asked for again until it is confirmed; who looks at the page is told meanwhile what stops the arm.
+  const seconds = stopping ? (now - stopping.since) / 1000 : 0;
+  const shown = stopping !== null && (seconds >= STOP_S || stopping.why !== "");
+  if (shown) {
+    $("unconfirmed-since").textContent = `${seconds.toFixed(1)} s`;
+    $("unconfirmed-why").textContent = stopping.why;
+    if (stopping.asked === 0 && socket?.readyState === WebSocket.OPEN && now - stopping.answered > 1000 * AGAIN_S) stop();
+  }
+  if ($("unconfirmed").hidden === shown) {
+    $("unconfirmed").hidden = !shown;
+    if (shown) $("stop-again").focus();
+  }
+}
+
+$("stop").onclick = $("stop-again").onclick = stop;
+$("stop-close").onclick = () => { stopping = null; watch(); };
 addEventListener("keydown", (event) => { if (event.key === "Escape" && !flight) { event.preventDefault(); stop(); } });
 for (const button of document.querySelectorAll("[data-do]")) {
   const verb = button.dataset.do;
@@ -369,6 +476,7 @@ $("scene").onpointermove = (event) => {
   orbit = [event.clientX, event.clientY];
 };
 $("scene").onpointerup = () => { orbit = null; };
+setInterval(watch, 100);
 setInterval(() => {
   drawPlot($("plot-error"), history.error, ["error"], true);
   drawPlot($("plot-velocity"), history.velocity, joints, false);
