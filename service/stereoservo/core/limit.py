@@ -184,8 +184,9 @@ def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
     limited, acted = np.empty(n), np.empty(n)
     told, found = limit_velocity(
         Wanted(
-            *(np.ascontiguousarray(array, dtype=np.float64) for array in (raw, positions, previous)), inputs.brake,
-            inputs.dt_s, inputs.joint_age_s, inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
+            np.ascontiguousarray(raw, dtype=np.float64), np.ascontiguousarray(positions, dtype=np.float64),
+            np.ascontiguousarray(previous, dtype=np.float64), inputs.brake, inputs.dt_s, inputs.joint_age_s,
+            inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
         ),
         Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted,
     )  # fmt: skip

@@ -265,7 +265,7 @@ def step(context: StepContext) -> None:
                 _stand_as_before(c, context)
         elif mobile.lost:
             _hand_over(c, mobile, context)
-    if context.arrays is not arrays:
+    if context.arrays is not None and context.arrays is not arrays:
         context.derived.use(context.arrays)
 
 
