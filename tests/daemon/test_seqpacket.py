@@ -91,6 +91,23 @@ def test_peers_are_bounded(tmp_path: Path) -> None:
     server.close()
 
 
+def test_a_server_that_hangs_holds_up_nobody_who_connects(tmp_path: Path) -> None:
+    server = ChannelServer(tmp_path / "a.sock")
+    waiting = list[PacketChannel]()
+
+    def connect_without_end() -> None:
+        while True:  # once the server's queue was full it waited, without end
+            waiting.append(PacketChannel.connect(tmp_path / "a.sock"))
+
+    with pytest.raises(ChannelError, match="accepts no connection"):
+        connect_without_end()
+    assert waiting[0].send(b"first")
+    assert server.accept()[0].receive() == [b"first"]
+    for channel in waiting:
+        channel.close()
+    server.close()
+
+
 def test_what_cannot_work_is_refused_with_the_reason(tmp_path: Path) -> None:
     with pytest.raises(ChannelError, match="nobody listens") as caught:
         PacketChannel.connect(tmp_path / "none.sock")

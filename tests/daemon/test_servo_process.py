@@ -20,7 +20,7 @@ from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     Ask,
     Heartbeat,
-    Hello,
+    Received,
     ServoState,
     encode_observation,
     event_decoder,
@@ -187,7 +187,7 @@ class Bench:
 
     def connect(self, last_event: int = 0) -> None:
         self.control = PacketChannel.connect(self.directories.control_socket)
-        self.control.send(encode(Hello(last_event)))
+        self.control.send(encode(Received(last_event)))
 
     def run(self, cycles: int, *, beat: bool = True) -> None:
         for _ in range(cycles):

@@ -16,8 +16,8 @@ from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.ipc_messages import (
     Ask,
     Heartbeat,
-    Hello,
     NewModel,
+    Received,
     ServoState,
     event_decoder,
     state_decoder,
@@ -73,7 +73,7 @@ class ServoConnection:
             if not self.connected:
                 self._control = _try(self._directories, "control_socket")
                 if self._control is not None:
-                    self._control.send(encode(Hello(self._last_event)))
+                    self._control.send(encode(Received(self._last_event)))
             if self._steps is None:
                 with suppress(SlotError):  # not there yet; tried again
                     self._steps = RingReader(self._directories.steps_ring)

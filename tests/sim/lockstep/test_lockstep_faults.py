@@ -21,8 +21,8 @@ from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     Ask,
     Heartbeat,
-    Hello,
     NewModel,
+    Received,
     ServoState,
     event_decoder,
     state_decoder,
@@ -90,7 +90,7 @@ class SocketLinks(ProcessLinks):
         self._vision = {name: VisionSlots(self.directories, name) for name in CAMERAS}
         self._stop_button = StopSlot(self.directories.stop_slot)
         self._gateway_end = PacketChannel.connect(self.directories.control_socket)
-        self._gateway_end.send(encode(Hello(0)))
+        self._gateway_end.send(encode(Received(0)))
 
     @property
     def state(self) -> ServoState:
