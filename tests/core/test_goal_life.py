@@ -321,7 +321,9 @@ def test_time_in_which_nobody_hears_the_clients_is_none_of_a_lease(bench: Any) -
     for _ in range(10):
         bench.step(ExtendLeases(0.2))
         bench.run(0.2)
-    assert {"goal_aborted", "reply"} & {e.kind for e in bench.events[before:]} == set()  # nobody asked: no reply
+    assert {"goal_aborted", "reply"} & {
+        e.kind for e in bench.events[before:]
+    } == set()  # nobody asked: no reply
     bench.run(1.0)
     ends = {e.id: e.reasons[0].code for e in bench.events if e.kind == "goal_aborted"}
     assert ends == {first.goal.id: "LEASE_EXPIRED", second.goal.id: "LEASE_EXPIRED"}

@@ -435,6 +435,8 @@ class Gateway:
         state = self._servo.state()
         if state is not None:
             self._state_heard = now
+            self._calibration.take_epoch(state.status.model_epoch)
+            self._relocalization.take_epoch(state.status.model_epoch)
             self._refinement.take_state(state.status)
             self._collect_notes()
             self._state = state_message(
