@@ -17,13 +17,12 @@ from stereoservo.client import Client, FailedError, calibration_requests, client
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.keys import KeySpace
-from stereoservo.messages.recording_request import RecordedImages
+from stereoservo.messages.recording_request import ImagesRecorded, RecordedImages
 from stereoservo.messages.wire import (
     CalibrationResult,
     CellInfo,
     EventList,
     EventMessage,
-    ImagesRecorded,
     LoopInfo,
     Reply,
     StateMessage,

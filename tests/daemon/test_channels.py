@@ -14,11 +14,11 @@ from typing import Any, Literal, NamedTuple
 import pytest
 
 from stereoservo.core.cycle import Event, encode
+from stereoservo.daemon.channels.reports import KEPT_REPORTS, Reporter, ReportIntake
+from stereoservo.daemon.channels.seqpacket import ChannelServer, PacketChannel
 from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT
 from stereoservo.daemon.ipc_messages import Received, Report, event_decoder, report_decoder
-from stereoservo.daemon.reports import KEPT_REPORTS, Reporter, ReportIntake
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot
-from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.gateway.crash_records import HandledEvents
 from stereoservo.gateway.servo_connection import ServoConnection
@@ -264,7 +264,7 @@ def look(channel: Any) -> None:
 def test_nothing_is_lost_and_nothing_comes_twice(
     make: Callable[[Path, int], Any], fault: Fault, size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stereoservo.daemon.reports.write_log", lambda origin, message: None)
+    monkeypatch.setattr("stereoservo.daemon.channels.reports.write_log", lambda origin, message: None)
     for at, every, away in product(range(MESSAGES), (1, 3), (0, 4)):
         case = f"round {at}, looks every {every}, away for {away}"
         directory = tmp_path / f"{at}{every}{away}"  # a socket's path is short

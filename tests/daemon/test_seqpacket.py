@@ -4,7 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.daemon.seqpacket import MAX_MESSAGE_BYTES, ChannelError, ChannelServer, PacketChannel
+from stereoservo.daemon.channels.seqpacket import (
+    MAX_MESSAGE_BYTES,
+    ChannelError,
+    ChannelServer,
+    PacketChannel,
+)
 from stereoservo.messages.directories import DirectoryError
 
 

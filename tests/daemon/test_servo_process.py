@@ -14,6 +14,7 @@ from stereoservo.core.cycle import Event, check_observation, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import core_settings
 from stereoservo.core.state_encoding import encode_state
+from stereoservo.daemon.channels.seqpacket import PacketChannel
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
@@ -30,7 +31,6 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.pacing import ClockPacing
 from stereoservo.daemon.record_ring import RingReader
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot, create_slot, create_stop_slot
-from stereoservo.daemon.seqpacket import PacketChannel
 from stereoservo.daemon.servo import AHEAD_S, GATEWAY_SILENCE_S, RETURN_S, UNHEARD_S, ServoProcess
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import check_cell

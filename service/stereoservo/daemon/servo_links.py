@@ -7,6 +7,8 @@ import select
 import msgspec
 
 from stereoservo.core.cycle import Event, ModelUpdate, encode
+from stereoservo.daemon.channels.outbox import Outbox
+from stereoservo.daemon.channels.seqpacket import ChannelServer, PacketChannel
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
@@ -23,10 +25,8 @@ from stereoservo.daemon.ipc_messages import (
     to_servo_decoder,
 )
 from stereoservo.daemon.links import GatewayMessages
-from stereoservo.daemon.outbox import Outbox
 from stereoservo.daemon.record_ring import RingWriter
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot
-from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.servo_state import STATE_LAYOUT

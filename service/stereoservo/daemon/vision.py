@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from stereoservo.core.cycle import check_observation
 from stereoservo.daemon.camera_setup import make_camera
+from stereoservo.daemon.channels.reports import Reporter
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
@@ -32,7 +33,6 @@ from stereoservo.daemon.ipc_messages import (
 )
 from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
-from stereoservo.daemon.reports import Reporter
 from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
 from stereoservo.messages.decoding import RecordBoundary, cause_of
 from stereoservo.messages.directories import CellDirectories

@@ -23,6 +23,7 @@ from zenoh.handlers import RingChannel
 from stereoservo.client.session import SessionError, close_session, open_session
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
+from stereoservo.daemon.channels.reports import ReportIntake
 from stereoservo.daemon.heartbeat import (
     GATEWAY_HANG_S,
     REQUEST_S,
@@ -39,7 +40,6 @@ from stereoservo.daemon.ipc_messages import (
     load_plan,
 )
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
-from stereoservo.daemon.reports import ReportIntake
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord

@@ -12,6 +12,7 @@ import msgspec
 
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, encode
+from stereoservo.daemon.channels.seqpacket import ChannelError, PacketChannel
 from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.ipc_messages import (
     Ask,
@@ -26,7 +27,6 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.process_control import write_log
 from stereoservo.daemon.record_ring import RingReader
 from stereoservo.daemon.seqlock import SlotError, SlotReader
-from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories

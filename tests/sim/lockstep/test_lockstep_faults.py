@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import Event, ModelUpdate, encode
+from stereoservo.daemon.channels.seqpacket import PacketChannel
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
@@ -30,7 +31,6 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.links import GatewayMessages, VisionLinks
 from stereoservo.daemon.lockstep import LockstepCell, LockstepLinks, MemoryLinks
 from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_slot, create_stop_slot
-from stereoservo.daemon.seqpacket import PacketChannel
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.daemon.vision import VisionSlots
 from stereoservo.kinematics.model import CellModel

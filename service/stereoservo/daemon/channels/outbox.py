@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from stereoservo.daemon.seqpacket import PacketChannel
+from stereoservo.daemon.channels.seqpacket import PacketChannel
 
 
 class Outbox:

@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 
 from stereoservo.core.cycle import encode
+from stereoservo.daemon.channels.outbox import Outbox
+from stereoservo.daemon.channels.seqpacket import ChannelError, ChannelServer, PacketChannel
 from stereoservo.daemon.ipc_messages import Received, Report, received_decoder, report_decoder
-from stereoservo.daemon.outbox import Outbox
 from stereoservo.daemon.process_control import write_log
-from stereoservo.daemon.seqpacket import ChannelError, ChannelServer, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.recording_request import RecordedImages
 from stereoservo.ports.devices import Clock
