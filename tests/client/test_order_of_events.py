@@ -205,7 +205,7 @@ def test_a_wait_finds_its_events_in_any_order(name: str, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    "order", permutations([CALIBRATED, REPORT, event("fit_progress", id="mine", progress=0.5)])
+    "order", list(permutations([CALIBRATED, REPORT, event("fit_progress", id="mine", progress=0.5)]))
 )
 def test_each_event_of_a_calibration_is_shown_once(
     order: tuple[Step, ...], monkeypatch: pytest.MonkeyPatch
