@@ -15,6 +15,7 @@ from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.goals import (
     AcknowledgeGoal,
     CancelGoal,
+    ExtendLeases,
     FeatureTarget,
     Hold,
     Home,
@@ -307,6 +308,36 @@ def test_stream_renews_the_lease(bench: Any) -> None:
         bench.step(UpdateGoal(command.goal.id, features(bench, goal_q)))
     assert not [e for e in bench.events if e.kind == "goal_aborted"]
     assert bench.ended(2.0).reasons[0].code == "LEASE_EXPIRED"
+
+
+def test_time_in_which_nobody_hears_the_clients_is_none_of_a_lease(bench: Any) -> None:
+    bench.ready()
+    target = features(bench, bench.q + DISPLACED)
+    first = bench.goal(target, lease_s=0.5, speed_scale=0.1)
+    second = bench.goal(target, lease_s=0.5, mode="queue")
+    assert bench.reply(first).accepted
+    assert bench.reply(second).accepted
+    before = len(bench.events)
+    for _ in range(10):
+        bench.step(ExtendLeases(0.2))
+        bench.run(0.2)
+    assert {"goal_aborted", "reply"} & {
+        e.kind for e in bench.events[before:]
+    } == set()  # nobody asked: no reply
+    bench.run(1.0)
+    ends = {e.id: e.reasons[0].code for e in bench.events if e.kind == "goal_aborted"}
+    assert ends == {first.goal.id: "LEASE_EXPIRED", second.goal.id: "LEASE_EXPIRED"}
+
+
+def test_time_in_which_nobody_hears_the_clients_counts_for_no_acknowledgement(bench: Any) -> None:
+    bench.ready()
+    first = bench.goal(features(bench, bench.q), acknowledge_s=0.5)
+    assert bench.reply(first).accepted
+    assert bench.ended().kind == "goal_reached"
+    for _ in range(10):
+        bench.step(ExtendLeases(0.2))
+        bench.run(0.2)
+    assert bench.reply(AcknowledgeGoal(first.goal.id)).accepted
 
 
 # -- drop-outs, hold, and what is told ------------------------------------------------------------------------

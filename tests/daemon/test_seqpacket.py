@@ -4,7 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo.daemon.seqpacket import MAX_MESSAGE_BYTES, ChannelError, ChannelServer, PacketChannel
+from stereoservo.daemon.channels.seqpacket import (
+    MAX_MESSAGE_BYTES,
+    ChannelError,
+    ChannelServer,
+    PacketChannel,
+)
 from stereoservo.messages.directories import DirectoryError
 
 
@@ -88,6 +93,23 @@ def test_peers_are_bounded(tmp_path: Path) -> None:
     assert len(server.accept()) == 2
     clients[2].receive()
     assert [client.is_open for client in clients] == [True, True, False]
+    server.close()
+
+
+def test_a_server_that_hangs_holds_up_nobody_who_connects(tmp_path: Path) -> None:
+    server = ChannelServer(tmp_path / "a.sock")
+    waiting = list[PacketChannel]()
+
+    def connect_without_end() -> None:
+        while True:  # once the server's queue was full it waited, without end
+            waiting.append(PacketChannel.connect(tmp_path / "a.sock"))
+
+    with pytest.raises(ChannelError, match="accepts no connection"):
+        connect_without_end()
+    assert waiting[0].send(b"first")
+    assert server.accept()[0].receive() == [b"first"]
+    for channel in waiting:
+        channel.close()
     server.close()
 
 

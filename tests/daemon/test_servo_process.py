@@ -14,13 +14,14 @@ from stereoservo.core.cycle import Event, check_observation, encode
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import core_settings
 from stereoservo.core.state_encoding import encode_state
+from stereoservo.daemon.channels.seqpacket import PacketChannel
 from stereoservo.daemon.heartbeat import DRIVER_CALL_S, SERVO_HANG_S
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
     Ask,
     Heartbeat,
-    Hello,
+    Received,
     ServoState,
     encode_observation,
     event_decoder,
@@ -30,8 +31,7 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.pacing import ClockPacing
 from stereoservo.daemon.record_ring import RingReader
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot, create_slot, create_stop_slot
-from stereoservo.daemon.seqpacket import PacketChannel
-from stereoservo.daemon.servo import GATEWAY_SILENCE_S, ServoProcess
+from stereoservo.daemon.servo import AHEAD_S, GATEWAY_SILENCE_S, RETURN_S, UNHEARD_S, ServoProcess
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.directories import CellDirectories
@@ -40,12 +40,16 @@ from stereoservo.messages.goals import (
     Command,
     Disable,
     Enable,
+    Goal,
     Hold,
     Jog,
+    JointTarget,
     OrderAuxiliary,
+    RenewGoal,
     Request,
     Reset,
     Resume,
+    RunGoal,
 )
 from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.numerics.arrays import FloatArray
@@ -187,7 +191,7 @@ class Bench:
 
     def connect(self, last_event: int = 0) -> None:
         self.control = PacketChannel.connect(self.directories.control_socket)
-        self.control.send(encode(Hello(last_event)))
+        self.control.send(encode(Received(last_event)))
 
     def run(self, cycles: int, *, beat: bool = True) -> None:
         for _ in range(cycles):
@@ -311,6 +315,63 @@ def test_gateway_silence_holds_a_moving_arm_and_only_then(bench: Bench) -> None:
     (held,) = [event for event in bench.events if event.kind == "held"]
     assert "its gateway said nothing for 0.5 s" in held.message  # nobody asked for it: say why
     assert not bench.arm.written[-1].any()
+
+
+LEASED = "aaaa0001"
+
+
+def leased_goal(bench: Bench, lease_s: float) -> None:
+    goal = Goal(LEASED, JointTarget({"j1": 1.5}), speed_scale=0.05, lease_s=lease_s)
+    assert bench.ask(RunGoal(goal)).accepted
+
+
+def ends(bench: Bench) -> list[Event]:
+    return [event for event in bench.events if event.id == LEASED and event.kind == "goal_aborted"]
+
+
+@pytest.mark.parametrize("lease_s", [0.3, 5.0])
+@pytest.mark.parametrize("away_s", [0.4, 2.0, 12.0])
+def test_no_lease_runs_out_while_the_gateway_could_not_hear_the_client(
+    bench: Bench, away_s: float, lease_s: float
+) -> None:
+    """The goal ended with "the client did not renew its lease: is it alive?", of a client that lived and renewed."""
+    enabled(bench)
+    leased_goal(bench, lease_s)
+    bench.run(round(away_s * RATE_HZ), beat=False)
+    if away_s > GATEWAY_SILENCE_S:  # a new one; clients find it a little later
+        assert bench.kinds().count("held") == 1
+        bench.connect(bench.events[-1].seq)
+        bench.run(round(0.5 * RETURN_S * RATE_HZ))
+    for _ in range(8):
+        assert bench.ask(RenewGoal(LEASED)).accepted
+        bench.run(round(0.3 * lease_s * RATE_HZ))
+    assert ends(bench) == []
+
+
+def test_a_client_that_has_died_is_found_once_it_could_have_been_heard(bench: Bench) -> None:
+    enabled(bench)
+    leased_goal(bench, 1.0)
+    bench.run(round(0.5 * RATE_HZ))
+    bench.run(round(3.0 * RATE_HZ), beat=False)
+    bench.connect(bench.events[-1].seq)
+    heard_ns = bench.clock.now_ns()
+    while not ends(bench):
+        bench.run(1)
+    (end,) = ends(bench)
+    assert end.reasons[0].code == "LEASE_EXPIRED"
+    after_s = (end.t_ns - heard_ns) * 1e-9
+    assert RETURN_S + 0.5 <= after_s <= RETURN_S + 0.5 + UNHEARD_S + 2 * AHEAD_S
+
+
+def test_a_gateway_that_stumbles_again_and_again_hides_no_dead_client(bench: Bench) -> None:
+    enabled(bench)
+    leased_goal(bench, 1.0)
+    heard = 0.0
+    while not ends(bench):
+        bench.run(round(0.3 * RATE_HZ), beat=False)
+        bench.run(round(0.3 * RATE_HZ))
+        heard += 0.3
+    assert heard < 2.0
 
 
 def test_the_stop_slot_brakes_within_the_next_cycles_and_is_acknowledged(bench: Bench) -> None:

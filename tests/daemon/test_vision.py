@@ -13,16 +13,13 @@ from stereoservo.daemon.ipc_messages import (
     PRIOR_LAYOUT,
     decode_observation,
     encode_prior,
-    report_decoder,
 )
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter
-from stereoservo.daemon.seqpacket import ChannelServer
 from stereoservo.daemon.vision import (
     LONGEST_PAUSE_S,
     PRIOR_MAX_AGE_S,
     SILENT_CAMERA_S,
     CameraPipeline,
-    Reporter,
     VisionSlots,
     camera_loop,
     run_camera,
@@ -233,20 +230,6 @@ def test_a_camera_is_looked_at_seldom_and_its_frames_are_taken_soon(bench: Bench
         assert looks[0] < 5 * len(waited)  # 8 without the rhythm
         assert late[round(0.9 * len(late))] <= poll_s + 1e-9
     assert late[-1] <= max(1.0 / 30.0 - 0.9 / true_hz, 0.1 / true_hz) + 2 * poll_s
-
-
-def test_reports_wait_for_a_gateway_that_is_not_up_yet(tmp_path: Path) -> None:
-    reporter = Reporter(tmp_path / "reports.sock", "vision-left", VirtualClock())
-    reporter.report("camera_lost", "first")
-    server = ChannelServer(tmp_path / "reports.sock")
-    reporter.report("camera_back", "second")
-    (peer,) = server.accept()
-    found = [report_decoder.decode(data) for data in peer.receive()]
-    assert [(r.origin, r.kind, r.message) for r in found] == [
-        ("vision-left", "camera_lost", "first"),
-        ("vision-left", "camera_back", "second"),
-    ]
-    server.close()
 
 
 def test_a_prior_that_cannot_be_read_is_left_out(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:

@@ -167,6 +167,33 @@ def test_a_killed_gateway_holds_the_arm_and_comes_back_with_its_events(
         assert [taught.name for taught in again.info().taught] == ["park"]
 
 
+def test_a_goal_outlives_gateways_that_die_and_what_dies_meanwhile_is_told_once(
+    own: Client, directories: CellDirectories
+) -> None:
+    """Its client lived and renewed, and the goal ended since the client "did not renew its lease"; of the second death
+    and what came after it nobody was told.
+    """
+    moved_away(own)
+    goal = own.goal("park", gain=0.05, time_limit_s=300.0, tolerance_px=0.01, lease_s=1.0)
+    deaths = []
+    for victim in ("gateway", "gateway", "vision-left"):
+        old = processes(directories)[victim]
+        os.kill(old, signal.SIGKILL)
+        deaths.append(f"{victim} ended by signal SIGKILL")
+        eventually("a new one", lambda: processes(directories).get(victim, old) != old, 60.0)  # noqa: B023
+        eventually("the cell answers", lambda: answers(own), 60.0)
+    eventually("all is told", lambda: len(told(directories, "process_ended")) >= len(deaths), 60.0)
+    assert [text.partition(" (")[0] for text in told(directories, "process_ended")] == deaths
+    assert ends(directories, goal.id) == []
+    own.resume()
+    eventually("the goal goes on", lambda: not at_rest(own))
+    goal.cancel()
+    eventually("it ends", lambda: bool(ends(directories, goal.id)))
+    (end,) = ends(directories, goal.id)
+    assert end["kind"] == "goal_cancelled"
+    goal.abandon()
+
+
 def test_a_killed_vision_process_comes_back(own: Client, directories: CellDirectories) -> None:
     old = processes(directories)["vision-left"]
     with EventWatch(own) as watch:
@@ -219,10 +246,19 @@ def test_a_killed_servo_process_ends_everything_with_an_error(
     assert live_cells() == []
 
 
+def journal(directories: CellDirectories) -> list[dict[str, str]]:
+    """Events in the cell's journal."""
+    return [json.loads(line) for line in directories.journal.read_text().splitlines()]
+
+
+def told(directories: CellDirectories, kind: str) -> list[str]:
+    """Messages of the events of a kind in the cell's journal."""
+    return [event["message"] for event in journal(directories) if event["kind"] == kind]
+
+
 def ends(directories: CellDirectories, goal: str) -> list[dict[str, str]]:
     """Terminal events of a goal in the cell's journal."""
-    events = [json.loads(line) for line in directories.journal.read_text().splitlines()]
-    return [event for event in events if event["id"] == goal and event["kind"] in TERMINAL]
+    return [event for event in journal(directories) if event["id"] == goal and event["kind"] in TERMINAL]
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,9 @@ from stereoservo.cli.output import (
     emit,
     note,
 )
-from stereoservo.client import Client, EventWatch
+from stereoservo.client import Client, EventWatch, HeardEvents
 from stereoservo.messages.recording_request import ImagesRecorded
+from stereoservo.messages.wire import EventMessage
 
 LAST_WORD_S = 10.0
 """The gateway gives its cameras 5 s to finish their files."""
@@ -41,12 +42,18 @@ def record(
     json: JsonOption = False,
 ) -> None:
     """Record the flight of a live cell into a file on its host; `replay` runs it again."""
+
+    def hear(event: EventMessage) -> None:
+        if event.kind in ("images_ended", "recording_failed"):
+            note(event.message)
+
     recorded: ImagesRecorded | None = None
     with Client(cell, endpoint=endpoint, operator=operator) as client, EventWatch(client) as watch:
+        heard = HeardEvents(watch, lambda event: True, hear)
         client.record(images=images)
         file = client.info().recording
         if not file:
-            began = watch.wait(lambda e: e.kind in ("recording", "recording_failed"), "the recording", 5.0)
+            began = heard.wait(("recording", "recording_failed"), "the recording", 5.0)
             if began.kind != "recording":
                 client.record(on=False)
                 raise CommandError("recording_failed", began.message)
@@ -56,17 +63,13 @@ def record(
         try:
             while time.monotonic() < until:
                 time.sleep(min(0.5, max(0.0, until - time.monotonic())))
-                for event in watch.poll():
-                    if event.kind in ("images_ended", "recording_failed"):
-                        note(event.message)
-                    recorded = event.images or recorded
+                heard.poll()
         except KeyboardInterrupt:
             note("ending the recording")
         finally:
             reply = client.record(on=False)
-        if images and recorded is None:
-            ended = watch.wait(lambda e: e.kind == "images_recorded", "the end of the images", LAST_WORD_S)
-            recorded = ended.images
+        if images:
+            recorded = heard.wait(("images_recorded",), "the end of the images", LAST_WORD_S).images
     lines = [reply.message]
     result: dict[str, Any] = {"file": file, "message": reply.message}
     if recorded is not None:

@@ -13,7 +13,7 @@ from stereoservo.client.errors import (
     RefusedError,
     TimedOutError,
 )
-from stereoservo.client.events import EventWatch
+from stereoservo.client.events import EventWatch, HeardEvents
 from stereoservo.client.goal_handle import GoalHandle, GoalProgress, GoalResult
 from stereoservo.client.session import SessionError
 from stereoservo.client.targets import GoalOptions, as_target
@@ -28,6 +28,7 @@ __all__ = [
     "GoalOptions",
     "GoalProgress",
     "GoalResult",
+    "HeardEvents",
     "InvalidReplyError",
     "NoReplyError",
     "RefusedError",

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 from stereoservo.client.connection import Connection
 from stereoservo.client.errors import FailedError, TimedOutError
-from stereoservo.client.events import EventWatch
+from stereoservo.client.events import EventWatch, HeardEvents
 from stereoservo.client.goal_handle import Lease
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import Calibrate
@@ -68,28 +68,21 @@ def _run(
 ) -> EventMessage:
     lease: Lease | None = None
 
-    def until(*ends: str) -> Callable[[EventMessage], bool]:
-        def matches(event: EventMessage) -> bool:
-            if event.id != command.id:
-                return False
-            if lease is not None and event.kind in ("calibration_finished", "check_finished"):
-                lease.end()
-            if progress is not None:
-                progress(event)
-            return event.kind in ends
-
-        return matches
+    def hear(event: EventMessage) -> None:
+        if lease is not None and event.kind in ("calibration_finished", "check_finished"):
+            lease.end()
+        if progress is not None:
+            progress(event)
 
     with EventWatch(connection) as watch:
+        heard = HeardEvents(watch, lambda event: event.id == command.id, hear)
         connection.command("calibrate", command)
         lease = Lease(connection, command.id, command.lease_s)
         try:
-            end = watch.wait(
-                until(success, "calibration_failed", "calibration_aborted"), "calibration", timeout_s
-            )
+            end = heard.wait((success, "calibration_failed", "calibration_aborted"), "calibration", timeout_s)
         finally:
             lease.end()
         if report and end.kind != "calibration_aborted":
             with suppress(TimedOutError):  # the model exists; an event announces its report, if it comes
-                watch.wait(until("calibration_report"), "the report", REPORT_TIMEOUT_S)
+                heard.wait(("calibration_report",), "the report", REPORT_TIMEOUT_S)
     return end

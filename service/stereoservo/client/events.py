@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
@@ -27,10 +28,13 @@ class EventWatch:
         self._boot = state.boot
         self._next = connection.events(NEXT_EVENT).next
         self._alive = time.monotonic()
+        self._left: deque[EventMessage] = deque()
+        """Came with one that was waited for, after it."""
 
     def poll(self) -> list[EventMessage]:
         """Events since the last poll. Raises DaemonLostError, InvalidReplyError."""
-        found: list[EventMessage] = []
+        found = list(self._left)
+        self._left.clear()
         while (sample := self._subscriber.try_recv()) is not None:
             event = read_message(str(sample.key_expr), sample.payload.to_bytes(), EventMessage)
             if event.boot != self._boot:
@@ -80,10 +84,12 @@ class EventWatch:
         self._alive = time.monotonic()
 
     def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:
-        """Wait for an event. Raises TimedOutError, DaemonLostError."""
+        """Wait for an event that comes from now on. Raises TimedOutError, DaemonLostError."""
         until = time.monotonic() + timeout_s
         while True:
-            for event in self.poll():
+            self._left.extend(self.poll())
+            while self._left:
+                event = self._left.popleft()
                 if wanted(event):
                     return event
             self._connection.while_waiting()
@@ -104,3 +110,43 @@ class EventWatch:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class HeardEvents:
+    """Events of one matter, heard by a watch. A wait for one of them also finds it where it came before the wait: what
+    several processes tell comes in any order.
+
+    ``concerns``: whether an event is of the matter; ``hear``: called with each of these, once, in order.
+    """
+
+    def __init__(
+        self,
+        watch: EventWatch,
+        concerns: Callable[[EventMessage], bool],
+        hear: Callable[[EventMessage], None],
+    ) -> None:
+        self._watch = watch
+        self._concerns = concerns
+        self._hear = hear
+        self._first: dict[str, EventMessage] = {}
+
+    def poll(self) -> None:
+        """Hear what has come. Raises DaemonLostError, InvalidReplyError."""
+        for event in self._watch.poll():
+            self._take(event)
+
+    def _take(self, event: EventMessage) -> bool:
+        if not self._concerns(event):
+            return False
+        self._first.setdefault(event.kind, event)
+        self._hear(event)
+        return True
+
+    def wait(self, kinds: tuple[str, ...], what: str, timeout_s: float) -> EventMessage:
+        """The first event of one of ``kinds``, of those that were heard or else to come. Raises TimedOutError,
+        DaemonLostError.
+        """
+        heard = [self._first[kind] for kind in kinds if kind in self._first]
+        if heard:
+            return min(heard, key=lambda event: event.seq)
+        return self._watch.wait(lambda event: self._take(event) and event.kind in kinds, what, timeout_s)

@@ -82,10 +82,12 @@ class RunPlan(msgspec.Struct, frozen=True):
         )
 
 
-class Hello(msgspec.Struct, frozen=True, tag="hello"):
-    """First message of the gateway; ``last_event`` is the number of the last event it has, later ones are sent."""
+class Received(msgspec.Struct, frozen=True, tag="received"):
+    """What a receiver has: a sender's messages up to ``number`` (see `outbox`). The servo process sends no event over a
+    connection before the gateway has said this.
+    """
 
-    last_event: int
+    number: int
 
 
 class Heartbeat(msgspec.Struct, frozen=True, tag="heartbeat"):
@@ -105,7 +107,7 @@ class NewModel(msgspec.Struct, frozen=True, tag="model", eq=False):
     reanchored: tuple[str, ...] = ()
 
 
-ToServo = Hello | Heartbeat | Ask | NewModel
+ToServo = Received | Heartbeat | Ask | NewModel
 
 
 class ServoState(msgspec.Struct, frozen=True, eq=False):
@@ -145,7 +147,9 @@ def newest_stamps(
 
 
 class Report(msgspec.Struct, frozen=True):
-    """A message of a vision process or the supervisor that the gateway passes on to clients."""
+    """A message of a vision process or the supervisor that the gateway passes on to clients: ``number`` (1 and up) of
+    ``stream``, which each process begins anew.
+    """
 
     origin: str
     kind: str
@@ -153,6 +157,8 @@ class Report(msgspec.Struct, frozen=True):
     t_ns: int
     images: RecordedImages | None = None
     """Of a recording of images that has ended."""
+    stream: int = 0
+    number: int = 0
 
 
 def rounded(observation: CameraObservation) -> CameraObservation:
@@ -259,6 +265,7 @@ each from a multiple of 8 bytes on.
 _STEP = struct.Struct("<IIq")
 """Before a step in the ring: mark, steps lost before it, time. What is rare is msgpack, which no mark begins."""
 _STEP_MARK = 0xC1C1C1C1  # a byte that msgpack never uses
+received_decoder = msgspec.msgpack.Decoder(Received)
 report_decoder = msgspec.msgpack.Decoder(Report)
 _plan_decoder = msgspec.msgpack.Decoder(RunPlan)
 

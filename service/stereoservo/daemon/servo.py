@@ -36,7 +36,7 @@ from stereoservo.daemon.seqlock import SlotError
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.messages.cell_file import CellFileError
 from stereoservo.messages.directories import DirectoryError
-from stereoservo.messages.goals import Hold, OrderAuxiliary, Request
+from stereoservo.messages.goals import ExtendLeases, Hold, OrderAuxiliary, Request
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path
 from stereoservo.messages.servo_state import LoopStatistics
 from stereoservo.numerics.arrays import FloatArray
@@ -49,6 +49,12 @@ GATEWAY_SILENCE_S = 0.5
 """Without a heartbeat of the gateway for so long, a moving arm is held."""
 SILENCE = f"the servo process: its gateway said nothing for {GATEWAY_SILENCE_S:g} s (a busy computer?)"
 """The operator's name in the event `held` that follows."""
+UNHEARD_S = 0.15
+"""Without a heartbeat of the gateway for so long (three of them), it hears no client either: no lease runs."""
+RETURN_S = 2.0
+"""So long after a silence that held the arm clients may need to find a gateway that was started anew."""
+AHEAD_S = 0.05
+"""How often, and by how much ahead, leases are extended meanwhile."""
 STATE_RATE_HZ = 50.0
 STATISTICS_EVERY_S = 0.5
 FAULT_READ_EVERY_S = 0.1
@@ -96,6 +102,8 @@ class ServoProcess:
         self._fault_ns = 0
         self._heard_ns = 0
         self._silent = False
+        self._unheard_until_ns = 0
+        self._extended_until_ns = 0
         self._moving = False
         self._differences: tuple[str, ...] = ()
         self._sent: FloatArray | None = None
@@ -212,16 +220,33 @@ class ServoProcess:
     # -- gateway --------------------------------------------------------------------------------------------
 
     def _receive(self, now_ns: int) -> GatewayMessages:
-        """The gateway's messages; a hold is added where it has been silent and the arm moves."""
+        """The gateway's messages; a hold is added where it has been silent and the arm moves, and leases do not run
+        while it hears no client.
+        """
         messages = self._links.receive()
         if messages.heard:
+            if self._silent:
+                self._unheard_until_ns = now_ns + round(RETURN_S * 1e9)
             self._heard_ns = now_ns
             self._silent = False
         elif self._heard_ns and not self._silent and now_ns - self._heard_ns > GATEWAY_SILENCE_S * 1e9:
             self._silent = True
             if self._moving:
-                return messages._replace(requests=(Request(-1, SILENCE, Hold()),))
+                messages = messages._replace(requests=(Request(-1, SILENCE, Hold()),))
+        if self._heard_ns and (
+            now_ns - self._heard_ns > UNHEARD_S * 1e9 or now_ns < self._unheard_until_ns
+        ):  # fmt: skip
+            return self._extend_leases(messages, now_ns)
         return messages
+
+    def _extend_leases(self, messages: GatewayMessages, now_ns: int) -> GatewayMessages:
+        """``messages`` and, where it is due, a request that gives clients the time in which nobody hears them."""
+        if self._extended_until_ns - now_ns >= AHEAD_S * 1e9:
+            return messages
+        since_ns = max(self._heard_ns, self._extended_until_ns)
+        self._extended_until_ns = now_ns + round(2 * AHEAD_S * 1e9)
+        request = Request(-1, SILENCE, ExtendLeases((self._extended_until_ns - since_ns) * 1e-9))
+        return messages._replace(requests=(request, *messages.requests))
 
     def _publish(self, newest: NewestStep, pacing: Pacing) -> None:
         """Publish priors to the cameras, and state and events to the gateway."""

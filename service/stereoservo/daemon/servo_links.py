@@ -1,23 +1,22 @@
-"""Links of the servo process to the vision processes and the gateway, by slots in shared memory and sockets; and its
-outbox of recent events.
-"""
+"""Links of the servo process to the vision processes and the gateway, by slots in shared memory and sockets."""
 
 from __future__ import annotations
 
 import select
-from collections import deque
 
 import msgspec
 
 from stereoservo.core.cycle import Event, ModelUpdate, encode
+from stereoservo.daemon.channels.outbox import Outbox
+from stereoservo.daemon.channels.seqpacket import ChannelServer, PacketChannel
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,
     PRIOR_LAYOUT,
     STATE_CAPACITY,
     Ask,
-    Hello,
     NewModel,
+    Received,
     ServoState,
     ToServo,
     decode_observation,
@@ -28,43 +27,15 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.links import GatewayMessages
 from stereoservo.daemon.record_ring import RingWriter
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, StopSlot
-from stereoservo.daemon.seqpacket import ChannelServer, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.goals import Request
 from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraObservation, Prior
 from stereoservo.recording.step_records import StepMessage
 
 RETAINED_EVENTS = 2048
+"""The last ones, whether they were received or not: a gateway that is started anew is sent them all."""
 NOTHING_WAITS = GatewayMessages(False, (), None)
-
-
-class EventOutbox:
-    """The last ``RETAINED_EVENTS`` events, encoded, so that a restarted gateway can receive those it missed."""
-
-    def __init__(self) -> None:
-        self._retained: deque[tuple[int, bytes]] = deque(maxlen=RETAINED_EVENTS)
-        self._sent = 0
-
-    def add(self, events: tuple[Event, ...]) -> None:
-        """Queue events; their numbers ascend."""
-        for event in events:
-            self._retained.append((event.seq, encode(event)))
-
-    def rewind(self, last_known: int) -> None:
-        """Send the events after ``last_known`` (again)."""
-        self._sent = last_known
-
-    def flush(self, peer: PacketChannel) -> None:
-        """Send queued events, as far as the socket accepts them."""
-        if not self._retained or self._retained[-1][0] <= self._sent:
-            return
-        for seq, data in self._retained:
-            if seq > self._sent:
-                if not peer.send(data):
-                    return
-                self._sent = seq
 
 
 class _RecorderPeer:
@@ -95,35 +66,43 @@ class ProcessLinks:
         self._control = ChannelServer(directories.control_socket, single=True)
         self._steps = RingWriter(directories.steps_ring)
         self._gateway: PacketChannel | None = None
+        self._greeted = False
+        """Whether the gateway has said which events it has: before that it is sent none."""
         self._recorder: _RecorderPeer | None = None
-        self._outbox = EventOutbox()
+        self._outbox = Outbox(RETAINED_EVENTS)
         self._waiting = select.epoll()
         """Tells in one call whether a peer or a message waits; what is closed leaves it by itself."""
         self._waiting.register(self._control.fileno(), select.EPOLLIN)
 
     def receive(self) -> GatewayMessages:
-        """Requests and model of the newest gateway connection; a message that does not decode is left out."""
+        """Requests and model of the gateway; a message that does not decode is left out. One that was started anew
+        replaces the one before, whose last words are taken first.
+        """
         if not self._waiting.poll(0):
             return NOTHING_WAITS
-        heard = False
+        messages, connected = [] if self._gateway is None else self._messages_of(self._gateway), False
         for peer in self._control.accept():
-            self._gateway = peer
+            self._gateway, self._greeted = peer, False
             self._waiting.register(peer.fileno(), select.EPOLLIN)
-            heard = True
-        requests: list[Request] = []
-        update: ModelUpdate | None = None
-        for data in [] if self._gateway is None else self._gateway.receive():
-            heard = True
-            message: ToServo | None = None
+            messages += self._messages_of(peer)
+            connected = True
+        models = [ModelUpdate(m.model, m.reanchored) for m in messages if isinstance(m, NewModel)]
+        return GatewayMessages(
+            connected or bool(messages),
+            tuple(message.request for message in messages if isinstance(message, Ask)),
+            models[-1] if models else None,
+        )
+
+    def _messages_of(self, gateway: PacketChannel) -> list[ToServo]:
+        found: list[ToServo] = []
+        for data in gateway.receive():
             with self._gateway_boundary:
-                message = to_servo_decoder.decode(data)
-            if isinstance(message, Ask):
-                requests.append(message.request)
-            elif isinstance(message, NewModel):
-                update = ModelUpdate(message.model, message.reanchored)
-            elif isinstance(message, Hello):
-                self._outbox.rewind(message.last_event)
-        return GatewayMessages(heard, tuple(requests), update)
+                message: ToServo = to_servo_decoder.decode(data)
+                found.append(message)
+                if isinstance(message, Received):
+                    self._outbox.resume(message.number)
+                    self._greeted = True
+        return found
 
     def observations(self) -> tuple[CameraObservation, ...]:
         """The newest observation of each camera that was not returned before; what does not decode is left out."""
@@ -161,8 +140,9 @@ class ProcessLinks:
 
     def publish_events(self, events: tuple[Event, ...]) -> None:
         """Queue events and send those that wait, as far as the gateway's socket accepts them."""
-        self._outbox.add(events)
-        if self._gateway is not None and self._gateway.is_open:
+        for event in events:
+            self._outbox.add(event.seq, encode(event))
+        if self._gateway is not None and self._greeted and self._gateway.is_open:
             self._outbox.flush(self._gateway)
 
     def close(self) -> None:

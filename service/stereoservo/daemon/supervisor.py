@@ -27,6 +27,7 @@ import msgspec
 
 from stereoservo.daemon import record_ring
 from stereoservo.daemon.cell_preparation import PlanOptions
+from stereoservo.daemon.channels.reports import Reporter
 from stereoservo.daemon.heartbeat import (
     HEARTBEAT_BYTES,
     HEARTBEAT_LAYOUT,
@@ -49,7 +50,6 @@ from stereoservo.daemon.plant_driver import PLANT_CAPACITY, PLANT_ORDERS_LAYOUT,
 from stereoservo.daemon.preview import PICTURE_CAPACITY, PICTURE_LAYOUT, WANTED_BYTES, WANTED_LAYOUT
 from stereoservo.daemon.process_control import Termination, child_environment, write_log
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
-from stereoservo.daemon.vision import Reporter
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.compilation_progress import PatientWait, read_progress
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories

@@ -16,15 +16,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereoservo.core.cycle import check_observation, encode
+from stereoservo.core.cycle import check_observation
 from stereoservo.daemon.camera_setup import make_camera
+from stereoservo.daemon.channels.reports import Reporter
 from stereoservo.daemon.heartbeat import CAMERA_OPENS_S, VISION_HANG_S, HeartbeatWriter
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
     PRIOR_LAYOUT,
     PlanError,
-    Report,
     RunPlan,
     decode_prior,
     encode_observation,
@@ -34,11 +34,10 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.links import VisionLinks
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
-from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
 from stereoservo.messages.decoding import RecordBoundary, cause_of
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, hardware_lock_path
-from stereoservo.messages.recording_request import RecordedImages, request_path
+from stereoservo.messages.recording_request import request_path
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import (
@@ -67,36 +66,6 @@ LOOKS = 2
 """For a frame, in vain: with more of them the next one is looked for later."""
 PRIOR_MAX_AGE_S = 0.5
 EXIT_SETUP = 3
-
-
-class Reporter:
-    """Sends reports to the gateway, oldest first; keeps the last 64 unsent ones."""
-
-    def __init__(self, path: Path, origin: str, clock: Clock) -> None:
-        self._path = path
-        self._origin = origin
-        self._clock = clock
-        self._waiting: list[bytes] = []
-        self._channel: PacketChannel | None = None
-
-    def report(self, kind: str, message: str, images: RecordedImages | None = None) -> None:
-        """Queue a report, and log it."""
-        write_log(self._origin, message)
-        self._waiting.append(encode(Report(self._origin, kind, message, self._clock.now_ns(), images)))
-        del self._waiting[:-64]
-        self.flush()
-
-    def flush(self) -> None:
-        """Send the waiting reports, as far as the gateway accepts them."""
-        if not self._waiting:
-            return
-        if self._channel is None or not self._channel.is_open:
-            try:
-                self._channel = PacketChannel.connect(self._path)
-            except ChannelError:  # the gateway is not up (yet): tried again at the next flush
-                return
-        while self._waiting and self._channel.send(self._waiting[0]):
-            self._waiting.pop(0)
 
 
 class VisionSlots:

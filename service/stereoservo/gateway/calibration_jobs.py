@@ -73,14 +73,23 @@ class CalibrationJobs:
             self._start_fit()
         elif event.kind == "check_finished" and fresh:
             self._start_check(reset=event.name == RESET_ZEROS)
-        elif event.kind == "model" and self._handed is not None:
-            handed, self._handed = self._handed, None
-            self.notes = ()
-            self._report_applied(*handed)
         elif event.kind == "warning" and event.message.startswith("model refused"):
             goal_id = self._fit_id if self._handed is None else self._handed[0]
             self._handed = None
             self._failed(goal_id, event.message)
+
+    def take_epoch(self, epoch: int) -> None:
+        """The core works with the model of ``epoch``: where that is the one that was handed over, it is reported."""
+        if self._handed is None or epoch < self._handed[1].epoch:
+            return
+        (goal_id, what), self._handed = self._handed, None
+        if epoch > what.epoch:
+            self._failed(
+                goal_id, f"model epoch {epoch} came before epoch {what.epoch} was used: calibrate again"
+            )
+            return
+        self.notes = ()
+        self._report_applied(goal_id, what)
 
     def _report_applied(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
         """Report that the core has applied the model that was sent."""

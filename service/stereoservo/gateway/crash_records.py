@@ -120,6 +120,10 @@ class HandledEvents:
         """Whether ``event`` has had its effect."""
         return event.seq <= self._acted or event.t_ns < self._not_before_ns
 
+    def missed_before(self, event: Event) -> int:
+        """How many events are missing between those that were dealt with and ``event``."""
+        return 0 if event.t_ns < self._not_before_ns else max(0, event.seq - self._journaled - 1)
+
     def mark(self, event: Event, *, acted: bool) -> None:
         """``event`` is in the journal and, with ``acted``, has had its effect."""
         self._journaled = max(self._journaled, event.seq)

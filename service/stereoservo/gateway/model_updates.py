@@ -84,11 +84,15 @@ class RelocalizationJobs:
             self._job.add(event)
             if fresh:
                 self._start()
-        elif event.kind == "model" and self._handed is not None:
-            self._take(self._handed)
-            self._handed = None
         elif event.kind == "camera_adjusted" and fresh:
             self._keep_adjusted(event)
+
+    def take_epoch(self, epoch: int) -> None:
+        """The core works with the model of ``epoch``."""
+        if self._handed is not None and epoch >= self._handed.epoch:
+            handed, self._handed = self._handed, None
+            if epoch == handed.epoch:
+                self._take(handed)
 
     def _keep_adjusted(self, event: Event) -> None:
         """Store the re-estimated matrix of a mobile camera in the model and in its file."""

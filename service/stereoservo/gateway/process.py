@@ -23,6 +23,7 @@ from zenoh.handlers import RingChannel
 from stereoservo.client.session import SessionError, close_session, open_session
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import Event
+from stereoservo.daemon.channels.reports import ReportIntake
 from stereoservo.daemon.heartbeat import (
     GATEWAY_HANG_S,
     REQUEST_S,
@@ -37,11 +38,9 @@ from stereoservo.daemon.ipc_messages import (
     RunPlan,
     decode_observation,
     load_plan,
-    report_decoder,
 )
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader
-from stereoservo.daemon.seqpacket import ChannelServer
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.cell_state import CellState
 from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
@@ -162,7 +161,7 @@ class Gateway:
             self.settings, plan.cell.calibration is not None and plan.cell.calibration.refine, self._models,
             self._servo, self.log, self._calibration, self._relocalization, taught, self._intake.running,
         )  # fmt: skip
-        self._reports = ChannelServer(directories.reports_socket)
+        self._reports = ReportIntake(directories.reports_socket)
         slots = [directories.observation_slot(name) for name in cameras]
         log = partial(write_log, "gateway")
         self._observations = [
@@ -170,7 +169,6 @@ class Gateway:
         ]
         self._previews = Previews(self._publishers.previews, directories)
         self._preview_boundary = RecordBoundary("preview pictures", log)
-        self._report_boundary = RecordBoundary("reports of vision processes and supervisor", log)
         self._declare()
         self._stop = StopThread(
             stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot
@@ -269,7 +267,7 @@ class Gateway:
         with self._preview_boundary:
             self._previews.poll()
         self._publish_state()
-        self._read_reports()
+        self._reports.poll(self._take_report)
         if time.monotonic() - self._steps_taken >= STEPS_EVERY_S:
             self._take_steps()
         self._recordings.poll()
@@ -395,7 +393,12 @@ class Gateway:
     def _core_event(self, event: Event) -> None:
         if event.kind == "reply":
             self._intake.core_reply(event)
+        missed = self._handled.missed_before(event)
+        if missed:
+            text = f"{missed} events of the servo process are lost: no gateway took them while they were kept"
+            self.log.add("warning", message=text, origin="gateway")
         if event.kind in SILENT:
+            self._handled.mark(event, acted=False)
             return
         self._intake.core_event(event)
         # A restarted gateway is sent the servo process's events again.
@@ -430,6 +433,8 @@ class Gateway:
     def _read_state(self) -> None:
         state = self._state.read()
         if state is not None:
+            self._calibration.take_epoch(state.status.model_epoch)
+            self._relocalization.take_epoch(state.status.model_epoch)
             self._refinement.take_state(state.status)
 
     def _newest_message(self) -> StateMessage | None:
@@ -447,7 +452,7 @@ class Gateway:
         """Bring the notes on what was left out up to date."""
         self._notes.tell("journal", self._journal.note)
         self._notes.tell("servo process", self._servo.note)
-        self._notes.tell("reports", self._report_boundary.note)
+        self._notes.tell("reports", self._reports.note)
         beat = self._supervisor.newest()
         self._notes.tell("supervisor", SUPERVISOR_SILENT if beat is not None and beat.silent_s(0.0) else "")
         for k, (_, boundary) in enumerate(self._observations):
@@ -461,13 +466,6 @@ class Gateway:
         state = self._newest_message()
         if state is not None and self._publishers.state.matching_status.matching:
             self._publishers.state.put(encode(state))
-
-    def _read_reports(self) -> None:
-        self._reports.accept()
-        for peer in self._reports.peers:
-            for data in peer.receive():
-                with self._report_boundary:
-                    self._take_report(report_decoder.decode(data))
 
     def _take_report(self, report: Report) -> None:
         if report.images is not None:

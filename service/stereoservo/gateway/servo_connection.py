@@ -12,12 +12,13 @@ import msgspec
 
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, encode
+from stereoservo.daemon.channels.seqpacket import ChannelError, PacketChannel
 from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
 from stereoservo.daemon.ipc_messages import (
     Ask,
     Heartbeat,
-    Hello,
     NewModel,
+    Received,
     ServoState,
     event_decoder,
     state_decoder,
@@ -26,7 +27,6 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.process_control import write_log
 from stereoservo.daemon.record_ring import RingReader
 from stereoservo.daemon.seqlock import SlotError, SlotReader
-from stereoservo.daemon.seqpacket import ChannelError, PacketChannel
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
@@ -73,7 +73,7 @@ class ServoConnection:
             if not self.connected:
                 self._control = _try(self._directories, "control_socket")
                 if self._control is not None:
-                    self._control.send(encode(Hello(self._last_event)))
+                    self._control.send(encode(Received(self._last_event)))
             if self._steps is None:
                 with suppress(SlotError):  # not there yet; tried again
                     self._steps = RingReader(self._directories.steps_ring)

@@ -386,6 +386,17 @@ class ReanchorRefused(
     unit: str = ""
 
 
+class ExtendLeases(
+    msgspec.Struct, frozen=True, tag="extend_leases", tag_field="command", forbid_unknown_fields=True
+):
+    """All leases, and what waits to be acknowledged, end by ``seconds`` later: nobody could hear the clients so long.
+
+    From the servo process; no client may send it, and it is not answered.
+    """
+
+    seconds: float
+
+
 Command = (
     RunGoal
     | RenewGoal
@@ -403,6 +414,7 @@ Command = (
     | Calibrate
     | Teach
     | ReanchorRefused
+    | ExtendLeases
 )
 
 

@@ -24,6 +24,8 @@ from stereoservo_sim.demonstration.scenario import (
 
 LOOK_EVERY_S = 2.0
 RECENT_EVENTS = 50
+LOOKS = 3
+"""For the event that tells why a cell is held: state and events come by ways of their own."""
 MOST_HOLDS = 20
 BUSY_COMPUTER = frozenset({"JOINT_STAMP", "LOOP_GAP"})
 """Codes of the stops of a simulated cell whose computer was busy."""
@@ -46,7 +48,7 @@ class LiveDemonstrator:
         self._progress = progress
         self._tell = tell
         self._looked_s = time.monotonic()
-        self._holds = 0
+        self._holds = self._looks = 0
         client.while_waiting = self._look
 
     def enable(self) -> None:
@@ -120,11 +122,16 @@ class LiveDemonstrator:
         if not any(reason.code == "HELD" for reason in state.reasons):
             return
         told = [
-            event.message
+            event
             for event in self._client.events(max(1, state.last_event - RECENT_EVENTS)).events
-            if event.kind == "held"
+            if event.kind in ("held", "resumed")
         ]
-        cause = told[-1] if told else "no event says why"
+        known = bool(told) and told[-1].kind == "held"
+        self._looks += 1
+        if not known and self._looks < LOOKS:
+            return
+        self._looks = 0
+        cause = told[-1].message if known else "no event says why"
         if not self._goes_on(SILENCE in cause, cause):
             raise ClientError(f"the cell was held and nobody resumed it: {cause}")
 

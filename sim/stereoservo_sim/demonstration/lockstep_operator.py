@@ -83,7 +83,7 @@ class LockstepOperator:
 
     def enable(self) -> None:
         """Enable, and wait until the arm may move. Raises LockstepRefusalError, LockstepTimeoutError."""
-        since = self.cell.events[-1].seq if self.cell.events else 0
+        since = self._last_event
         self._submit(Enable())
         self.cell.wait_for(lambda e: e.kind == "lifecycle" and e.name == Lifecycle.ACTIVE, 5.0, since - 1)
 
@@ -91,57 +91,64 @@ class LockstepOperator:
         """Run trial motions, fit in this process, send the model to the core. Raises LockstepRefusalError,
         CalibrationError.
         """
-        self.trials, end = self._measure(check=False)
+        self.trials = self._measure(check=False)
         self._epoch += 1
         model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
-        self._send_model(model, end)
+        self._send_model(model)
         return model
 
     def check(self, model: CellModel) -> CheckReport:
         """Run the check motion and test ``model`` with it. Raises LockstepRefusalError, CalibrationError."""
-        seen, _ = self._measure(check=True)
+        seen = self._measure(check=True)
         return check_model_holds(model, seen, limit_px=self.cell.settings.tolerance_px)
 
     def reset_zeros(self, model: CellModel) -> tuple[CellModel, ZeroReset]:
         """Run the check motion and send a model with corrected joint zeros to the core. Raises
         LockstepRefusalError, CalibrationError.
         """
-        seen, end = self._measure(check=True)
+        seen = self._measure(check=True)
         examined = examine_model(model, seen)
         report = make_check_report(examined, limit_px=self.cell.settings.tolerance_px)
         self._epoch += 1
         cured, reset = reset_zeros(examined, report, epoch=self._epoch)
-        self._send_model(cured, end)
+        self._send_model(cured)
         return cured, reset
 
-    def _send_model(self, model: CellModel, end: Event) -> None:
+    def _send_model(self, model: CellModel) -> None:
+        since = self._last_event
         self.cell.update_model(ModelUpdate(model))
-        self.cell.wait_for(lambda e: e.kind == "model", 5.0, end.seq)
+        self.cell.wait_for(
+            lambda e: e.kind == "model" and self.cell.status.model_epoch == model.epoch, 5.0, since
+        )
         self._body = model.marker_ids
 
-    def _measure(self, *, check: bool) -> tuple[TrialData, Event]:
-        """Run the calibration motion or the check motion; returns its measurements and the event that ended it."""
-        first = len(self.cell.events)
+    @property
+    def _last_event(self) -> int:
+        """Number of the last event so far. Taken before a request, since effects may come before its reply."""
+        return self.cell.events[-1].seq if self.cell.events else 0
+
+    def _measure(self, *, check: bool) -> TrialData:
+        """Run the calibration motion or the check motion; returns its measurements."""
+        first, since = len(self.cell.events), self._last_event
         goal_id = str(next(self._ids))
         self._submit(Calibrate(goal_id, check=check))
         ends = ("calibration_finished", "check_finished", "calibration_aborted")
         end = self.cell.wait_for(
             lambda e: e.id == goal_id and e.kind in ends,
-            CALIBRATION_TIMEOUT_S, self.cell.events[first].seq - 1,
+            CALIBRATION_TIMEOUT_S, since,
         )  # fmt: skip
         if end.kind == "calibration_aborted":
             raise LockstepRefusalError(end)
         job = TrialCollector(self.cell.settings)
         for event in self.cell.events[first:]:
             job.add(event)
-        return job.trials(), end
+        return job.trials()
 
     def teach(self, name: str, frames: int = 20) -> Event:
         """Store the current observations as goal ``name``. Raises LockstepRefusalError."""
-        reply = self._submit(Teach(name, frames))
-        event = self.cell.wait_for(
-            lambda e: e.name == name and e.kind in ("taught", "warning"), 30.0, reply.seq
-        )
+        since = self._last_event
+        self._submit(Teach(name, frames))
+        event = self.cell.wait_for(lambda e: e.name == name and e.kind in ("taught", "warning"), 30.0, since)
         if event.kind != "taught":
             raise LockstepRefusalError(event)
         self.taught[name] = feature_target(event, self._epoch, self._body)
@@ -150,8 +157,9 @@ class LockstepOperator:
     def goal(self, target: Target | str, *, timeout_s: float = 120.0, **options: object) -> Event:
         """Run a goal (a taught one by its name) to its end. Raises LockstepRefusalError when it is refused."""
         goal = self._goal(target, **options)
-        reply = self._submit(RunGoal(goal))
-        return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, reply.seq)
+        since = self._last_event
+        self._submit(RunGoal(goal))
+        return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, since)
 
     def planned(self, target: Target | str, **options: object) -> PlanReport:
         """Plan of a goal, without motion. Raises LockstepRefusalError when it is refused."""
@@ -168,5 +176,6 @@ class LockstepOperator:
     def home(self) -> Event:
         """Move home. Raises LockstepRefusalError."""
         goal_id = str(next(self._ids))
-        reply = self._submit(Home(goal_id))
-        return self.cell.wait_for(lambda e: e.id == goal_id and e.kind in TERMINAL, 120.0, reply.seq)
+        since = self._last_event
+        self._submit(Home(goal_id))
+        return self.cell.wait_for(lambda e: e.id == goal_id and e.kind in TERMINAL, 120.0, since)

@@ -11,7 +11,7 @@ from stereoservo.client import ClientError, FailedError
 from stereoservo.daemon.servo import SILENCE
 from stereoservo.messages.goals import TaughtTarget
 from stereoservo_sim.demonstration import live_demonstrator
-from stereoservo_sim.demonstration.live_demonstrator import BUSY_COMPUTER, MOST_HOLDS, LiveDemonstrator
+from stereoservo_sim.demonstration.live_demonstrator import BUSY_COMPUTER, LOOKS, MOST_HOLDS, LiveDemonstrator
 
 
 class HeldCell:
@@ -51,6 +51,34 @@ class HeldCell:
 @pytest.fixture(autouse=True)
 def _looks_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_demonstrator, "LOOK_EVERY_S", 0.0)
+
+
+class LateTold(HeldCell):
+    """Is held ``late`` looks before its events say so; until then the last of them is an older one."""
+
+    def __init__(self, late: int, last: tuple[str, str] | None) -> None:
+        super().__init__(1, f"held by {SILENCE}")
+        self.late, self.last = late, last
+
+    def events(self, first: int) -> Any:
+        self.late -= 1
+        heard = super().events(first).events[1:] if self.late < 0 else []
+        older = [] if self.last is None else [SimpleNamespace(kind=self.last[0], message=self.last[1])]
+        return SimpleNamespace(events=[*older, *heard])
+
+
+@pytest.mark.parametrize("late", range(LOOKS + 1))
+@pytest.mark.parametrize("last", [None, ("resumed", "by anna"), ("lifecycle", "active")])
+def test_a_state_that_is_told_before_its_event_is_waited_for(last: tuple[str, str] | None, late: int) -> None:
+    told: list[str] = []
+    cell: Any = LateTold(late, last)
+    demonstrator = LiveDemonstrator(cell, lambda _: None, told.append)
+    if late < LOOKS:
+        demonstrator.move({"j1": 0.0})
+        assert told == [f"held by {SILENCE}: resumed"]
+    else:
+        with pytest.raises(ClientError, match="no event says why"):
+            demonstrator.move({"j1": 0.0})
 
 
 @pytest.mark.parametrize("looks", [1, 3])

@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 
 from stereoservo.core.cycle import Event, ModelUpdate, encode
+from stereoservo.daemon.channels.seqpacket import PacketChannel
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_CAPACITY,
     OBSERVATION_LAYOUT,
     Ask,
     Heartbeat,
-    Hello,
     NewModel,
+    Received,
     ServoState,
     event_decoder,
     state_decoder,
@@ -30,7 +31,6 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.links import GatewayMessages, VisionLinks
 from stereoservo.daemon.lockstep import LockstepCell, LockstepLinks, MemoryLinks
 from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_slot, create_stop_slot
-from stereoservo.daemon.seqpacket import PacketChannel
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.daemon.vision import VisionSlots
 from stereoservo.kinematics.model import CellModel
@@ -90,7 +90,7 @@ class SocketLinks(ProcessLinks):
         self._vision = {name: VisionSlots(self.directories, name) for name in CAMERAS}
         self._stop_button = StopSlot(self.directories.stop_slot)
         self._gateway_end = PacketChannel.connect(self.directories.control_socket)
-        self._gateway_end.send(encode(Hello(0)))
+        self._gateway_end.send(encode(Received(0)))
 
     @property
     def state(self) -> ServoState:

@@ -51,6 +51,7 @@ from stereoservo.messages.goals import (
     Command,
     Disable,
     Enable,
+    ExtendLeases,
     Goal,
     Hold,
     Home,
@@ -210,6 +211,17 @@ def renew(command: RenewGoal, context: StepContext) -> str:
         f"goal {command.id} is not active; active: {goal_of(source) or 'none'}",
         subject=command.id,
     )
+
+
+def extend_leases(command: ExtendLeases, context: StepContext) -> None:
+    """Give clients the time in which nobody could hear them."""
+    state, by_ns = context.state, round(command.seconds * 1e9)
+    source = state.source
+    if MOTION_SOURCES[type(source)].leased:
+        cast(Leased, source).lease_until_ns += by_ns
+    elif isinstance(source, AwaitingAcknowledgement):
+        source.until_ns += by_ns
+    state.queued_until_ns = {goal: until_ns + by_ns for goal, until_ns in state.queued_until_ns.items()}
 
 
 def move_goal(command: UpdateGoal, context: StepContext) -> str:
@@ -529,6 +541,7 @@ _HANDLERS: dict[type[Any], Callable[[Any, Request, StepContext], str | Accepted 
     AcknowledgeGoal: _of_command(acknowledge),
     CancelGoal: _of_command(cancel),
     ReanchorRefused: _of_command(camera_relocalization.refused),
+    ExtendLeases: _of_command(extend_leases),
     Teach: start_teaching,
     Jog: _jog,
     OrderAuxiliary: _order_auxiliary,

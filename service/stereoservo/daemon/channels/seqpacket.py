@@ -43,8 +43,14 @@ class PacketChannel:
         """Connect to a server. Raises ChannelError where nobody listens."""
         check_socket_path(path)
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        connection.setblocking(False)
         try:
             connection.connect(str(path))
+        except BlockingIOError as error:  # its queue is full: it would be waited for as long as it hangs
+            connection.close()
+            raise ChannelError(
+                "unreachable", f"{path}: its process accepts no connection (it hangs?)"
+            ) from error
         except OSError as error:
             connection.close()
             raise ChannelError(
