@@ -18,6 +18,7 @@ import numpy as np
 from stereoservo.control.incidence_kernel import (
     METRIC_FLOOR,
     Constraints,
+    Regulation,
     SecondTask,
     fixed_dimension,
     incidence_kernel,
@@ -35,10 +36,11 @@ from stereoservo.control.mobility import (
 )
 from stereoservo.control.mobility_kernel import point_jacobian
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.composition import Composition
+from stereoservo.kinematics.composition import Composition, PresentArm
 from stereoservo.kinematics.kernels import image_jacobian, invert4
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import plain
 from stereoservo.planning.visibility_constraints import limit_pull
 
 KINDS = (
@@ -239,11 +241,12 @@ def incidence_step(
     if metric is None:
         metric = joint_metric(scene.operators, scene.matrices, scene.points)
     rest = no_second_task(n) if second is None else second
+    arm = PresentArm(scene.operators, int(scene.composition))
+    constraints = Constraints(task.kinds, task.markers, task.fixed, task.drift)
+    regulation = Regulation(task.tolerance_px, options.gain, options.dt_s, options.damping, metric)
     velocity, error, status, rank, conditioning, share = incidence_kernel(
-        scene.operators, int(scene.composition), scene.matrices, scene.points,
-        Constraints(task.kinds, task.markers, task.fixed, task.drift), task.tolerance_px, options.gain, options.dt_s,
-        options.damping, metric, rest,
-    )  # fmt: skip
+        plain(arm), scene.matrices, scene.points, plain(constraints), plain(regulation), plain(rest)
+    )
     return IncidenceStep(velocity, error, status, rank, conditioning, share)
 
 
