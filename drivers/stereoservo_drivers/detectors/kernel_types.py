@@ -30,7 +30,7 @@ def written(dtype: Any, dimensions: int) -> Any:
 
 
 def fields(*types_of_fields: Any) -> Any:
-    """Type of the fields of a record, as `stereoservo.numerics.compilation.plain` gives them."""
+    """Type of the fields of a record, see `stereoservo.numerics.compilation.Fields`."""
     return types.Tuple(types_of_fields)
 
 

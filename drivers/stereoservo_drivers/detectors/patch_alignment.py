@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import types
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from stereoservo.numerics.compilation import inlined_kernel, kernel, plain
+from stereoservo.numerics.compilation import Fields, inlined_kernel, kernel, plain
 from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, INT, compile_for, fields, given, written
 
 TEMPLATE_LEVELS = 4
@@ -266,11 +266,11 @@ class Warps(NamedTuple):
 
 @kernel
 def align_patches(
-    picture: ImageArray, templates: TemplateArrays, chosen: IntArray, iterations: int, warps: Warps
+    picture: ImageArray, templates: Fields, chosen: IntArray, iterations: int, warps: Fields
 ) -> None:
     """Move ``warps`` of the ``chosen`` (m,) templates until they fit ``picture``, all in pixels of its level.
 
-    Templates and warps are the fields of their records.
+    With the fields of `TemplateArrays` and of `Warps`.
     """
     half, averaged, steps, levels, squares = templates
     A, p, measured, outcome = warps

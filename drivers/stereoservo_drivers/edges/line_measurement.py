@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel, plain
 from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, fields, given, written
 
 STEP = 0.5
@@ -192,8 +192,8 @@ class EdgePlaces(NamedTuple):
 
 
 @kernel
-def fit_line(places: EdgePlaces, sign: float, half: float, reach: float, found: FloatArray) -> None:
-    """Line through those of the ``places`` (the fields of their record) whose slopes have ``sign``: ``found`` (7,)
+def fit_line(places: Fields, sign: float, half: float, reach: float, found: FloatArray) -> None:
+    """Line through those of the ``places`` (the fields of `EdgePlaces`) whose slopes have ``sign``: ``found`` (7,)
     gets how many profiles have a place on it (0: there is no line), offset, tilt, their covariance (1 1, 1 2, 2 2)
     [px²] and the places' rms distance from it.
 

@@ -19,7 +19,7 @@ from stereoservo.control.marker_groups import IN_PLANE, MarkerGroups, find_group
 from stereoservo.control.primitives_kernel import dot, minors
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel, plain
 
 LEAST_ALTITUDE = 10.0
 """Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
@@ -172,11 +172,10 @@ def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT
     more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
     do.
     """
+    shown, goal = (scene.points, scene.pixels, scene.weights), (task.target_points, task.target_known)
     face, triple, cameras, kept = _choose_face(
-        plain(faces), plain(ShownBody(scene.points, scene.pixels, scene.weights)),
-        plain(BodyGoal(task.target_points, task.target_known)), scene.camera_centres,
-        plain(Triangle(before.face, before.triple)),
-    )  # fmt: skip
+        plain(faces), shown, goal, scene.camera_centres, (before.face, before.triple)
+    )
     changed = before.cameras > 0 and (cameras == 0 or set(triple.tolist()) != set(before.triple.tolist()))
     return FaceChoice(face, triple, cameras, kept, changed)
 
@@ -556,9 +555,9 @@ def choose_face_step(
 
 @kernel
 def _choose_face(
-    known_faces: Faces, shown: ShownBody, goal: BodyGoal, camera_centres: FloatArray, before: Triangle
+    known_faces: Fields, shown: Fields, goal: Fields, camera_centres: FloatArray, before: Fields
 ) -> tuple[int, IntArray, int, FloatArray]:
-    """`choose_face_step` for Python: all but the centres are the fields of their records."""
+    """`choose_face_step` for Python, with the fields of all records."""
     return choose_face_step(
         Faces(*known_faces), ShownBody(*shown), BodyGoal(*goal), camera_centres, Triangle(*before)
     )

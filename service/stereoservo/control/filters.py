@@ -18,13 +18,12 @@ State is plain arrays, functions are pure.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel
 
 
 class TrackSettings(msgspec.Struct, frozen=True):
@@ -100,9 +99,9 @@ def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: Floa
     positions, rates, covariance = track.positions.copy(), track.rates.copy(), track.covariance.copy()
     stamps, tracked = track.stamps_s.copy(), track.tracked.copy()
     jumped = update_track(
-        plain(TrackArrays(positions, rates, covariance, stamps, tracked)), stamp_s,
-        np.ascontiguousarray(pixels, dtype=np.float64), np.ascontiguousarray(wanted, dtype=np.float64),
-        plain(TrackConstants(s.sigma_px, s.density_px2_s3, s.rate_px_s, s.jump_sigmas, s.gap_s)),
+        (positions, rates, covariance, stamps, tracked), stamp_s, np.ascontiguousarray(pixels, dtype=np.float64),
+        np.ascontiguousarray(wanted, dtype=np.float64),
+        (s.sigma_px, s.density_px2_s3, s.rate_px_s, s.jump_sigmas, s.gap_s),
     )  # fmt: skip
     return TargetTrack(
         s, positions, rates, covariance, stamps, tracked, stamp_s, track.ignored, track.jumps + int(jumped)
@@ -120,33 +119,13 @@ def predict(track: TargetTrack, t_s: float) -> tuple[FloatArray, FloatArray, Flo
     )
 
 
-class TrackArrays(NamedTuple):
-    """The arrays of a `TargetTrack`, with their shapes and units."""
-
-    positions: FloatArray
-    rates: FloatArray
-    covariance: FloatArray
-    stamps: FloatArray
-    tracked: FloatArray
-
-
-class TrackConstants(NamedTuple):
-    """`TrackSettings` for the kernel, in their order and units."""
-
-    sigma: float
-    density: float
-    rate: float
-    jump_sigmas: float
-    gap_s: float
-
-
 @kernel
 def update_track(
-    track: TrackArrays, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: TrackConstants
+    track: Fields, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: Fields
 ) -> bool:
     """One observation into a track's arrays; whether a marker jumped. See `observe`.
 
-    Track and constants are the fields of their records.
+    ``track``: the fields of `TargetTrack` from ``positions`` to ``tracked``; ``constants``: those of `TrackSettings`.
     """
     positions, rates, covariance, stamps, tracked = track
     sigma, density, rate, jump_sigmas, gap_s = constants

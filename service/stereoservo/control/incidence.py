@@ -17,8 +17,6 @@ import numpy as np
 
 from stereoservo.control.incidence_kernel import (
     METRIC_FLOOR,
-    Constraints,
-    Regulation,
     SecondTask,
     fixed_dimension,
     incidence_kernel,
@@ -36,7 +34,7 @@ from stereoservo.control.mobility import (
 )
 from stereoservo.control.mobility_kernel import point_jacobian
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.composition import Composition, PresentArm
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import image_jacobian, invert4
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
@@ -241,11 +239,13 @@ def incidence_step(
     if metric is None:
         metric = joint_metric(scene.operators, scene.matrices, scene.points)
     rest = no_second_task(n) if second is None else second
-    arm = PresentArm(scene.operators, int(scene.composition))
-    constraints = Constraints(task.kinds, task.markers, task.fixed, task.drift)
-    regulation = Regulation(task.tolerance_px, options.gain, options.dt_s, options.damping, metric)
+    arm, constraints = (
+        (scene.operators, int(scene.composition)),
+        (task.kinds, task.markers, task.fixed, task.drift),
+    )
+    regulation = (task.tolerance_px, options.gain, options.dt_s, options.damping, metric)
     velocity, error, status, rank, conditioning, share = incidence_kernel(
-        plain(arm), scene.matrices, scene.points, plain(constraints), plain(regulation), plain(rest)
+        arm, scene.matrices, scene.points, constraints, regulation, plain(rest)
     )
     return IncidenceStep(velocity, error, status, rank, conditioning, share)
 

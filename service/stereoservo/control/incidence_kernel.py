@@ -18,7 +18,7 @@ from stereoservo.control.laws.stereo import pixel_gradients
 from stereoservo.kinematics.composition import PresentArm, displace
 from stereoservo.kinematics.kernels import transform_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import damped_least_squares, right_singular
 
 
@@ -249,19 +249,24 @@ def _decomposed(J: FloatArray, e: FloatArray) -> Decomposition:
 
 @kernel
 def incidence_kernel(
-    arm: PresentArm, matrices: FloatArray, points: FloatArray, constraints: Constraints, regulation: Regulation,
-    second: SecondTask,
-) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:  # fmt: skip
+    arm: Fields,
+    matrices: FloatArray,
+    points: FloatArray,
+    constraints: Fields,
+    regulation: Fields,
+    second: Fields,
+) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
     """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
 
-    ``points`` (m, 4) in cameras ``matrices`` (c, 3, 4). The others are the fields of their records.
+    ``points`` (m, 4) in cameras ``matrices`` (c, 3, 4); the fields of a `PresentArm`, of `Constraints`, a `Regulation`
+    and a `SecondTask`.
     """
-    arm, constraints, second = PresentArm(*arm), Constraints(*constraints), SecondTask(*second)
+    held, rest = Constraints(*constraints), SecondTask(*second)
     tolerance_px, gain, dt_s, damping, metric = regulation
-    n, count = arm.operators.shape[0], constraints.kinds.shape[0]
+    n, count = arm[0].shape[0], held.kinds.shape[0]
     velocity = np.zeros(n)
     status = np.zeros(count, dtype=np.int64)
-    seen, linear = _linearized(arm, matrices, points, constraints, metric)
+    seen, linear = _linearized(PresentArm(*arm), matrices, points, held, metric)
     error = linear.error
     if not linear.finite:
         for k in range(count):
@@ -288,7 +293,7 @@ def incidence_kernel(
     for j in range(n):
         velocity[j] = gain * step[j]
     _feed_forward(velocity, linear, found, metric, damping)
-    _second_task(velocity, found, second, metric, damping)
+    _second_task(velocity, found, rest, metric, damping)
     return velocity, error, status, rank, found.conditioning, share
 
 

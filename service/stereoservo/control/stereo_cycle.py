@@ -14,7 +14,7 @@ import numpy as np
 
 from stereoservo.kinematics.kernels import Chain, invert4, transform_points_into, triangulate_into
 from stereoservo.numerics.arrays import FloatArray, KindArray
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import add_pixel_equations, damped_solve
 
 DAMPING = 1e-6
@@ -174,12 +174,17 @@ def _add_point(
 
 @kernel
 def stereo_cycle(
-    arm: StereoArm, q: FloatArray, target_points: FloatArray, sighted: Sighted, options: CycleOptions,
+    arm: Fields,
+    q: FloatArray,
+    target_points: FloatArray,
+    sighted: Fields,
+    options: Fields,
     velocity: FloatArray,
-) -> float:  # fmt: skip
+) -> float:
     """`StereoCycle.step` into ``velocity`` (n,); returns the conditioning.
 
-    Arm, with its chain, sights and options are the fields of their records; ``target_points`` (m, 4).
+    The fields of a `StereoArm`, with those of its chain, of a `Sighted` and of `CycleOptions`; ``target_points``
+    (m, 4).
     """
     chain, squares, matrices, marker_points = arm
     pixels, set_points, weights = sighted
@@ -281,10 +286,10 @@ class StereoCycle:
         marker_points: FloatArray,
         tip_first: bool = False,
     ) -> None:
-        chain = Chain(np.ascontiguousarray(generators), kinds, zero, tip_first)
+        chain = (np.ascontiguousarray(generators), kinds, zero, tip_first)
         squares = np.ascontiguousarray(generators @ generators)
         self._points = np.ascontiguousarray(marker_points)
-        self._arm = plain(StereoArm(plain(chain), squares, np.ascontiguousarray(matrices), self._points))
+        self._arm = (chain, squares, np.ascontiguousarray(matrices), self._points)
 
     def step(
         self,
@@ -306,6 +311,5 @@ class StereoCycle:
         velocity = np.empty(len(q))
         mean = target_points is not None
         targets = target_points if target_points is not None else self._points
-        sighted = plain(Sighted(pixels, set_points, weights))
-        options = plain(CycleOptions(gain, damping, mean, triangulations))
+        sighted, options = (pixels, set_points, weights), (gain, damping, mean, triangulations)
         return velocity, stereo_cycle(self._arm, q, targets, sighted, options, velocity)

@@ -20,7 +20,13 @@ from stereoservo.numerics.kernel_cache import KernelCache
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
-_R = TypeVar("_R", bound=tuple[Any, ...])
+Fields = tuple[Any, ...]
+"""The fields of a record in a plain tuple, as a kernel takes them that Python calls in each step or frame.
+
+numba looks up the type of a NamedTuple anew at every call from Python, for more than a microsecond; that of a plain
+tuple by what is in it, for a tenth of that. The kernel unpacks the fields in their order, or makes the record of them:
+``View(*view)``.
+"""
 
 LOG_VARIABLE = "STEREOSERVO_COMPILE_LOG"
 """Environment variable: a file to which every process appends a line of JSON for each signature that it compiles."""
@@ -65,14 +71,9 @@ def reassociating_kernel(function: _F) -> _F:
     return _compile(function, fastmath={"reassoc", "nsz", "contract"})
 
 
-def plain(record: _R) -> _R:
-    """The fields of a NamedTuple as a plain tuple, for a kernel that Python calls in each step or frame.
-
-    numba looks up the type of a NamedTuple anew at every call, for more than a microsecond; that of a plain tuple by
-    what is in it, for a tenth of that. The kernel unpacks its fields in their order, or makes the record of them:
-    ``View(*view)``.
-    """
-    return cast(_R, tuple(record))
+def plain(record: tuple[Any, ...]) -> Fields:
+    """The `Fields` of a NamedTuple."""
+    return tuple(record)
 
 
 def overloads() -> Iterator[Overload]:

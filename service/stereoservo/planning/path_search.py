@@ -23,7 +23,7 @@ import numpy as np
 
 from stereoservo.kinematics.composition import Composition
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel, plain
 from stereoservo.planning.motion_frame import (
     EXPONENTIAL,
     FIRST,
@@ -324,26 +324,25 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
     # an arm that lacks freedoms leaves the path between its ends
     tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
     constraints = _unlimited(p.constraints) if unconstrained else p.constraints
-    arm = Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias)
     broken, reached = _go_on(
-        plain(Way(int(p.stage), p.path, p.residual, p.joint_step)), plain(SampleRange(p.sample, until)),
-        plain(constraints), plain(arm), plain(Following(len(p.joints) > p.rank, tolerance)),
-        plain(PathRecord(p.all_joints, p.all_displacements, p.table)),
+        (int(p.stage), p.path, p.residual, p.joint_step), (p.sample, until), plain(constraints),
+        (int(p.request.composition), p.operators, p.joints, p.displacement, p.bias),
+        (len(p.joints) > p.rank, tolerance), (p.all_joints, p.all_displacements, p.table),
     )  # fmt: skip
     return int(broken), int(reached)
 
 
 @kernel
 def _go_on(
-    way: Way, some: SampleRange, constraints: Constraints, arm: Arm, following: Following, record: PathRecord
+    way: Fields, some: Fields, constraints: Fields, arm: Fields, following: Fields, record: Fields
 ) -> tuple[int, int]:
-    """Kind of limit broken or −1, and where, of ``some`` samples (`path_ik`). All are the fields of their records."""
-    way, some, bounds, kept = Way(*way), SampleRange(*some), Constraints(*constraints), PathRecord(*record)
-    if way.stage == CLOSED_FORM:
-        return check_path(way, some, bounds, kept)
-    if way.stage == STRAIGHT_IN_JOINTS:
-        return follow_joint_line(way, some, bounds, Arm(*arm), kept)
-    return follow_path(way, some, bounds, Arm(*arm), Following(*following), kept)
+    """Kind of limit broken or −1, and where, of samples of a way (`path_ik`), with the fields of all records."""
+    tried, span, bounds, kept = Way(*way), SampleRange(*some), Constraints(*constraints), PathRecord(*record)
+    if tried.stage == CLOSED_FORM:
+        return check_path(tried, span, bounds, kept)
+    if tried.stage == STRAIGHT_IN_JOINTS:
+        return follow_joint_line(tried, span, bounds, Arm(*arm), kept)
+    return follow_path(tried, span, bounds, Arm(*arm), Following(*following), kept)
 
 
 def _unlimited(constraints: Constraints) -> Constraints:

@@ -8,10 +8,9 @@ import numpy as np
 
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.laws.image import image
-from stereoservo.control.laws.points import PointTask, step_by_points
-from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS, gains_of, limited
+from stereoservo.control.laws.points import step_by_points
+from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS, held_gain, limited
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import plain
 
 
 def stereo_block(scene: Scene, task: Task, options: Options) -> LawStep:
@@ -54,7 +53,7 @@ def euclidean_points(
         )
         seen = (_seen(scene, task) > 0.0).astype(np.float64)
         velocity, conditioning = step_by_points(
-            operators, plain(PointTask(X, X_star, seen, metres)), plain(gains_of(options, jacobian))
+            operators, (X, X_star, seen, metres), (held_gain(options), int(jacobian), options.damping)
         )
         return limited(scene, task, options, velocity, conditioning)
 

@@ -22,7 +22,7 @@ from stereoservo.calibration.change.hypothesis_test import (
 )
 from stereoservo.kinematics.kernels import exp_twist, multiply4_into
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import NormalSystem, add_pixel_equations, damped_solve
 
 NOTHING, CAMERA, CAMERAS, MARKER, JOINT, JOINTS, UNEXPLAINED = range(7)
@@ -245,7 +245,7 @@ class Explanations(NamedTuple):
 
 
 @kernel
-def _predict(shown: Innovations, pixels: FloatArray, observed: FloatArray) -> tuple[float, float]:
+def _predict(shown: Fields, pixels: FloatArray, observed: FloatArray) -> tuple[float, float]:
     """``pixels`` (c, p, 2) as predicted and ``observed``, where seen; chi-square and rms [px] of the innovations."""
     Ps, X, _, innovations, weights, _, _ = shown
     chi2, square_px, seen = 0.0, 0.0, 0.0
@@ -268,10 +268,10 @@ def _predict(shown: Innovations, pixels: FloatArray, observed: FloatArray) -> tu
 
 @kernel
 def explain_innovations(
-    seen: Innovations, thresholds: FloatArray, log_alpha: float, least_px: float, found: Explanations
+    seen: Fields, thresholds: FloatArray, log_alpha: float, least_px: float, found: Fields
 ) -> None:
-    """Estimates of all hypotheses and the decision among them, into ``found``; it and ``seen`` are the fields of their
-    records. ``thresholds``, ``log_alpha`` and ``least_px`` are those of a `hypothesis_test.Thresholds`.
+    """Estimates of all hypotheses and the decision among them, into ``found``, the fields of `Explanations`; ``seen``:
+    those of `Innovations`. ``thresholds``, ``log_alpha`` and ``least_px`` are those of a `hypothesis_test.Thresholds`.
     """
     Ps, X, markers, _, weights, operators, twists = seen
     sizes, chi2, amounts, effects, answer = found

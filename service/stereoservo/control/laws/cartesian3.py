@@ -42,7 +42,7 @@ from stereoservo.kinematics.composition import PresentArm
 from stereoservo.kinematics.kernels import multiply4_into, transform_points, transform_points_into
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.planning.primitives import (
     HINGE,
     PLANAR,
@@ -440,10 +440,8 @@ def cartesian3_step(
 
 
 @kernel
-def _normalised_step(
-    arm: PresentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped
-) -> None:
-    """`_normalised_step_into` for Python: all but ``eyes`` are the fields of their records."""
+def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields, stepped: Fields) -> None:
+    """`_normalised_step_into` for Python, with the fields of all records."""
     _normalised_step_into(PresentArm(*arm), BodyTask(*task), eyes, Rates(*rates), Stepped(*stepped))
 
 
@@ -473,12 +471,13 @@ def cartesian3_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> 
 
 def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:
     """The step of a law with ``count`` components, 3 or 2, each at the gain of ``options``."""
-    body = BodyTask(scene.points, task.target_points, task.face, task.centre, task.centre_target)
-    rates = Rates(options.gain, options.dt_s, options.rotation_rate, options.translation_rate)
-    stepped = Stepped(np.empty(len(scene.operators)), np.empty((2, count)), np.empty(count, np.int64))
-    arm = PresentArm(scene.operators, int(scene.composition))
-    _normalised_step(plain(arm), plain(body), scene.camera_centres, plain(rates), plain(stepped))
-    return LawStep(stepped.velocity, stepped.components[0], stepped.components[1], stepped.shown, 1.0)
+    velocity, components = np.empty(len(scene.operators)), np.empty((2, count))
+    status = np.empty(count, np.int64)
+    body = (scene.points, task.target_points, task.face, task.centre, task.centre_target)
+    rates = (options.gain, options.dt_s, options.rotation_rate, options.translation_rate)
+    arm = (scene.operators, int(scene.composition))
+    _normalised_step(arm, body, scene.camera_centres, rates, (velocity, components, status))
+    return LawStep(velocity, components[0], components[1], status, 1.0)
 
 
 def cartesian_reasons(

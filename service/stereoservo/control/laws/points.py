@@ -18,14 +18,14 @@ from stereoservo.control.laws.stereo import (
     MEAN,
     Gains,
     gain_held,
-    gains_of,
+    held_gain,
     image_reasons,
     limited,
     pixel_gradients,
     velocities_into,
 )
 from stereoservo.numerics.arrays import FloatArray, Record
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import add_equation, damped_solve
 
 
@@ -106,8 +106,8 @@ def points_step(operators: FloatArray, task: PointTask, gains: Gains) -> tuple[F
 
 
 @kernel
-def step_by_points(operators: FloatArray, task: PointTask, gains: Gains) -> tuple[FloatArray, float]:
-    """`points_step` for Python: task and gains are the fields of their records."""
+def step_by_points(operators: FloatArray, task: Fields, gains: Fields) -> tuple[FloatArray, float]:
+    """`points_step` for Python, with the fields of a `PointTask` and of `Gains`."""
     return points_step(operators, PointTask(*task), Gains(*gains))
 
 
@@ -138,12 +138,11 @@ def points(scene: Scene, task: Task, options: Options) -> LawStep:
     With the mean Jacobian ``Ĥ_j (M + M*)/2`` the motion is the screw from here to the goal, from anywhere short of
     half a turn. There is no fixed depth in space: that choice is the present points.
     """
-    measured = PointTask(
+    measured = (
         scene.points, task.target_points, _seen(scene, task), pixel_metrics(scene.matrices, scene.points)
-    )
-    velocity, conditioning = step_by_points(
-        scene.operators, plain(measured), plain(gains_of(options, options.jacobian))
-    )
+    )  # fmt: skip
+    gains = (held_gain(options), int(options.jacobian), options.damping)
+    velocity, conditioning = step_by_points(scene.operators, measured, gains)
     return limited(scene, task, options, velocity, conditioning)
 
 

@@ -26,7 +26,7 @@ from stereoservo.control.law import (
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, Record
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import NormalSystem, add_pixel_equations, damped_solve
 
 ILL_CONDITIONED = 1e-5
@@ -191,8 +191,10 @@ def _image_step_into(
 
 
 @kernel
-def _image_step(operators: FloatArray, view: View, body: Body, gains: Gains, velocity: FloatArray) -> float:
-    """`_image_step_into` for Python: view, body and gains are the fields of their records."""
+def _image_step(
+    operators: FloatArray, view: Fields, body: Fields, gains: Fields, velocity: FloatArray
+) -> float:
+    """`_image_step_into` for Python, with the fields of a `View`, a `Body` and of `Gains`."""
     return _image_step_into(operators, View(*view), Body(*body), Gains(*gains), velocity)
 
 
@@ -257,23 +259,17 @@ def held_gain(options: Options) -> float:
     return float(gain_held(options.gain, options.dt_s))
 
 
-def gains_of(options: Options, jacobian: int) -> Gains:
-    """The gains of a velocity that is held, with this choice of the Jacobian."""
-    return Gains(held_gain(options), int(jacobian), options.damping)
-
-
 def image_velocity_step(
     scene: Scene, task: Task, options: Options, jacobian: int, rates: FloatArray
 ) -> LawStep:
     """The kernel's step for a choice of the Jacobian and a feed-forward (c, m, 2) [px/s]."""
-    view = View(
+    view = (
         scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted
-    )
-    body = Body(scene.points, task.target_points, task.target_known)
+    )  # fmt: skip
+    body = (scene.points, task.target_points, task.target_known)
+    gains = (held_gain(options), int(jacobian), options.damping)
     velocity = np.empty(len(scene.operators))
-    conditioning = _image_step(
-        scene.operators, plain(view), plain(body), plain(gains_of(options, jacobian)), velocity
-    )
+    conditioning = _image_step(scene.operators, view, body, gains, velocity)
     return limited(scene, task, options, velocity, conditioning)
 
 

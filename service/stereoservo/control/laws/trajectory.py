@@ -15,7 +15,7 @@ from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, jo
 from stereoservo.kinematics.composition import PresentArm
 from stereoservo.kinematics.kernels import project_points, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import kernel, plain
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import NormalSystem, cholesky_solve, damped_solve
 
 JOINT_SHARE = 1e-4
@@ -56,13 +56,13 @@ class HeldStep(NamedTuple):
 
 @kernel
 def trajectory_step(
-    arm: PresentArm, view: View, points: FloatArray, plan: PlannedJoints, held_step: HeldStep
+    arm: Fields, view: Fields, points: FloatArray, plan: Fields, held_step: Fields
 ) -> tuple[FloatArray, float]:
     """Joint velocity (n,) and conditioning; for ``dt_s`` > 0 refined by Newton's method on the images.
 
-    All but ``points`` are the fields of their records.
+    The fields of a `PresentArm`, a `View`, of `PlannedJoints` and of a `HeldStep`; ``points`` (m, 4).
     """
-    view, plan = View(*view), PlannedJoints(*plan)
+    seen, joints = View(*view), PlannedJoints(*plan)
     operators, composition = arm
     gain, dt_s, damping = held_step
     n = operators.shape[0]
@@ -70,15 +70,15 @@ def trajectory_step(
     known = np.zeros(points.shape[0])
     held = -math.expm1(-gain * dt_s) / dt_s if dt_s > 0.0 else gain
     N, b = np.empty((n, n)), np.empty(n)
-    image_equations_into(operators, view, Body(points, points, known), held, 0, NormalSystem(N, b))
-    planned = plan.rates.shape[0] == n
+    image_equations_into(operators, seen, Body(points, points, known), held, 0, NormalSystem(N, b))
+    planned = joints.rates.shape[0] == n
     if planned:
         largest = 0.0
         for j in range(n):
             largest = max(largest, N[j, j])
         for j in range(n):
-            pull[j] = damping * largest + plan.weight * JOINT_SHARE * N[j, j]
-            meant[j] = plan.rates[j] + plan.weight * held * plan.error[j]
+            pull[j] = damping * largest + joints.weight * JOINT_SHARE * N[j, j]
+            meant[j] = joints.rates[j] + joints.weight * held * joints.error[j]
             if not math.isfinite(pull[j] * meant[j]):
                 return x, 0.0
             N[j, j] += pull[j]
@@ -88,7 +88,7 @@ def trajectory_step(
         conditioning = damped_solve(N, b, damping, x)
     if dt_s > 0.0 and conditioning != 0.0:
         present, longer = PresentArm(operators, composition), HeldStep(held, dt_s, damping)
-        _refine(present, view, points, Pull(pull, meant, planned), longer, x)
+        _refine(present, seen, points, Pull(pull, meant, planned), longer, x)
     return x, conditioning
 
 
@@ -175,23 +175,14 @@ def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
             f"an arm of {n} joints takes {n} planned rates and errors, or none of both; got "
             f"{len(task.joint_rates)} and {len(task.joint_error)}"
         )
-    view = View(
-        scene.matrices,
-        scene.camera_centres,
-        scene.pixels,
-        task.set_points,
-        task.rates,
-        scene.weights,
-        task.wanted,
-    )
-    plan = PlannedJoints(task.joint_rates, task.joint_error, task.joint_weight)
+    view = (
+        scene.matrices, scene.camera_centres, scene.pixels, task.set_points, task.rates, scene.weights, task.wanted
+    )  # fmt: skip
+    plan = (task.joint_rates, task.joint_error, task.joint_weight)
     velocity, conditioning = trajectory_step(
-        plain(PresentArm(scene.operators, int(scene.composition))),
-        plain(view),
-        scene.points,
-        plain(plan),
-        plain(HeldStep(options.gain, options.dt_s, options.damping)),
-    )
+        (scene.operators, int(scene.composition)), view, scene.points, plan,
+        (options.gain, options.dt_s, options.damping),
+    )  # fmt: skip
     return limited(scene, task, options, velocity, conditioning)
 
 
