@@ -33,10 +33,12 @@ class StereoArm(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Of a chain at some joints: its ``exponentials`` (n, 4, 4) in the order of the chain, and the product of those
-    that stand left of each, ``before`` (n + 1, 4, 4), H̄.
+    """Of a chain of ``generators`` (n, 4, 4) at some joints: its ``exponentials`` (n, 4, 4) in the order of the chain,
+    and the product of those that stand left of each, ``before`` (n + 1, 4, 4), H̄; ``tip_first`` as in `Chain`.
     """
 
+    generators: FloatArray
+    tip_first: bool
     exponentials: FloatArray
     before: FloatArray
 
@@ -78,9 +80,9 @@ class CycleOptions(NamedTuple):
 
 @kernel
 def _factors_into(chain: Chain, squares: FloatArray, q: FloatArray, factors: Factors) -> None:
-    """The factors of a chain at ``q`` (n,)."""
+    """The factors of a chain at ``q`` (n,); ``squares`` (n, 4, 4) of its generators."""
     generators, kinds, zero, tip_first = chain
-    E, B = factors
+    _, _, E, B = factors
     n = q.shape[0]
     for i in range(4):
         for k in range(4):
@@ -108,11 +110,10 @@ def _factors_into(chain: Chain, squares: FloatArray, q: FloatArray, factors: Fac
 
 @kernel
 def _add_point(
-    arm: StereoArm, factors: Factors, points: PlacedPoints, p: int, share: float, point_rows: PointRows
+    factors: Factors, matrices: FloatArray, points: PlacedPoints, p: int, share: float, point_rows: PointRows
 ) -> None:
     """``share`` times the rows of point ``p`` onto ``point_rows``, whose gradients are scratch."""
-    generators, tip_first, matrices = arm.chain.generators, arm.chain.tip_first, arm.matrices
-    E, B = factors
+    generators, tip_first, E, B = factors
     M, M0 = points
     rows, g = point_rows
     n, cameras = E.shape[0], matrices.shape[0]
@@ -190,10 +191,10 @@ def stereo_cycle(
     pixels, set_points, weights = sighted
     gain, damping, mean, triangulations = options
     n, cameras, markers = q.shape[0], matrices.shape[0], marker_points.shape[0]
-    record = StereoArm(Chain(*chain), squares, matrices, marker_points)
+    generators, kinds, zero, tip_first = chain
     E, B = np.empty((n, 4, 4)), np.empty((n + 1, 4, 4))
-    factors = Factors(E, B)
-    _factors_into(record.chain, squares, q, factors)
+    factors = Factors(generators, tip_first, E, B)
+    _factors_into(Chain(generators, kinds, zero, tip_first), squares, q, factors)
     M, M0 = np.empty((markers, 4)), marker_points
     transform_points_into(B[n], marker_points, M)
     back = B[n]
@@ -224,9 +225,9 @@ def stereo_cycle(
                 rows[c, 1, j] = 0.0
         if not seen:
             continue
-        _add_point(record, factors, PlacedPoints(M, M0), p, 0.5 if mean else 1.0, point_rows)
+        _add_point(factors, matrices, PlacedPoints(M, M0), p, 0.5 if mean else 1.0, point_rows)
         if mean:
-            _add_point(record, factors, PlacedPoints(target_points, T0), p, 0.5, point_rows)
+            _add_point(factors, matrices, PlacedPoints(target_points, T0), p, 0.5, point_rows)
         for c in range(cameras):
             w = weights[c, p]
             if not w > 0.0:
