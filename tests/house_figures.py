@@ -27,6 +27,8 @@ SERVICE = PRODUCT[0]
 
 STEADY_FILES, STEADY_HOPS, ACCEPTING_FILES, IMAGE_FILES = 12, 40, 20, 18
 FOLDER_MODULES, MODULE_LINES, FUNCTION_LINES = 20, 600, 80
+KERNEL_ARGUMENTS, CORE_KERNELS = 6, 33
+"""Arguments of a kernel; and kernels of the core that have more, as long as there are any."""
 LAWS = ("stereo", "cartesian3")
 LAW_NAMES = re.compile(r"""["'](stereo|cartesian3|cartesian2)["']""")
 """Names that are nothing but laws: `image`, `points` and `trajectory` are words of other things, too."""
@@ -243,6 +245,50 @@ def function_figure() -> Figure:
     return Figure(f"functions above {FUNCTION_LINES} lines", len(beyond), 0, tuple(beyond))
 
 
+def kernel_arguments() -> dict[str, list[str]]:
+    """Of each module, the kernels that have too many arguments, and how many."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for path in modules():
+        for name, count in _kernels(ast.parse(path.read_text())):
+            if count > KERNEL_ARGUMENTS:
+                found[_name(path)].append(f"{name} {count}")
+    return found
+
+
+def _kernels(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Functions with a decorator of `numerics.compilation`, each with the number of its arguments."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        decorators = {
+            inner.id for one in node.decorator_list for inner in ast.walk(one) if isinstance(inner, ast.Name)
+        }
+        if any(name.endswith("kernel") for name in decorators):
+            a = node.args
+            yield node.name, len(a.posonlyargs + a.args + a.kwonlyargs)
+
+
+def argument_figures() -> list[Figure]:
+    """Kernels with too many arguments: in the core, where there may be no more than there were, and elsewhere."""
+    found = kernel_arguments()
+    figures = []
+    for where, limit in (("in the core", CORE_KERNELS), ("elsewhere", 0)):
+        mine = {
+            path: names
+            for path, names in found.items()
+            if path.startswith("service/stereoservo/core/") == (where == "in the core")
+        }
+        figures.append(
+            Figure(
+                f"kernels with more than {KERNEL_ARGUMENTS} arguments, {where}",
+                sum(map(len, mine.values())),
+                limit,
+                tuple(f"{path}: {', '.join(names)}" for path, names in mine.items()),
+            )
+        )
+    return figures
+
+
 def circle_figure() -> Figure:
     """Groups of modules that import each other when they are loaded."""
     imports = {_dotted(path): path for path in modules()}
@@ -326,7 +372,8 @@ def modules_with_law_names() -> list[str]:
 
 def main() -> int:
     """Print all figures; 1 where one is beyond its limit."""
-    figures = [folder_figure(), module_figure(), function_figure(), circle_figure(), *path_figures()]
+    sizes = [folder_figure(), module_figure(), function_figure(), *argument_figures()]
+    figures = [*sizes, circle_figure(), *path_figures()]
     for figure in figures:
         print(f"{'ok  ' if figure.within else 'OVER'} {figure.name}: {figure.value} (limit {figure.limit})")
         for item in figure.items:

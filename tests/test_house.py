@@ -28,6 +28,26 @@ def test_no_function_is_beyond_its_limit():
     assert house.function_figure().items == ()
 
 
+def test_kernels_have_few_arguments():
+    """Those of the core that have more only become fewer: whoever takes one away lowers `CORE_KERNELS`."""
+    core, elsewhere = house.argument_figures()
+    assert elsewhere.items == ()
+    assert core.value == house.CORE_KERNELS, core.items
+
+
+def test_arguments_of_every_kind_of_kernel_are_counted(tmp_path, monkeypatch):
+    module = tmp_path / "service/stereoservo/module.py"
+    module.parent.mkdir(parents=True)
+    seven = ", ".join("abcdefg")
+    module.write_text(
+        f"@kernel\ndef few(a, b, c, d, e, f): ...\n@reassociating_kernel\ndef many({seven}): ...\n"
+        f"@kernel\ndef by_name(a, b, c, d, *, e, f, g): ...\ndef no_kernel({seven}): ...\n"
+    )
+    monkeypatch.setattr(house, "ROOT", tmp_path)
+    monkeypatch.setattr(house, "PRODUCT", (module.parent,))
+    assert house.kernel_arguments() == {"service/stereoservo/module.py": ["many 7", "by_name 7"]}
+
+
 @pytest.mark.parametrize("law", house.LAWS)
 def test_a_servo_step_enters_few_files(law):
     steady, accepting = house.servo_paths(law)

@@ -21,7 +21,7 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
-from stereoservo_drivers.detectors.frame_images import gray_image
+from stereoservo_drivers.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 
 SIGMA_PX = 0.1

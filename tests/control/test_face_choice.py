@@ -13,6 +13,7 @@ from stereoservo.control.faces import (
     NOT_CHOSEN,
     FaceChoice,
     Faces,
+    Triangle,
     choose_face,
     choose_triangle,
     kept_faces,
@@ -120,10 +121,10 @@ def test_sights_along_a_way_are_those_of_the_truth(virtual):
     led = [faces.markers()[f][0] for f in sights.lead]
     assert [a for a, b in pairwise([-1, *led]) if a != b] + [led[-1]] == [-1, 0, 4, 8]
     targets = world.hidden(body.at(poses[-1]))
-    assert len(kept_faces(*faces, points, targets, world.matrices, world.camera_centres)) == 0
+    assert len(kept_faces(faces, points, targets, world.matrices, world.camera_centres)) == 0
     middle = world.hidden(body.at(poses[6]))
     np.testing.assert_array_equal(
-        kept_faces(*faces, points, middle, world.matrices, world.camera_centres),
+        kept_faces(faces, points, middle, world.matrices, world.camera_centres),
         faces.triples[[0 in m for m in faces.markers()]],
     )
 
@@ -139,7 +140,7 @@ def test_the_face_that_a_law_works_on_leads_in_whatever_order_they_are(virtual):
         chosen = choose_face(faces, scene_of(body, T, rng, noise=0.0), task_of(body, T)).face
         turned = Faces(*(array[::-1].copy() for array in faces[:3]), faces.body)
         for one in (faces, turned):
-            kept = kept_faces(*one, points, points, world.matrices, world.camera_centres)
+            kept = kept_faces(one, points, points, world.matrices, world.camera_centres)
             assert len(kept) == 2
             np.testing.assert_array_equal(kept[0], faces.triples[chosen])
 
@@ -248,7 +249,9 @@ def test_many_markers_of_a_face_are_tried_by_those_that_are_spread_out(virtual):
         assert len(set(tried.tolist())) == min(count, MOST_TRIED)
         assert (np.diff(tried) > 0).all()
         members, none = np.ones((1, count)), np.zeros(3, np.int64)
-        _, triple, cameras = choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, -2, none)
+        _, triple, cameras = choose_triangle(
+            members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none)
+        )
         assert cameras == 2
         _, area = triangle_sight(*triple, pixels, weights)
         sides = rng.integers(0, count, (3, 20_000))
@@ -257,5 +260,7 @@ def test_many_markers_of_a_face_are_tried_by_those_that_are_spread_out(virtual):
         weights[:, triple[0]] = 0.0
         assert (
             triple[0]
-            not in choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, -2, none)[1]
+            not in choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none))[
+                1
+            ]
         )

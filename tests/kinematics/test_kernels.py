@@ -61,7 +61,8 @@ def test_forward_kinematics_is_the_references(seed, kinds):
     assert np.abs(H - chain.displacement(q)).max() < 1e-10
     assert np.abs(operators - chain.operators_at(q)).max() < 1e-10
     again, operators_again = np.full((4, 4), np.nan), np.full(operators.shape, np.nan)
-    kernels.chain_forward_into(chain.generators, chain.kind_codes, chain.zero, q, again, operators_again)
+    record = kernels.Chain(chain.generators, chain.kind_codes, chain.zero, False)
+    kernels.chain_forward_into(record, q, again, operators_again)
     assert again.tobytes() == H.tobytes()
     assert operators_again.tobytes() == operators.tobytes()
     turned = ProjectiveChain(chain.kinds, chain.generators, chain.zero, tip_first=True)

@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from stereoservo.planning.path_ik import Arm, PathRecord, follow_path, freedoms, reach
+from stereoservo.planning.path_ik import (
+    Arm,
+    Following,
+    PathRecord,
+    SampleRange,
+    Way,
+    follow_path,
+    freedoms,
+    reach,
+)
 from stereoservo.planning.planner import plan, start_planning
 from stereoservo.planning.tracking import sample_plan
 from stereoservo.planning.visibility_constraints import NOT_REACHABLE, empty_table, moved
@@ -14,7 +23,8 @@ def along(planning, samples, tolerance=2.0):
     p, n = planning, len(planning.joints)
     arm = Arm(0, p.start_operators.copy(), p.joints.copy(), np.eye(4), np.zeros(n))
     record = PathRecord(np.zeros((samples, n)), np.zeros((samples, 4, 4)), empty_table())
-    return follow_path(p.path, 0, samples, p.constraints, p.residual, arm, False, tolerance, record)
+    way, following = Way(0, p.path, p.residual, p.joint_step), Following(False, tolerance)
+    return follow_path(way, SampleRange(0, samples), p.constraints, arm, following, record)
 
 
 def test_too_few_samples_are_noticed_between_them(virtual, cells):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import kernel, plain
 from stereoservo.ports.devices import Prior
 from stereoservo_drivers.detectors.centroids import measure
 from stereoservo_drivers.detectors.components import (
@@ -27,7 +29,9 @@ from stereoservo_drivers.detectors.components import (
     SUM_U,
     SUM_V,
     TOP,
+    Picture,
     Scratch,
+    Sought,
     join_runs,
 )
 from stereoservo_drivers.detectors.face_fit import whole
@@ -37,14 +41,13 @@ from stereoservo_drivers.detectors.kernel_types import (
     FLOAT,
     IMAGE,
     INT,
-    INT32,
-    SINGLE,
+    SCRATCH,
     WORD,
     compile_for,
+    fields,
     given,
-    written,
 )
-from stereoservo_drivers.detectors.patterns import find_faces
+from stereoservo_drivers.detectors.patterns import SearchedFaces, find_faces
 
 SHRINK_FROM = 240
 """Least side of an image [px] that is searched, not measured, at half its size: a third of the time, half
@@ -80,8 +83,9 @@ def noise_level(image):
 
 
 @kernel
-def _mask_runs(mask, words, columns, runs):
-    """Runs (n, 4) of an image's pixels (n,) that are not 0; their number. ``words``: the same pixels, eight in each."""
+def _mask_runs(bright, runs):
+    """Runs (n, 4) of the pixels of a `Mask`; their number."""
+    mask, words, columns, _ = bright
     count = 0
     within = False
     for start in range(0, mask.size, 8):
@@ -89,12 +93,12 @@ def _mask_runs(mask, words, columns, runs):
             continue
         v, u = start // columns, start % columns
         for k in range(start, min(start + 8, mask.size)):
-            bright = mask[k] != 0
-            if within and (u == 0 or not bright):
+            lit = mask[k] != 0
+            if within and (u == 0 or not lit):
                 runs[count, BEYOND] = u if u > 0 else columns
                 count += 1
                 within = False
-            if bright and not within:
+            if lit and not within:
                 runs[count, ROW], runs[count, FIRST] = v, u
                 within = True
             u += 1
@@ -106,15 +110,36 @@ def _mask_runs(mask, words, columns, runs):
     return count
 
 
-@kernel
-def _spots(image, dark, mask, words, columns, shrink, min_contrast, lopsided, most, labels, runs, patch):
-    """Measurements (m, FIELDS) of the whole spots among the components of a mask, at most ``most``, the roundest first.
-
-    ``mask`` (n,) of ``columns``, ``shrink`` times smaller than ``image``; ``words`` as :func:`_mask_runs` takes them.
+class Mask(NamedTuple):
+    """The bright ``pixels`` (n,) of an image, not 0, in rows of ``columns``, ``shrink`` times smaller than the image;
+    ``words``: the same pixels, eight in each.
     """
-    scratch = Scratch(labels, runs, patch)
-    own = np.empty((mask.size // 2 + mask.size // columns + 1, 4), np.int32)
-    totals = join_runs(own, _mask_runs(mask, words, columns, own), np.int64(1))
+
+    pixels: npt.NDArray[np.uint8]
+    words: npt.NDArray[np.uint64]
+    columns: int
+    shrink: int
+
+
+class SpotGates(NamedTuple):
+    """What a spot must be: of ``contrast`` [grey levels] at least, and no more ``lopsided``; and the ``most`` of them
+    that are wanted.
+    """
+
+    contrast: int
+    lopsided: float
+    most: int
+
+
+@kernel
+def _spots(picture, mask, gates, scratch):
+    """Measurements (m, FIELDS) of the whole spots of a `Picture` among the components of a `Mask`, at most as many as
+    are wanted, the roundest first. All four are the fields of their records.
+    """
+    picture, mask, gates, scratch = Picture(*picture), Mask(*mask), SpotGates(*gates), Scratch(*scratch)
+    size, columns, shrink = mask.pixels.size, mask.columns, mask.shrink
+    own = np.empty((size // 2 + size // columns + 1, 4), np.int32)
+    totals = join_runs(own, _mask_runs(mask, own), np.int64(1))
     found = np.empty((totals.shape[0], FIELDS))
     count = 0
     for c in range(totals.shape[0]):
@@ -126,14 +151,18 @@ def _spots(image, dark, mask, words, columns, shrink, min_contrast, lopsided, mo
             continue
         if longer > MAX_ASPECT * shorter or area < MIN_FILL * width * height:
             continue
-        status = measure(
-            image, dark, shrink * left - GROW, shrink * top - GROW, shrink * (left + width) + GROW,
-            shrink * (top + height) + GROW, shrink * (total[SUM_U] / area) + 0.5 * (shrink - 1),
-            shrink * (total[SUM_V] / area) + 0.5 * (shrink - 1), min_contrast, np.int64(5), scratch, found[count],
+        window = (
+            shrink * left - GROW, shrink * top - GROW, shrink * (left + width) + GROW,
+            shrink * (top + height) + GROW,
         )  # fmt: skip
-        if status == OK and whole(found[count], lopsided):
+        sought = Sought(
+            shrink * (total[SUM_U] / area) + 0.5 * (shrink - 1),
+            shrink * (total[SUM_V] / area) + 0.5 * (shrink - 1), gates.contrast, np.int64(5),
+        )  # fmt: skip
+        status = measure(picture, window, sought, scratch, found[count])
+        if status == OK and whole(found[count], gates.lopsided):
             count += 1
-    return _roundest(found[:count], most)
+    return _roundest(found[:count], gates.most)
 
 
 @kernel
@@ -182,7 +211,7 @@ def find_spots(
     mask = cv2.compare(bright, cv2.add(mean, offset), cv2.CMP_GT).ravel()
     words = mask[: mask.size // 8 * 8].view(np.uint64)
     spots: FloatArray = _spots(
-        image, dark, mask, words, bright.shape[1], shrink, min_contrast, lopsided, most, *scratch
+        (image, dark), (mask, words, bright.shape[1], shrink), (min_contrast, lopsided, most), plain(scratch)
     )
     return spots
 
@@ -191,9 +220,12 @@ def compile_kernels() -> None:
     """Compile what the detector calls, or load it from the cache."""
     compile_for(noise_level, IMAGE)
     compile_for(
-        _spots, IMAGE, BOOL, given(BYTE, 1), given(WORD, 1), INT, INT, INT, FLOAT, INT, written(INT32, 2),
-        written(INT32, 2), written(SINGLE, 2),
-    )  # fmt: skip
+        _spots,
+        fields(IMAGE, BOOL),
+        fields(given(BYTE, 1), given(WORD, 1), INT, INT),
+        fields(INT, FLOAT, INT),
+        SCRATCH,
+    )
 
 
 Region = tuple[int, int, int, int]
@@ -275,21 +307,16 @@ def crop(image: ImageArray, region: Region) -> ImageArray:
 
 
 def copies_of(
-    positions: FloatArray,
-    radii: FloatArray,
-    bases: IntArray,
-    inverses: FloatArray,
-    sought: BoolArray,
-    spots: FloatArray,
-    least: int,
-    tolerance: float,
+    faces: SearchedFaces, sought: BoolArray, spots: FloatArray, least: int, tolerance: float
 ) -> list[IntArray]:
     """All occurrences (k, 7) of each face that is ``sought`` (f,) among ``spots`` (m, FIELDS): rows of the spots, -1
     for missing dots.
     """
-    owners, counts = np.empty((len(radii), MOST_COPIES, 7), np.int64), np.empty(len(radii), np.int64)
-    gates = np.array([least, REACH_PX, tolerance])
-    find_faces(positions, radii, bases, inverses, sought, spots, gates, owners, counts)
+    owners, counts = (
+        np.empty((len(faces.radii), MOST_COPIES, 7), np.int64),
+        np.empty(len(faces.radii), np.int64),
+    )
+    find_faces(plain(faces), sought, spots, (least, REACH_PX, tolerance), owners, counts)
     return [found[:count] for found, count in zip(owners, counts.tolist(), strict=True)]
 
 

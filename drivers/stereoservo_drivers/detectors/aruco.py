@@ -26,7 +26,6 @@ from stereoservo.ports.devices import (
 )
 from stereoservo_drivers.detectors import tag_registration
 from stereoservo_drivers.detectors.acquisition import noise_level
-from stereoservo_drivers.detectors.frame_images import SMALLEST_IMAGE, sized_image
 from stereoservo_drivers.detectors.tag_registration import (
     FIRST_BLUR_PX,
     DictionaryName,
@@ -35,6 +34,7 @@ from stereoservo_drivers.detectors.tag_registration import (
     size_of,
     tag_cells,
 )
+from stereoservo_drivers.frame_images import SMALLEST_IMAGE, sized_image
 from stereoservo_drivers.options import invalid
 
 NOISY = 3.0

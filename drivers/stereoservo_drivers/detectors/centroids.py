@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo_drivers.detectors.components import (
     AREA,
@@ -62,7 +63,12 @@ from stereoservo_drivers.detectors.components import (
     QYY,
     SHAPE,
     F,
+    Matrix2,
     Patch,
+    Pixels,
+    Sought,
+    Symmetric2,
+    Threshold,
     U,
     V,
     X,
@@ -96,10 +102,11 @@ MARGIN = 4
 
 
 @reassociating_kernel
-def _soft_moments(level, xs, ys, cx, cy, half, scale):
+def _soft_moments(pixels, cx, cy, half, scale):
     """Moments 1, x, y, x², xy, y² about (cx, cy) of the levels, times ``scale`` less a half and cut off at 0 and 1, no
     farther than ``half`` in x.
     """
+    level, xs, ys = pixels
     s = su = sv = suu = suv = svv = F(0.0)
     for k in range(level.size):
         x, y = xs[k] - cx, ys[k] - cy
@@ -124,8 +131,8 @@ def _ellipse(component, patch, planes, contrast, out):
     mid_u, mid_v = 0.5 * (component.left + component.right), 0.5 * (component.top + component.bottom)
     half = 0.5 * (component.right - component.left) + 2.0
     s, su, sv, suu, suv, svv = _soft_moments(
-        planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b], F(mid_u - patch.left), F(mid_v - patch.top), F(half),
-        F(2.0 / contrast),
+        Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]), F(mid_u - patch.left), F(mid_v - patch.top),
+        F(half), F(2.0 / contrast),
     )  # fmt: skip
     if s < 3.0:
         return False
@@ -176,8 +183,9 @@ SUMS = 27
 
 
 @reassociating_kernel
-def _centre_sums(level, xs, ys, ellipse):
+def _centre_sums(pixels, ellipse):
     """Sums over the pixels of a window: W I, W I x, W I y, and the skirt's part of J (4)."""
+    level, xs, ys = pixels
     q11, q12, q22, cx, cy, skirt = ellipse
     width = F(4.0) * skirt * skirt
     twice = F(2.0) * skirt * skirt
@@ -207,10 +215,11 @@ def _centre_sums(level, xs, ys, ellipse):
 
 
 @reassociating_kernel
-def _weight_sums(level, xs, ys, ellipse):
+def _weight_sums(pixels, ellipse):
     """Further sums over the pixels of a window: W and W² with their second moments, second moments of W I and W² I
     (14); of the band about the dot's edge its weight and squared weight, first and third harmonic of its level (6).
     """
+    level, xs, ys = pixels
     q11, q12, q22, cx, cy, skirt = ellipse
     narrow = F(0.25) / (skirt * skirt)
     w = wxx = wxy = wyy = ww = wwxx = wwxy = wwyy = F(0.0)
@@ -327,18 +336,19 @@ class Dot(NamedTuple):
 
 
 @kernel
-def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out):
-    """Status, the dot nearest to (pu, pv) and the patch about it; its ellipse and its centre to first order into
+def _find_dot(picture, box, sought, scratch, out):
+    """Status, the dot that is ``sought`` and the patch about it; its ellipse and its centre to first order into
     ``out``.
     """
-    rows, columns = image.shape
+    dark, min_contrast = picture.dark, sought.contrast
+    rows, columns = picture.image.shape
     none, nowhere = Dot(0.0, 0.0, 0.0, 0.0, 0.0), Patch(0, 0, 0, 0, 8)
     brightest = np.empty(box[3] - box[1], np.int64)
-    low, high = extremes(image, dark, box, brightest)
+    low, high = extremes(picture, box, brightest)
     if high - low < min_contrast:
         return NO_CONTRAST, none, nowhere
-    threshold = 255 - (low + high) // 2 if dark else (low + high + 1) // 2
-    found = nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, scratch)
+    threshold = Threshold(255 - (low + high) // 2 if dark else (low + high + 1) // 2, brightest)
+    found = nearest_component(picture, box, threshold, sought, scratch)
     if found.label == 0:
         return NO_COMPONENT, none, nowhere
     if (
@@ -347,14 +357,14 @@ def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out):
         or found.bottom >= rows - MARGIN
     ):
         return BORDER, none, nowhere
-    background, noise = ring_level(image, dark, found.left, found.right, found.top, found.bottom)
+    background, noise = ring_level(picture, found)
     contrast = float(255 - low if dark else high) - background
     if found.inner >= 4:
         contrast = found.level_sum / found.inner - background
     if contrast < min_contrast:
         return NO_CONTRAST, none, nowhere
     around = found.left - ROOM, found.top - ROOM, found.right + ROOM, found.bottom + ROOM
-    patch = fill_patch(image, dark, background, around, scratch.patch)
+    patch = fill_patch(picture, background, around, scratch.patch)
     mixed = found.gap <= 3
     if mixed:
         blank_others(box, found.label, patch, scratch)
@@ -370,7 +380,7 @@ def _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out):
     if wide or mixed:
         if patch_size(around) > PATCH:
             return SHAPE, none, nowhere
-        patch = fill_patch(image, dark, background, around, scratch.patch)
+        patch = fill_patch(picture, background, around, scratch.patch)
     return OK, Dot(background, noise, contrast, skirt, beside), patch
 
 
@@ -387,7 +397,7 @@ def _refine_centre(image, dot, patch, planes, out):
             return BORDER, light, (jxx, jxy, jyx, jyy)
         a, b = lanes(patch, window.top, window.bottom)
         light, sx, sy, jxx, jxy, jyx, jyy = _centre_sums(
-            planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b], single_ellipse(patch, dot.skirt, out)
+            Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]), single_ellipse(patch, dot.skirt, out)
         )
         jxx -= light
         jyy -= light
@@ -406,8 +416,10 @@ def _refine_centre(image, dot, patch, planes, out):
 
 
 @kernel
-def _congruence(a, b, c, d, n11, n12, n22):
-    """Upper triangle of A N Aᵀ, A = [a b; c d]."""
+def _congruence(A, N):
+    """Upper triangle of A N Aᵀ, of a `Matrix2` and a `Symmetric2`."""
+    a, b, c, d = A
+    n11, n12, n22 = N
     return (
         a * a * n11 + 2.0 * a * b * n12 + b * b * n22,
         a * c * n11 + (a * d + b * c) * n12 + b * d * n22,
@@ -420,11 +432,12 @@ def _sensitivities(j, weights, contrast, out):
     """Into ``out``: the centre's covariance at unit noise, its shifts by slopes of the light and of the background."""
     _, wxx, wxy, wyy, _, wwxx, wwxy, wwyy, lxx, lxy, lyy, wlxx, wlxy, wlyy = weights
     det = j[0] * j[3] - j[1] * j[2]
-    a, b, c, d = j[3] / det, -j[1] / det, -j[2] / det, j[0] / det
-    out[CXX], out[CXY], out[CYY] = _congruence(a, b, c, d, wwxx, wwxy, wwyy)
+    inverse = Matrix2(j[3] / det, -j[1] / det, -j[2] / det, j[0] / det)
+    a, b, c, d = inverse
+    out[CXX], out[CXY], out[CYY] = _congruence(inverse, Symmetric2(wwxx, wwxy, wwyy))
     out[CONTRAST] = contrast
     f = 1.0 / contrast
-    out[BXX], out[BXY], out[BYY] = _congruence(a, b, c, d, f * wlxx, f * wlxy, f * wlyy)
+    out[BXX], out[BXY], out[BYY] = _congruence(inverse, Symmetric2(f * wlxx, f * wlxy, f * wlyy))
     for k in range(2):
         # the shift is -J⁻¹ sum T dI, and T = d W
         p, r = (a, b) if k == 0 else (c, d)
@@ -438,30 +451,31 @@ def _sensitivities(j, weights, contrast, out):
 
 
 @kernel
-def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, scratch, out):
-    """Measure the dot nearest to (pu, pv) in the window [u0, u1) x [v0, v1) of ``image`` (h, w) uint8.
+def measure(picture, window, sought, scratch, out):
+    """Measure the dot that is ``sought`` in a window, (u0, v0, u1, v1) for [u0, u1) x [v0, v1), of a `Picture`.
 
-    ``dark``: dots darker than their background. ``out`` (FIELDS,) is written; returns a status, ``OK`` or
-    why not.
+    ``out`` (FIELDS,) is written; returns a status, ``OK`` or why not.
     """
-    rows, columns = image.shape
+    rows, columns = picture.image.shape
+    u0, v0, u1, v1 = window
     u0, v0 = max(u0, 0), max(v0, 0)
     u1, v1 = min(u1, columns), min(v1, rows)
     if u1 - u0 < 7 or v1 - v0 < 7 or u1 - u0 > MAX_WINDOW or v1 - v0 > MAX_WINDOW:
         return BORDER
     box = (u0, v0, u1, v1)
-    status, dot, patch = _find_dot(image, dark, box, pu, pv, min_contrast, min_area, scratch, out)
+    status, dot, patch = _find_dot(picture, box, sought, scratch, out)
     if status != OK:
         return status
     planes = scratch.patch
-    status, light, j = _refine_centre(image, dot, patch, planes, out)
+    status, light, j = _refine_centre(picture.image, dot, patch, planes, out)
     if status != OK:
         return status
     ellipse = single_ellipse(patch, dot.skirt, out)
-    window = _window(dot.skirt, out)
-    a, b = lanes(patch, window.top, window.bottom)
-    level, xs, ys = planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]
-    weights, (bump, bump2, odd_x, odd_y, odd_3x, odd_3y) = _weight_sums(level, xs, ys, ellipse)
+    counted = _window(dot.skirt, out)
+    a, b = lanes(patch, counted.top, counted.bottom)
+    weights, (bump, bump2, odd_x, odd_y, odd_3x, odd_3y) = _weight_sums(
+        Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]), ellipse
+    )
     _sensitivities(j, weights, dot.contrast, out)
     surface = surroundings(patch, planes, _around(dot.skirt, out), ellipse, 4.0 * 1.4826 * dot.noise + 2.0)
     out[NOISE] = surface.variance
@@ -480,18 +494,27 @@ def measure(image, dark, u0, v0, u1, v1, pu, pv, min_contrast, min_area, scratch
     return OK
 
 
+class DotWindows(NamedTuple):
+    """Where k dots are looked for: ``boxes`` (k, 4) as :func:`measure` takes them, the points ``near`` (k, 2) [px]
+    which they are near to, and the ``least`` (k,) pixels that they have.
+    """
+
+    boxes: IntArray
+    near: FloatArray
+    least: IntArray
+
+
 @kernel
-def measure_windows(image, dark, windows, near, min_contrast, least, scratch, out, status):
-    """:func:`measure` in windows (k, 4) about points (k, 2) [px], components of ``least`` (k,) pixels or
-    more.
+def measure_windows(picture, windows, min_contrast, scratch, out, status):
+    """:func:`measure` in each of the `DotWindows`.
 
     Writes ``out`` (k, FIELDS) and ``status`` (k,); empty windows are skipped with ``BORDER``.
     """
-    for k in range(windows.shape[0]):
-        u0, v0, u1, v1 = windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3]
-        status[k] = measure(
-            image, dark, u0, v0, u1, v1, near[k, 0], near[k, 1], min_contrast, least[k], scratch, out[k]
-        )
+    boxes, near, least = windows
+    for k in range(boxes.shape[0]):
+        window = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+        sought = Sought(near[k, 0], near[k, 1], min_contrast, least[k])
+        status[k] = measure(picture, window, sought, scratch, out[k])
 
 
 QUANTISATION = 1.0 / 12.0

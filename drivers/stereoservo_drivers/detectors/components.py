@@ -29,6 +29,49 @@ PATCH = (MAX_WINDOW + 96) ** 2
 """Pixels of the largest patch, padding included."""
 
 
+class Picture(NamedTuple):
+    """An ``image`` (h, w) uint8, and whether its dots are ``dark`` on a lighter plate."""
+
+    image: npt.NDArray[np.uint8]
+    dark: bool
+
+
+class Sought(NamedTuple):
+    """The dot that is looked for: the one nearest to (``u``, ``v``) [px], of ``contrast`` [grey levels] and ``area``
+    [pixels] at least.
+    """
+
+    u: float
+    v: float
+    contrast: int
+    area: int
+
+
+class Pixels(NamedTuple):
+    """Pixels of a patch (n,): ``level`` above the background, column ``x`` and row ``y`` [px] from the patch's own."""
+
+    level: npt.NDArray[np.float32]
+    x: npt.NDArray[np.float32]
+    y: npt.NDArray[np.float32]
+
+
+class Matrix2(NamedTuple):
+    """[[``a``, ``b``], [``c``, ``d``]]."""
+
+    a: float
+    b: float
+    c: float
+    d: float
+
+
+class Symmetric2(NamedTuple):
+    """[[``xx``, ``xy``], [``xy``, ``yy``]]."""
+
+    xx: float
+    xy: float
+    yy: float
+
+
 class Scratch(NamedTuple):
     """Memory of :func:`~stereoservo_drivers.detectors.centroids.measure`, reused between calls of one thread."""
 
@@ -47,10 +90,11 @@ def scratch() -> Scratch:
 
 
 @kernel
-def extremes(image, dark, box, brightest):
-    """Lowest and highest level of a window; ``brightest`` (rows,) gets that of each row, of inverted levels where
-    ``dark``.
+def extremes(picture, box, brightest):
+    """Lowest and highest level of a window; ``brightest`` (rows,) gets that of each row, of inverted levels where dots
+    are dark.
     """
+    image, dark = picture
     u0, v0, u1, v1 = box
     low, high = 255, 0
     for v in range(v0, v1):
@@ -114,19 +158,28 @@ def join_runs(runs, count, reach):
     return totals
 
 
+class Threshold(NamedTuple):
+    """The ``level`` from which on a pixel is bright, and the ``brightest`` level of each row (rows,) of a window."""
+
+    level: int
+    brightest: npt.NDArray[np.int64]
+
+
 @kernel
-def _bright_runs(image, dark, box, brightest, threshold, runs):
+def _bright_runs(picture, box, threshold, runs):
     """Runs (n, 4) of pixels at the threshold or above in a window; their number."""
+    image, dark = picture
+    level, brightest = threshold
     u0, v0, u1, v1 = box
     flip = 255 if dark else 0
     count = 0
     for v in range(v0, v1):
-        if brightest[v - v0] < threshold:
+        if brightest[v - v0] < level:
             continue
         row = image[v, u0:u1]
         within = False
         for k in range(row.size):
-            bright = (np.int64(row[k]) ^ flip) >= threshold
+            bright = (np.int64(row[k]) ^ flip) >= level
             if bright != within:
                 within = bright
                 if bright:
@@ -170,24 +223,25 @@ def _gap(totals, which):
 
 
 @kernel
-def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, scratch):
-    """The bright component of ``min_area`` pixels or more nearest to (pu, pv).
+def nearest_component(picture, box, threshold, sought, scratch):
+    """The bright component that is ``sought``, by place and area.
 
-    ``brightest`` level of each row (rows,). Those that touch the window's rim are something larger than a dot and are
-    not looked for. Labels are written where another one is near.
+    Those that touch the window's rim are something larger than a dot and are not looked for. Labels are written where
+    another one is near.
     """
+    image, dark = picture
     u0, v0, u1, v1 = box
     labels, runs, _ = scratch
-    count = _bright_runs(image, dark, box, brightest, threshold, runs)
+    count = _bright_runs(picture, box, threshold, runs)
     totals = join_runs(runs, count, np.int64(0))
     best, nearest = -1, 1e30
     for c in range(totals.shape[0]):
         total = totals[c]
-        if total[AREA_PX] < min_area or total[LEFT] == u0 or total[TOP] == v0:
+        if total[AREA_PX] < sought.area or total[LEFT] == u0 or total[TOP] == v0:
             continue
         if total[RIGHT] == u1 - 1 or total[BOTTOM] == v1 - 1:
             continue
-        du, dv = total[SUM_U] / total[AREA_PX] - pu, total[SUM_V] / total[AREA_PX] - pv
+        du, dv = total[SUM_U] / total[AREA_PX] - sought.u, total[SUM_V] / total[AREA_PX] - sought.v
         if du * du + dv * dv < nearest:
             nearest = du * du + dv * dv
             best = c
@@ -206,7 +260,7 @@ def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, 
         if mine == best:
             for u in range(first + 1, beyond - 1):
                 over, under = np.int64(image[row - 1, u]) ^ flip, np.int64(image[row + 1, u]) ^ flip
-                if over >= threshold and under >= threshold:
+                if over >= threshold.level and under >= threshold.level:
                     level_sum += np.int64(image[row, u]) ^ flip
                     inner += 1
     total = totals[best]
@@ -214,10 +268,12 @@ def nearest_component(image, dark, box, brightest, threshold, pu, pv, min_area, 
 
 
 @kernel
-def ring_level(image, dark, u_min, u_max, v_min, v_max):
-    """Median level of the rectangular ring 3 to 4 px outside a bounding box (all inside the image), and the median
-    distance from it.
+def ring_level(picture, component):
+    """Median level of the rectangular ring 3 to 4 px outside a component's bounding box (all inside the image), and the
+    median distance from it.
     """
+    image, dark = picture
+    u_min, u_max, v_min, v_max = component.left, component.right, component.top, component.bottom
     histogram = np.zeros(256, np.int32)
     count = 0
     for grow in (3, 4):
@@ -268,11 +324,12 @@ class Patch(NamedTuple):
 
 
 @kernel
-def fill_patch(image, dark, background, box, planes):
+def fill_patch(picture, background, box, planes):
     """The pixels of a rectangle, its last row and column included, into ``planes`` (4, n), row by row.
 
     What is outside of the image or pads a row has the level 0 and is not VALID; what pads the end is far away.
     """
+    image, dark = picture
     u0, v0, u1, v1 = box
     rows, columns = image.shape
     width = (u1 - u0) // 8 * 8 + 8

@@ -26,7 +26,6 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
-from stereoservo_drivers.detectors.frame_images import gray_image
 from stereoservo_drivers.detectors.landmark_search import (
     Keypoints,
     Surroundings,
@@ -43,6 +42,7 @@ from stereoservo_drivers.detectors.patch_alignment import (
     build_pyramid,
     compile_kernels,
 )
+from stereoservo_drivers.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 
 FLOW_BACK_PX = 0.7

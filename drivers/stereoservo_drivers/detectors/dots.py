@@ -13,7 +13,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import kernel, plain
 from stereoservo.ports.devices import (
     CameraObservation,
     DetectorDescription,
@@ -24,7 +24,7 @@ from stereoservo.ports.devices import (
 )
 from stereoservo_drivers.detectors import acquisition, centroids, patterns
 from stereoservo_drivers.detectors.acquisition import Expectation, find_spots
-from stereoservo_drivers.detectors.centroids import measure_windows
+from stereoservo_drivers.detectors.centroids import DotWindows, measure_windows
 from stereoservo_drivers.detectors.components import (
     AREA,
     CONTRAST,
@@ -34,6 +34,7 @@ from stereoservo_drivers.detectors.components import (
     FIELDS,
     NOISE,
     OK,
+    Picture,
     Scratch,
     scratch,
 )
@@ -47,19 +48,20 @@ from stereoservo_drivers.detectors.face_fit import (
     whole,
 )
 from stereoservo_drivers.detectors.face_options import FaceOptions, Positive, patterns_of
-from stereoservo_drivers.detectors.frame_images import sized_image
 from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle
 from stereoservo_drivers.detectors.kernel_types import (
     BOOL,
     FLOAT,
     IMAGE,
     INT,
-    INT32,
-    SINGLE,
+    SCRATCH,
     compile_for,
+    fields,
     given,
     written,
 )
+from stereoservo_drivers.detectors.patterns import SearchedFaces
+from stereoservo_drivers.frame_images import sized_image
 
 SAME_SPOT_PX = 2.0
 """A spot this near to a dot that was tracked is that dot."""
@@ -119,6 +121,7 @@ class _Seen(NamedTuple):
         return cls(np.empty(most, np.int64), np.empty((most, 2)), np.empty((most, 2, 2)))
 
     def observation(self, frame: Frame, count: int) -> CameraObservation:
+        """That of a ``frame``, of the first ``count`` rows."""
         return CameraObservation(
             frame.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, self.ids[:count],
             self.pixels[:count], self.covariances[:count],
@@ -158,10 +161,15 @@ class DotDetector:
         self._size = self.options.image_size
         self._every_id = np.array([pattern.ids for pattern in self._patterns])
         self._order = np.argsort(self._every_id.ravel())
-        self._positions = np.array([pattern.positions for pattern in self._patterns])
-        self._radii = np.array([pattern.radius for pattern in self._patterns])
-        self._bases = np.array([pattern.bases for pattern in self._patterns])
-        self._inverses = np.array([pattern.inverses for pattern in self._patterns])
+        positions = np.array([pattern.positions for pattern in self._patterns])
+        radii = np.array([pattern.radius for pattern in self._patterns])
+        self._faces = FaceDots(self._every_id, positions, radii)
+        self._searched = SearchedFaces(
+            positions,
+            radii,
+            np.array([pattern.bases for pattern in self._patterns]),
+            np.array([pattern.inverses for pattern in self._patterns]),
+        )
         self._dots = np.zeros((self._every_id.size, FIELDS))
         self._used = np.zeros(self._every_id.size, np.bool_)
         self._gate = np.inf
@@ -207,13 +215,17 @@ class DotDetector:
     def _track(self, image: ImageArray, prior: Prior, dt_s: float, seen: _Seen) -> int:
         """Measure and judge the dots of a prior, into ``seen`` and for :meth:`_with_others`; the number accepted."""
         options = self.options
-        found: int = track(
-            image, self._dark, self._every_id, self._positions, self._radii, self._order,
+        expected = (
             np.ascontiguousarray(prior.ids, np.int64), np.ascontiguousarray(prior.pixels, np.float64),
             np.ascontiguousarray(prior.velocities, np.float64),
-            np.ascontiguousarray(prior.covariances, np.float64), dt_s, options.min_contrast, self._gate,
-            options.lopsided, options.consistency_px, options.floor_px, *self._scratch, self._dots, self._used,
-            seen.ids, seen.pixels, seen.covariances,
+            np.ascontiguousarray(prior.covariances, np.float64), dt_s,
+        )  # fmt: skip
+        gates = (
+            options.min_contrast, self._gate, options.lopsided, options.consistency_px, options.floor_px
+        )  # fmt: skip
+        found: int = track(
+            (image, self._dark), (*self._faces, self._order), expected, gates, plain(self._scratch),
+            (self._dots, self._used, *seen),
         )  # fmt: skip
         return found
 
@@ -250,8 +262,7 @@ class DotDetector:
             away = np.hypot(*(spots[:, None, :2] - taken[None]).transpose(2, 0, 1)).min(axis=1)
             spots = np.ascontiguousarray(spots[away > SAME_SPOT_PX])
         copies = acquisition.copies_of(
-            self._positions, self._radii, self._bases, self._inverses, sought, spots, options.acquire_dots,
-            options.consistency_px,
+            self._searched, sought, spots, options.acquire_dots, options.consistency_px
         )  # fmt: skip
         owners = np.full(self._every_id.shape, -1, np.int64)
         for f, found in enumerate(copies):
@@ -259,24 +270,20 @@ class DotDetector:
             if owner is not None:
                 owners[f] = owner
         dots, used = np.zeros((*owners.shape, FIELDS)), np.zeros(owners.shape, np.bool_)
-        settle_faces(
-            self._positions,
-            self._radii,
-            spots,
-            owners,
-            options.consistency_px,
-            options.acquire_dots,
-            dots,
-            used,
-        )
+        checks = options.consistency_px, options.acquire_dots
+        settle_faces(plain(self._faces), spots, owners, checks, dots, used)
         return dots, used
 
     def _observation(self, frame: Frame, found: _Found, seen: _Seen) -> CameraObservation:
         dots, used = found
         count = report(
-            self._every_id, self._order, dots.reshape(-1, FIELDS), used.ravel(), self.options.floor_px, seen.ids,
-            seen.pixels, seen.covariances,
-        )  # fmt: skip
+            self._every_id,
+            self._order,
+            dots.reshape(-1, FIELDS),
+            used.ravel(),
+            self.options.floor_px,
+            plain(seen),
+        )
         return seen.observation(frame, count)
 
 
@@ -286,19 +293,60 @@ SHAPE_MARGIN = 6
 """Pixels between a dot's expected outline and the rim of its window, beside the prior's uncertainty."""
 
 
-@kernel
-def expect(
-    every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s,
-    predicted, present, spread, shapes, windows, least,
-):  # fmt: skip
-    """Windows for the dots of a prior of ``ids`` (k,), ``pixels``, ``velocities`` (k, 2), ``covariances``
-    (k, 2, 2).
+class FaceDots(NamedTuple):
+    """f faces of n dots: their ``ids`` (f, n), ``positions`` (f, n, 2) and ``radii`` (f,) [pattern units]."""
 
-    ``every_id`` (f, n), ``patterns`` (f, n, 2), ``radii`` (f,) are the faces. Writes ``predicted`` (m, 2)
-    [px] at ``dt_s`` [s] after the prior, ``present`` (m,), ``spread`` (m, 3) its covariance xx, xy, yy [px²],
-    ``shapes`` (m, SHAPE), ``windows`` (m, 4), ``least`` (m,) pixels of a dot. Faces that the prior shows from behind,
-    too thin, too uncertain or by fewer than four dots stay empty. Returns the number of windows.
+    ids: IntArray
+    positions: FloatArray
+    radii: FloatArray
+
+
+class PriorDots(NamedTuple):
+    """The dots of a prior: ``ids`` (k,), ``pixels`` (k, 2) [px], ``velocities`` (k, 2) [px/s] and ``covariances``
+    (k, 2, 2) [px²], ``dt_s`` [s] before the image.
     """
+
+    ids: IntArray
+    pixels: FloatArray
+    velocities: FloatArray
+    covariances: FloatArray
+    dt_s: float
+
+
+class ExpectedDots(NamedTuple):
+    """What a prior says of the m dots of all faces, where ``present`` (m,): ``predicted`` (m, 2) [px] with covariances
+    ``spread`` (m, 3), xx, xy, yy [px²], and the ``shapes`` (m, SHAPE) of their images.
+    """
+
+    predicted: FloatArray
+    present: BoolArray
+    spread: FloatArray
+    shapes: FloatArray
+
+
+class TrackGates(NamedTuple):
+    """What a tracked dot must be: of ``contrast`` [grey levels] at least; ``limit``, infinite for none: the largest
+    squared distance from its prior in covariances of prior and measurement; ``lopsided``, ``tolerance`` [px] as in the
+    options. ``floor`` [px]: standard deviation that is part of every covariance.
+    """
+
+    contrast: int
+    limit: float
+    lopsided: float
+    tolerance: float
+    floor: float
+
+
+@kernel
+def expect(face_dots, prior, expected, windows):
+    """`DotWindows` for the dots of a prior, into ``windows``, and what it says of them, into ``expected``.
+
+    Faces that the prior shows from behind, too thin, too uncertain or by fewer than four dots stay empty. Returns the
+    number of windows.
+    """
+    every_id, patterns, radii = face_dots
+    ids, pixels, velocities, covariances, dt_s = prior
+    predicted, present, spread, shapes = expected
     faces, n = every_id.shape
     count = 0
     H = np.zeros((3, 3))
@@ -339,9 +387,9 @@ def expect(
                 shape = shapes[f * n + i]
                 half = max(int(np.ceil(shape[5] + reaches[i])) + SHAPE_MARGIN, MIN_HALF_WINDOW)
                 u, v = int(np.floor(places[i, 0] + 0.5)), int(np.floor(places[i, 1] + 0.5))
-                window = windows[f * n + i]
+                window = windows.boxes[f * n + i]
                 window[0], window[1], window[2], window[3] = u - half, v - half, u + half + 1, v + half + 1
-                least[f * n + i] = max(5, int(0.4 * shape[4]))
+                windows.least[f * n + i] = max(5, int(0.4 * shape[4]))
                 count += 1
         if not good:
             mine[:] = False
@@ -349,8 +397,10 @@ def expect(
 
 
 @kernel
-def _gates(predicted, present, shapes, status, spread, limit, lopsided, dots, used):
+def _gate(expected, status, gates, dots, used):
     """Gates of each dot of a face, by itself and relative to its neighbours, into ``used`` (n,)."""
+    predicted, present, spread, shapes = expected
+    limit, lopsided = gates.limit, gates.lopsided
     n = used.size
     contrasts = np.zeros(n)
     scales = np.zeros(n)
@@ -379,33 +429,22 @@ def _gates(predicted, present, shapes, status, spread, limit, lopsided, dots, us
 
 
 @kernel
-def judge(
-    patterns, radii, predicted, present, shapes, status, spread, limit, lopsided, tolerance, dots, used
-):
+def judge(face_dots, expected, status, gates, dots, used):
     """Accept measured dots: complete, of the expected size, similar, nearest to their own prediction, consistent
     with the face.
 
-    ``spread`` (m, 3): covariances (xx, xy, yy) of the prior [px²], and ``limit`` the largest squared distance from it
-    with the measurement's covariance added, infinite for none;
-    ``lopsided``, ``tolerance`` [px] as in the options. Moves ``dots`` (m, FIELDS) to the dots' centres,
-    writes ``used`` (m,). Returns their number.
+    Moves ``dots`` (m, FIELDS) to the dots' centres, writes ``used`` (m,). Returns their number.
     """
+    _, patterns, radii = face_dots
+    predicted, present, spread, shapes = expected
+    tolerance = gates.tolerance
     faces, n = patterns.shape[0], patterns.shape[1]
     total = 0
     for f in range(faces):
         a, b = f * n, (f + 1) * n
         mine = used[a:b]
-        _gates(
-            predicted[a:b],
-            present[a:b],
-            shapes[a:b],
-            status[a:b],
-            spread[a:b],
-            limit,
-            lopsided,
-            dots[a:b],
-            mine,
-        )
+        own_face = ExpectedDots(predicted[a:b], present[a:b], spread[a:b], shapes[a:b])
+        _gate(own_face, status[a:b], gates, dots[a:b], mine)
         count = 0
         for i in range(a, b):
             if not used[i]:
@@ -429,10 +468,11 @@ def judge(
 
 
 @kernel
-def report(every_id, order, dots, used, floor, ids, pixels, covariances):
-    """What is ``used`` (m,) of ``dots`` (m, FIELDS) as an observation, by ascending id, into the first rows of the last
-    three arguments; their number. ``order`` (m,) sorts the ids of all faces (f, n); ``floor`` [px].
+def report(every_id, order, dots, used, floor, seen):
+    """What is ``used`` (m,) of ``dots`` (m, FIELDS) as an observation, by ascending id, into the first rows of ``seen``
+    (the fields of a `_Seen`); their number. ``order`` (m,) sorts the ids of all faces (f, n); ``floor`` [px].
     """
+    ids, pixels, covariances = seen
     n = every_id.shape[1]
     chosen = np.empty((used.size, FIELDS))
     count = 0
@@ -448,38 +488,39 @@ def report(every_id, order, dots, used, floor, ids, pixels, covariances):
 
 
 @kernel
-def track(
-    image, dark, every_id, patterns, radii, order, ids, pixels, velocities, covariances, dt_s, min_contrast, limit,
-    lopsided, tolerance, floor, labels, runs, patch, dots, used, seen_ids, seen_pixels, seen_covariances,
-):  # fmt: skip
+def track(picture, faces, prior, gates, scratch, found):
     """From an image and a prior to an observation: :func:`expect`, the measurement in windows, :func:`judge`,
-    :func:`report`. Returns the number of dots; ``dots`` (m, FIELDS) and ``used`` (m,) are written, too.
+    :func:`report`. Returns the number of dots.
+
+    All are the fields of their records, `Picture`, `FaceDots` and the order of all their ids (m,), `PriorDots`,
+    `TrackGates`, `Scratch`; ``found``: dots (m, FIELDS) and used (m,), which are written, then those of a `_Seen`.
     """
+    picture, prior, gates = Picture(*picture), PriorDots(*prior), TrackGates(*gates)
+    every_id, patterns, radii, order = faces
+    face_dots = FaceDots(every_id, patterns, radii)
+    dots, used, seen_ids, seen_pixels, seen_covariances = found
     m = used.size
     predicted, spread, shapes = np.zeros((m, 2)), np.zeros((m, 3)), np.zeros((m, SHAPE))
-    windows, least, status = np.zeros((m, 4), np.int64), np.zeros(m, np.int64), np.zeros(m, np.int64)
+    boxes, least, status = np.zeros((m, 4), np.int64), np.zeros(m, np.int64), np.zeros(m, np.int64)
     present = np.zeros(m, np.bool_)
     used[:] = False
-    expect(
-        every_id, patterns, radii, ids, pixels, velocities, covariances, dt_s, predicted, present, spread, shapes,
-        windows, least,
-    )  # fmt: skip
-    measure_windows(
-        image, dark, windows, predicted, min_contrast, least, Scratch(labels, runs, patch), dots, status
-    )  # fmt: skip
-    judge(
-        patterns, radii, predicted, present, shapes, status, spread, limit, lopsided, tolerance, dots, used
-    )  # fmt: skip
-    return report(every_id, order, dots, used, floor, seen_ids, seen_pixels, seen_covariances)
+    expected, windows = ExpectedDots(predicted, present, spread, shapes), DotWindows(boxes, predicted, least)
+    expect(face_dots, prior, expected, windows)
+    measure_windows(picture, windows, gates.contrast, Scratch(*scratch), dots, status)
+    judge(face_dots, expected, status, gates, dots, used)
+    return report(every_id, order, dots, used, gates.floor, (seen_ids, seen_pixels, seen_covariances))
 
 
 @kernel
-def settle_faces(patterns, radii, spots, owners, tolerance, least, dots, used):
+def settle_faces(face_dots, spots, owners, checks, dots, used):
     """Check the faces (f, n) that acquisition found: ``owners`` are rows of ``spots``, -1 for missing dots.
 
-    Of faces that share a spot the one with more dots stays; of equals, none. Writes ``dots`` (f, n, FIELDS) and
-    ``used`` (f, n), of zeros.
+    ``face_dots``: the fields of a `FaceDots`; ``checks``: how far [px] a dot may lie from its face's homography, and
+    the least dots of a face. Of faces that share a spot the one with more dots stays; of equals, none. Writes ``dots``
+    (f, n, FIELDS) and ``used`` (f, n), of zeros.
     """
+    _, patterns, radii = face_dots
+    tolerance, least = checks
     faces, n = owners.shape
     for f in range(faces):
         mine = count = 0
@@ -508,14 +549,15 @@ def _compile_kernels() -> None:
     seen = written(INT, 1), written(FLOAT, 2), written(FLOAT, 3)
     # before `track`, which calls it with the same types
     compile_for(
-        report, given(INT, 2), given(INT, 1), written(FLOAT, 2), written(BOOL, 1), FLOAT, *seen
+        report, given(INT, 2), given(INT, 1), written(FLOAT, 2), written(BOOL, 1), FLOAT, fields(*seen)
+    )  # fmt: skip
+    faces = given(INT, 2), given(FLOAT, 3), given(FLOAT, 1)
+    compile_for(
+        track, fields(IMAGE, BOOL), fields(*faces, given(INT, 1)),
+        fields(given(INT, 1), given(FLOAT, 2), given(FLOAT, 2), given(FLOAT, 3), FLOAT),
+        fields(INT, FLOAT, FLOAT, FLOAT, FLOAT), SCRATCH, fields(written(FLOAT, 2), written(BOOL, 1), *seen),
     )  # fmt: skip
     compile_for(
-        track, IMAGE, BOOL, given(INT, 2), given(FLOAT, 3), given(FLOAT, 1), given(INT, 1), given(INT, 1),
-        given(FLOAT, 2), given(FLOAT, 2), given(FLOAT, 3), FLOAT, INT, FLOAT, FLOAT, FLOAT, FLOAT,
-        written(INT32, 2), written(INT32, 2), written(SINGLE, 2), written(FLOAT, 2), written(BOOL, 1), *seen,
-    )  # fmt: skip
-    compile_for(
-        settle_faces, given(FLOAT, 3), given(FLOAT, 1), given(FLOAT, 2), given(INT, 2), FLOAT, INT,
-        written(FLOAT, 3), written(BOOL, 2),
+        settle_faces, fields(*faces), given(FLOAT, 2), given(INT, 2), fields(FLOAT, INT), written(FLOAT, 3),
+        written(BOOL, 2),
     )  # fmt: skip

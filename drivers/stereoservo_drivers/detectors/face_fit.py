@@ -23,6 +23,7 @@ from stereoservo_drivers.detectors.components import (
     QYY,
 )
 from stereoservo_drivers.detectors.homographies import (
+    OutlierGates,
     fit_homography,
     image_of_circle,
     outlier_dot,
@@ -180,7 +181,7 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
     # checked one
     for step in range(2):
         if step == 1 and count >= 5:
-            if not reject_outliers(pattern, dots, used, tolerance, sigma, max(least, 5), H):
+            if not reject_outliers(pattern, dots, used, OutlierGates(tolerance, sigma, max(least, 5)), H):
                 used[:] = False
                 return 0
         elif not fit_homography(pattern, dots, used, H):

@@ -338,13 +338,24 @@ def outlier_dot(pattern, pixels, used, sigma, out):
     return worst
 
 
+class OutlierGates(NamedTuple):
+    """How far a dot may lie from its prediction by the others: ``tolerance`` [px], and beside it what a dot's standard
+    deviation ``sigma`` [px] allows for; the ``least`` dots that must remain.
+    """
+
+    tolerance: float
+    sigma: float
+    least: int
+
+
 @kernel
-def _worst_outlier(pattern, pixels, used, frame, h, tolerance, sigma):
+def _worst_outlier(pattern, pixels, used, frame, h, gates):
     """The dot with the largest leave-one-out residual, -1 where all are within tolerance.
 
-    It may be ``tolerance`` [px] and five standard deviations, of ``sigma`` [px] times the largest root of
+    It may be the tolerance and five standard deviations, of sigma times the largest root of
     (I - L)⁻¹. Of the dots beyond, the one with the largest studentised residual goes. -2 where the fit is degenerate.
     """
+    tolerance, sigma, _ = gates
     out = np.zeros((used.size, 3))
     if not _leave_one_out(pattern, pixels, used, frame, h, out):
         return -2
@@ -359,22 +370,21 @@ def _worst_outlier(pattern, pixels, used, frame, h, tolerance, sigma):
 
 
 @kernel
-def reject_outliers(pattern, pixels, used, tolerance, sigma, least, H):
-    """Clear rows of ``used`` until each remaining dot lies within ``tolerance`` [px] of its prediction by the
-    others.
+def reject_outliers(pattern, pixels, used, gates, H):
+    """Clear rows of ``used`` until each remaining dot lies as near to its prediction by the others as the
+    `OutlierGates` say.
 
-    ``sigma`` [px]: standard deviation of a dot, allowed for on top. False where fewer than ``least`` dots
-    would remain; with five dots left nothing tells which one is wrong, so that ``least`` must be at least
-    5. ``H`` gets the homography.
+    False where fewer than their least dots would remain; with five dots left nothing tells which one is wrong, so that
+    it must be at least 5. ``H`` gets the homography.
     """
     frame, h = np.zeros(3), np.zeros(8)
     count = 0
     for i in range(used.size):
         count += 1 if used[i] else 0
-    while count >= least:
+    while count >= gates.least:
         if not _fit(pattern, pixels, used, frame, h):
             return False
-        worst = _worst_outlier(pattern, pixels, used, frame, h, tolerance, sigma)
+        worst = _worst_outlier(pattern, pixels, used, frame, h, gates)
         if worst == -1:
             _in_pixels(frame, h, H)
             return True

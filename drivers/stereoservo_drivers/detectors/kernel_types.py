@@ -29,6 +29,15 @@ def written(dtype: Any, dimensions: int) -> Any:
     return types.Array(dtype, dimensions, "C")
 
 
+def fields(*types_of_fields: Any) -> Any:
+    """Type of the fields of a record, see `stereoservo.numerics.compilation.Fields`."""
+    return types.Tuple(types_of_fields)
+
+
+SCRATCH = fields(written(INT32, 2), written(INT32, 2), written(SINGLE, 2))
+"""Fields of `components.Scratch`."""
+
+
 def compile_for(function: Callable[..., Any], *arguments: Any) -> None:
     """Compile a kernel for these argument types, now, and for no others, ever. Idempotent."""
     dispatcher = cast(Any, function)

@@ -20,6 +20,7 @@ from stereoservo_drivers.detectors.components import (
     SLOPE_YY,
     VALID,
     F,
+    Pixels,
     V,
     X,
     Y,
@@ -96,17 +97,28 @@ def _fit_surface(sums):
     return Surface(max(left, 0.0) / (n - 4.0), plane_level, n, level, slope_x, slope_y, slope_t)
 
 
+class Band(NamedTuple):
+    """The levels within ``limit`` of a surface, as `Surface` has it."""
+
+    level: float
+    slope_x: float
+    slope_y: float
+    slope_t: float
+    limit: float
+
+
 @reassociating_kernel
-def _ring_moments(level, valid, xs, ys, ellipse, box, limit, surface, sums):
+def _ring_moments(pixels, valid, ellipse, box, band, sums):
     """Sums over the VALID pixels of a ``box`` (its middle and half size in x, then in y) outside an ellipse's skirt
-    within ``limit`` of a ``surface``: 1, level, x, y, x², xy, y², x level, y level, level², tail, tail x, tail y,
+    whose levels are in a ``band``: 1, level, x, y, x², xy, y², x level, y level, level², tail, tail x, tail y,
     tail², tail level; into ``sums`` (15,).
     """
+    level, xs, ys = pixels
     q11, q12, q22, cx, cy, skirt = ellipse
     width, inner = F(4.0) * skirt * skirt, skirt * skirt
     # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
     fall = F(1.0) / ((skirt + F(RING)) * (skirt + F(RING)) - inner)
-    base, slope_x, slope_y, slope_t = surface
+    base, slope_x, slope_y, slope_t, limit = band
     si = sx = sy = sxx = sxy = syy = sxi = syi = sii = st = stx = sty = stt = sti = count = F(0.0)
     for k in range(level.size):
         x, y, i, one = xs[k] - cx, ys[k] - cy, level[k], valid[k]
@@ -155,11 +167,11 @@ def surroundings(patch, planes, box, ellipse, limit):
         F(0.5 * (left + right) - patch.left), F(0.5 * (right - left)), F(0.5 * (top + bottom) - patch.top),
         F(0.5 * (bottom - top)),
     )  # fmt: skip
-    level, valid, xs, ys = planes[LEVEL, a:b], planes[VALID, a:b], planes[X, a:b], planes[Y, a:b]
+    pixels, valid = Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]), planes[VALID, a:b]
     fit, sums = Surface(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.empty(15)
     for _ in range(2):
-        surface = F(fit.level), F(fit.slope_x), F(fit.slope_y), F(fit.slope_t)
-        _ring_moments(level, valid, xs, ys, ellipse, middle, F(limit), surface, sums)
+        band = Band(F(fit.level), F(fit.slope_x), F(fit.slope_y), F(fit.slope_t), F(limit))
+        _ring_moments(pixels, valid, ellipse, middle, band, sums)
         fit = _fit_surface(sums)
         if fit.variance < 0.0:
             return NO_SURFACE
@@ -170,11 +182,12 @@ def surroundings(patch, planes, box, ellipse, limit):
 
 
 @reassociating_kernel
-def _inner_moments(level, xs, ys, ellipse, base, A, right):
+def _inner_moments(pixels, ellipse, base, A, right):
     """Sums over the pixels with q = dᵀQd up to INNER: products of 1, x², xy, y², q², x, y with each other into the
     lower triangle of ``A`` (7, 7), with the level above ``base`` into ``right`` (7,). Returns the number of pixels and
     the sum of that level squared.
     """
+    level, xs, ys = pixels
     q11, q12, q22, cx, cy, _ = ellipse
     n = p = r = s = t = u = v = pp = pr = rr = rs = ss = pt = rt = st = tt = F(0.0)
     tu = tv = pu = pv = su = sv = l1 = lp = lr = ls = lt = lu = lv = ll = F(0.0)
@@ -242,8 +255,8 @@ def inside(patch, planes, ellipse, contrast, out):
     a, b = lanes(patch, int(np.ceil(out[V] - half_v)), int(np.floor(out[V] + half_v)))
     A = np.empty((TERMS + 2, TERMS))
     right, z = A[TERMS], A[TERMS + 1]
-    level, xs, ys = planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]
-    count, squares = _inner_moments(level, xs, ys, ellipse, F(contrast), A, right)
+    pixels = Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b])
+    count, squares = _inner_moments(pixels, ellipse, F(contrast), A, right)
     if count < MIN_INNER or not lower_root(A[:TERMS]):
         return
     square = np.float64(squares)

@@ -9,8 +9,11 @@ light, the edge of a shadow), the slope inside the dot itself is believed more, 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo_drivers.detectors.components import (
     AREA,
@@ -29,6 +32,8 @@ from stereoservo_drivers.detectors.components import (
     SLOPE_XX,
     SLOPE_XY,
     SLOPE_YY,
+    Matrix2,
+    Symmetric2,
 )
 from stereoservo_drivers.detectors.levels import EVEN
 
@@ -50,13 +55,22 @@ PRIOR_WEIGHT = 2.0
 """How many degrees of freedom the two count."""
 
 
+class DotReadings(NamedTuple):
+    """What the ``dots`` (n, FIELDS) of a face show: ``values`` (n,), which count where ``used`` (n,)."""
+
+    dots: FloatArray
+    values: FloatArray
+    used: BoolArray
+
+
 @kernel
-def _plane(dots, values, used, out):
-    """Least-squares plane a + b·x of ``values`` over the rows ``used``.
+def _plane(readings, out):
+    """Least-squares plane a + b·x of `DotReadings` over the dots.
 
     ``out``: middle (2), a, slope (2), its covariance (3) and the squared sum of residuals, both for unit noise; rms
     distance from the middle. False where it is undetermined.
     """
+    dots, values, used = readings
     n = 0
     out[:] = 0.0
     for i in range(used.size):
@@ -98,8 +112,9 @@ def _residual(dot, value, plane):
 
 
 @kernel
-def _outlier(dots, values, used, variance, plane):
+def _outlier(readings, variance, plane):
     """The dot whose value the plane of the others contradicts, -1 for none; ``plane`` becomes that of the others."""
+    dots, values, used = readings
     n = 0
     for i in range(used.size):
         n += 1 if used[i] else 0
@@ -120,24 +135,25 @@ def _outlier(dots, values, used, variance, plane):
                 worst = i
     if worst >= 0:
         used[worst] = False
-        if not _plane(dots, values, used, plane):
+        if not _plane(readings, plane):
             used[worst] = True
-            _plane(dots, values, used, plane)
+            _plane(readings, plane)
             return -1
     return worst
 
 
 @kernel
-def _known(dots, values, used, variance, typical, plane, slope):
-    """Slope (2) of ``values`` and its covariance (3) at any of the dots into ``slope``; the outlier dot, -1 for
+def _known(readings, variance, typical, plane, slope):
+    """Slope (2) of `DotReadings` and its covariance (3) at any of the dots into ``slope``; the outlier dot, -1 for
     none.
 
     ``variance`` of a value by noise; ``typical`` standard deviation beside it. -2 where there is no plane.
     """
-    mine = used.copy()
-    if not _plane(dots, values, mine, plane):
+    mine = readings.used.copy()
+    own_readings = DotReadings(readings.dots, readings.values, mine)
+    if not _plane(own_readings, plane):
         return -2
-    outlier = _outlier(dots, values, mine, variance + typical * typical, plane)
+    outlier = _outlier(own_readings, variance + typical * typical, plane)
     n = 0
     for i in range(mine.size):
         n += 1 if mine[i] else 0
@@ -184,8 +200,10 @@ def _bend_inside(dots, used, slope, noise):
 
 
 @kernel
-def _add_covariance(dot, a, b, c, d, p, q, r):
-    """Add M P Mᵀ to a dot's covariance, M = [[a, b], [c, d]] and P = [[p, q], [q, r]]."""
+def _add_covariance(dot, M, P):
+    """Add M P Mᵀ to a dot's covariance, of a `Matrix2` and a `Symmetric2`."""
+    a, b, c, d = M
+    p, q, r = P
     dot[EXX] += a * a * p + 2.0 * a * b * q + b * b * r
     dot[EXY] += a * c * p + (a * d + b * c) * q + b * d * r
     dot[EYY] += c * c * p + 2.0 * c * d * q + d * d * r
@@ -213,12 +231,13 @@ def _follow(dot, slope, noise, ground, moved):
     ground *= dot[BACKGROUND]
     g00, g01 = dot[LIT] + ground * dot[DARK], dot[LIT + 1] + ground * dot[DARK + 1]
     g10, g11 = dot[LIT + 2] + ground * dot[DARK + 2], dot[LIT + 3] + ground * dot[DARK + 3]
+    G = Matrix2(g00, g01, g10, g11)
     if ground > 0.0:
         t0, t1 = BLURRED_SLOPE * s0, BLURRED_SLOPE * s1
-        _add_covariance(dot, g00, g01, g10, g11, t0 * t0, t0 * t1, t1 * t1)
+        _add_covariance(dot, G, Symmetric2(t0 * t0, t0 * t1, t1 * t1))
     # (1 - K) P
     _add_covariance(
-        dot, g00, g01, g10, g11, p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r
+        dot, G, Symmetric2(p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r)
     )  # fmt: skip
     # the dot's own slope has noise in common with its centre: -(X Kᵀ Gᵀ + G K Xᵀ)
     m00, m01 = g00 * k00 + g01 * k10, g00 * k01 + g01 * k11
@@ -256,7 +275,8 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
         return -1
     for i in range(n):
         values[i] *= count / total
-    outlier = _known(dots, values, used, dark_noise * flux_noise / count, PRINT_CONTRAST, plane, slope)
+    readings = DotReadings(dots, values, used)
+    outlier = _known(readings, dark_noise * flux_noise / count, PRINT_CONTRAST, plane, slope)
     if outlier >= 0 and _as_bright_as_its_light(
         dots, areas, used, outlier, _residual(dots[outlier], values[outlier], plane)
     ):
@@ -278,13 +298,12 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
     for i in range(n):
         values[i] = dots[i, BACKGROUND]
     # the level of some sixty pixels
-    if _known(dots, values, used, dark_noise / 60.0, PRINT_BACKGROUND, plane, slope) >= -1:
+    if _known(readings, dark_noise / 60.0, PRINT_BACKGROUND, plane, slope) >= -1:
         for i in range(n):
             if used[i]:
                 dot = dots[i]
                 moved[i, 0] -= dot[DARK] * slope[0] + dot[DARK + 1] * slope[1]
                 moved[i, 1] -= dot[DARK + 2] * slope[0] + dot[DARK + 3] * slope[1]
-                _add_covariance(
-                    dot, dot[DARK], dot[DARK + 1], dot[DARK + 2], dot[DARK + 3], slope[2], slope[3], slope[4]
-                )  # fmt: skip
+                shift = Matrix2(dot[DARK], dot[DARK + 1], dot[DARK + 2], dot[DARK + 3])
+                _add_covariance(dot, shift, Symmetric2(slope[2], slope[3], slope[4]))
     return max(outlier, -1)

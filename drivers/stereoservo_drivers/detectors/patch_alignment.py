@@ -19,8 +19,8 @@ import numpy.typing as npt
 from numba import types
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from stereoservo.numerics.compilation import inlined_kernel, kernel
-from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, INT, compile_for, given, written
+from stereoservo.numerics.compilation import Fields, inlined_kernel, kernel, plain
+from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, INT, compile_for, fields, given, written
 
 TEMPLATE_LEVELS = 4
 SMALLEST_LEVEL = 24
@@ -241,26 +241,39 @@ def _align_patch(
     return RESTLESS
 
 
+class TemplateArrays(NamedTuple):
+    """All of :class:`Templates` that alignment needs: ``steps`` (n, 6, w), ``levels`` (n, w), ``squares`` (n,), each
+    patch ``half`` pixels to either side, the mean of ``averaged`` pictures.
+    """
+
+    half: int
+    averaged: int
+    steps: npt.NDArray[np.float32]
+    levels: npt.NDArray[np.float32]
+    squares: FloatArray
+
+
+class Warps(NamedTuple):
+    """Where m patches are, in and out: ``A`` (m, 2, 2), and ``p`` (m, 2) where the templates' middles are. Out:
+    ``measured`` (m, 3): correlation, gain, noise variance [grey levels²] of one pixel of the pair; ``outcome`` (m,).
+    """
+
+    A: FloatArray
+    p: FloatArray
+    measured: FloatArray
+    outcome: IntArray
+
+
 @kernel
 def align_patches(
-    picture: ImageArray,
-    half: int,
-    steps: npt.NDArray[np.float32],
-    levels: npt.NDArray[np.float32],
-    squares: FloatArray,
-    chosen: IntArray,
-    averaged: int,
-    iterations: int,
-    A: FloatArray,
-    p: FloatArray,
-    measured: FloatArray,
-    outcome: IntArray,
+    picture: ImageArray, templates: Fields, chosen: IntArray, iterations: int, warps: Fields
 ) -> None:
-    """Move warps of the ``chosen`` (m,) templates until they fit ``picture``, all in pixels of its level.
+    """Move ``warps`` of the ``chosen`` (m,) templates until they fit ``picture``, all in pixels of its level.
 
-    In and out: ``A`` (m, 2, 2), ``p`` (m, 2) where the templates' middles are. Out: ``measured`` (m, 3): correlation,
-    gain, noise variance [grey levels²] of one pixel of the pair; ``outcome`` (m,).
+    With the fields of `TemplateArrays` and of `Warps`.
     """
+    half, averaged, steps, levels, squares = templates
+    A, p, measured, outcome = warps
     for m in range(len(chosen)):
         k = chosen[m]
         template = Template(half, averaged, steps[k], levels[k], squares[k])
@@ -271,8 +284,8 @@ def compile_kernels() -> None:
     """Compile what the alignment calls, or load it from the cache."""
     compile_for(_sample_cubic, IMAGE, FLOAT, FLOAT)
     compile_for(
-        align_patches, IMAGE, INT, given(SINGLE, 3), given(SINGLE, 2), given(FLOAT, 1), given(INT, 1), INT, INT,
-        written(FLOAT, 3), written(FLOAT, 2), written(FLOAT, 2), written(INT, 1),
+        align_patches, IMAGE, fields(INT, INT, given(SINGLE, 3), given(SINGLE, 2), given(FLOAT, 1)), given(INT, 1),
+        INT, fields(written(FLOAT, 3), written(FLOAT, 2), written(FLOAT, 2), written(INT, 1)),
     )  # fmt: skip
 
 
@@ -345,14 +358,10 @@ class ReferencePatches:
         measured, outcome = np.zeros((m, 3)), np.full(m, LOST, np.int64)
         use = np.flatnonzero(level.valid[chosen] & np.isfinite(p).all(axis=1))
         if len(use):
-            some_A, some_p, some_m = A_level[use], p[use], measured[use]
-            some_o = outcome[use]
-            align_patches(
-                picture, self.half, level.steps, level.levels, level.squares, chosen[use], self._averaged,
-                ITERATIONS, some_A,
-                some_p, some_m, some_o,
-            )  # fmt: skip
-            A_level[use], p[use], measured[use], outcome[use] = some_A, some_p, some_m, some_o
+            templates = TemplateArrays(self.half, self._averaged, level.steps, level.levels, level.squares)
+            warps = Warps(A_level[use], p[use], measured[use], outcome[use])
+            align_patches(picture, plain(templates), chosen[use], ITERATIONS, plain(warps))
+            A_level[use], p[use], measured[use], outcome[use] = warps
         found = outcome == FOUND
         G = np.zeros((m, 2, 6))
         G[:, 0, 0] = G[:, 1, 2] = d[:, 0]

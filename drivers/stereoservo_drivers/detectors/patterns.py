@@ -13,7 +13,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo_drivers.detectors.components import AREA
 from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle, misfits
-from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile_for, given, written
+from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile_for, fields, given, written
 
 CLEAR = 1.6
 """Least ratio of misfits between the second-best and the best explanation of the same dots."""
@@ -81,11 +81,13 @@ def _promising(pattern, pixels, basis, least, reach, H):
 
 
 @kernel
-def _assign(pattern, radius, pixels, areas, reach, H, owner, circle):
-    """Dots nearest to the projected pattern into ``owner`` (n,), -1 where none has the right place and size.
+def _assign(face, dots, reach, H, owner, circle):
+    """Dots nearest to the projected pattern of a face into ``owner`` (n,), -1 where none has the right place and size.
 
     Returns their number; 0 where the homography does not show the pattern from in front.
     """
+    pattern, radius = face.pattern, face.radius
+    pixels, areas = dots
     n = pattern.shape[0]
     count = 0
     for i in range(n):
@@ -142,6 +144,27 @@ def _sizes_agree(foretold, depths, least, areas, quadruple, missing):
     return True
 
 
+class SearchedFaces(NamedTuple):
+    """f faces of n dots that are searched for: ``patterns`` (f, n, 2) with dots of ``radii`` (f,) [pattern units]; each
+    with b quadruples of its dots, ``bases`` (f, b, 4), and the :func:`basis_inverse` of each, ``inverses``
+    (f, b, 3, 3).
+    """
+
+    patterns: FloatArray
+    radii: FloatArray
+    bases: IntArray
+    inverses: FloatArray
+
+
+class SearchedFace(NamedTuple):
+    """One of `SearchedFaces`."""
+
+    pattern: FloatArray
+    radius: float
+    bases: IntArray
+    inverses: FloatArray
+
+
 class Dots(NamedTuple):
     """What a face is searched among: ``pixels`` (m, 2) and ``areas`` (m,) [px²]."""
 
@@ -164,6 +187,13 @@ class Rivals(NamedTuple):
     fits: FloatArray
 
 
+class Best(NamedTuple):
+    """How many ``dots`` the best explanation so far has, and how many ``rivals`` have as many."""
+
+    dots: int
+    rivals: int
+
+
 class Scratch(NamedTuple):
     """Memory of one search: a homography, a circle's image, two assignments (n,), and dots to fit to."""
 
@@ -177,16 +207,17 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def _explain(pattern, radius, dots, gates, rivals, best_count, known, scratch):
+def _explain(face, dots, gates, rivals, best, scratch):
     """Number of dots that the homography in ``scratch`` explains, 0 if refused, and their misfit [px] from the better
-    homography that is fitted to all of them. Fewer than ``best_count``, or what is known as a rival, are refused.
+    homography that is fitted to all of them. Fewer than the ``best`` has, or what is known as a rival, are refused.
     """
     H, circle, trial, again, used, matched, distances = scratch
-    count = _assign(pattern, radius, dots.pixels, dots.areas, gates.reach, H, trial, circle)
-    if count < gates.least or count < best_count:
+    pattern = face.pattern
+    count = _assign(face, dots, gates.reach, H, trial, circle)
+    if count < gates.least or count < best.dots:
         return 0, 0.0
-    if count == best_count:
-        for c in range(known):
+    if count == best.dots:
+        for c in range(best.rivals):
             same = True
             for d in range(trial.size):
                 same = same and rivals.owners[c, d] == trial[d]
@@ -203,7 +234,7 @@ def _explain(pattern, radius, dots, gates, rivals, best_count, known, scratch):
     if misfit > gates.tolerance:
         return 0, 0.0
     # sizes once more, under the better homography
-    if _assign(pattern, radius, dots.pixels, dots.areas, gates.reach, H, again, circle) < count:
+    if _assign(face, dots, gates.reach, H, again, circle) < count:
         return 0, 0.0
     return count, misfit
 
@@ -254,24 +285,24 @@ def _fourths(us, vs, three, turns, limit, out):
 
 
 @kernel
-def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tolerance, owner):
-    """Search a pattern (n, 2) with dots of ``radius`` [pattern units] among dots (m, 2) [px] of ``areas``
-    (m,) [px²].
+def find_face(face, dots, gates, owner):
+    """Search a `SearchedFace` among `Dots`.
 
-    Every ordered quadruple of dots is held against every row of ``bases`` (b, 4) with its ``inverses``
-    (b, 3, 3), pruned by the signs and sizes of its triangles, which the dots' areas foretell. A hypothesis
-    counts when ``least`` dots or more lie within ``tolerance`` [px] of the homography fitted to all of them
-    and are of the right size; ``reach`` [px] is how far a dot may lie from the homography of the quadruple.
+    Every ordered quadruple of dots is held against every row of the face's bases, pruned by the signs and sizes of its
+    triangles, which the dots' areas foretell. A hypothesis counts when as many dots as the `Gates` ask for lie within
+    their tolerance of the homography fitted to all of them and are of the right size.
     ``owner`` (n,) gets the dots' rows, -1 for missing ones. Returns the number found; 0 if none, or if
     another assignment of some of the same dots explains as many nearly as well. (One of quite other dots is a second
     copy of the pattern, which is found when these are taken away.)
     """
+    pattern, radius, bases, inverses = face
+    pixels, areas = dots
+    least, reach, tolerance = gates
     n, m = pattern.shape[0], pixels.shape[0]
     unit = np.pi * radius * radius
     third = 1.0 / (3.0 * unit)
     smallest, fourths = _least_areas(areas), np.empty(m, np.int64)
     us, vs = pixels[:, 0].copy(), pixels[:, 1].copy()
-    dots, gates = Dots(pixels, areas), Gates(least, reach, tolerance)
     rivals = Rivals(np.zeros((MOST_RIVALS, n), np.int64), np.zeros(MOST_RIVALS))
     scratch = Scratch(
         np.zeros((3, 3)), np.zeros(7), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_),
@@ -307,9 +338,7 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
                             continue
                         if not _promising(pattern, pixels, basis, wanted, reach + 0.5, scratch.H):
                             continue
-                        count, misfit = _explain(
-                            pattern, radius, dots, gates, rivals, best_count, known, scratch
-                        )
+                        count, misfit = _explain(face, dots, gates, rivals, Best(best_count, known), scratch)
                         if count == 0:
                             continue
                         if count > best_count:
@@ -329,13 +358,15 @@ def find_face(pattern, radius, pixels, areas, bases, inverses, least, reach, tol
 
 
 @kernel
-def find_copies(pattern, radius, bases, inverses, centres, areas, least, reach, tolerance, owners):
+def find_copies(face, dots, gates, owners):
     """All occurrences of a face among dots, as :func:`find_face` finds one, into ``owners`` (k, n); their number."""
+    pattern, radius, bases, inverses = face
+    centres, areas = dots
     m, n = areas.size, pattern.shape[0]
     left = np.arange(m)
     pixels, sizes, owner = np.empty((m, 2)), np.empty(m), np.empty(n, np.int64)
     count = 0
-    while m >= least and count < owners.shape[0]:
+    while m >= gates.least and count < owners.shape[0]:
         for k in range(m):
             pixels[k, 0], pixels[k, 1], sizes[k] = centres[left[k], 0], centres[left[k], 1], areas[left[k]]
         # the first basis is the corners, the others stand in where one is hidden
@@ -343,10 +374,8 @@ def find_copies(pattern, radius, bases, inverses, centres, areas, least, reach, 
         found = 0
         while first < bases.shape[0] and found == 0:
             end = 1 if first == 0 else bases.shape[0]
-            found = find_face(
-                pattern, radius, pixels[:m], sizes[:m], bases[first:end], inverses[first:end], least, reach,
-                tolerance, owner,
-            )  # fmt: skip
+            some = SearchedFace(pattern, radius, bases[first:end], inverses[first:end])
+            found = find_face(some, Dots(pixels[:m], sizes[:m]), gates, owner)
             first = end
         if found == 0:
             break
@@ -365,23 +394,22 @@ def find_copies(pattern, radius, bases, inverses, centres, areas, least, reach, 
 
 
 @kernel
-def find_faces(patterns, radii, bases, inverses, sought, spots, gates, owners, counts):
-    """Occurrences of the faces (f, n, 2) that are ``sought`` (f,) among ``spots`` (m, FIELDS) into ``owners``
-    (f, k, n), their numbers into ``counts`` (f,). ``gates``: as :func:`find_face` takes them (3,).
+def find_faces(faces, sought, spots, gates, owners, counts):
+    """Occurrences of those `SearchedFaces` that are ``sought`` (f,) among ``spots`` (m, FIELDS) into ``owners``
+    (f, k, n), their numbers into ``counts`` (f,). Faces and `Gates` are the fields of their records.
     """
-    centres, areas = spots[:, :2].copy(), spots[:, AREA].copy()
+    patterns, radii, bases, inverses = faces
+    dots = Dots(spots[:, :2].copy(), spots[:, AREA].copy())
     for f in range(radii.size):
         counts[f] = 0
         if sought[f]:
-            counts[f] = find_copies(
-                patterns[f], radii[f], bases[f], inverses[f], centres, areas, int(gates[0]), gates[1], gates[2],
-                owners[f],
-            )  # fmt: skip
+            face = SearchedFace(patterns[f], radii[f], bases[f], inverses[f])
+            counts[f] = find_copies(face, dots, Gates(*gates), owners[f])
 
 
 def compile_kernels() -> None:
     """Compile what the detector calls, or load it from the cache."""
     compile_for(
-        find_faces, given(FLOAT, 3), given(FLOAT, 1), given(INT, 3), given(FLOAT, 4), given(BOOL, 1),
-        written(FLOAT, 2), given(FLOAT, 1), written(INT, 3), written(INT, 1),
+        find_faces, fields(given(FLOAT, 3), given(FLOAT, 1), given(INT, 3), given(FLOAT, 4)), given(BOOL, 1),
+        written(FLOAT, 2), fields(INT, FLOAT, FLOAT), written(INT, 3), written(INT, 1),
     )  # fmt: skip

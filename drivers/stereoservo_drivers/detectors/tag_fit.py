@@ -8,16 +8,17 @@ slopes, black as a part of white: light that falls off does so on both.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel, reassociating_kernel
 from stereoservo.numerics.linear import cholesky_solve, factor_solve
 from stereoservo_drivers.detectors.homographies import inverse_of, square_to_quad
+from stereoservo_drivers.detectors.tag_samples import Samples, TagPlace, percentiles, sample_tag
 
 PARAMETERS = 13
-QUIET_CELLS = 0.5
-"""Fitted part of the white margin [cells]; a printed tag has one cell at least."""
 FEW_PIXELS, MOST_PIXELS = 250, 1500
 """Of larger tags every n-th pixel is taken, on a lattice: at first, and at last."""
 LEAST_BLUR, MOST_BLUR = 0.2, 4.0
@@ -150,11 +151,23 @@ def _darken(cells, work, size, across, down):
         work[7, k], work[8, k], work[9, k], work[10, k] = dark, dark_x, dark_y, dark_s
 
 
+class Sums(NamedTuple):
+    """Of a fit: the normal equations, the lower triangle of ``A`` (14, 14), whose last row is the right side and the
+    sum of squares; ``totals`` (8,): Huber's cost, the sums of squares of the clipped residuals, of pixels that are not
+    clipped, of |residual|, of model, model squared, model times grey (the three for the correlation), and of pixels
+    that tell nothing.
+    """
+
+    A: FloatArray
+    totals: FloatArray
+
+
 @reassociating_kernel
-def _differentiate(grey, us, vs, p, n, work, J):
+def _differentiate(samples, p, n, work, J):
     """Residuals of the pixels of `_darken` into the last row of ``J`` (14, ...), derivatives of the model into the
     others; the model into the first row of ``work``.
     """
+    grey, us, vs = samples
     for k in range(grey.size):
         u, v, inverse = us[k], vs[k], work[0, k]
         x, y, dark = work[1, k] / n, work[2, k] / n, work[7, k]
@@ -191,15 +204,14 @@ def _shown(p, us, vs):
 
 
 @reassociating_kernel
-def accumulate(grey, us, vs, cells, p, huber, A, totals):
-    """Normal equations of the fit at parameters ``p`` (13,): the lower triangle of ``A`` (14, 14), whose last row is
-    the right side and the sum of squares.
+def accumulate(samples, cells, p, huber, sums):
+    """`Sums` of the fit at parameters ``p`` (13,), into ``sums``.
 
-    ``grey`` (m,) [levels] at ``us``, ``vs`` (m,). Residuals beyond ``huber`` [levels] count linearly; a pixel at the
-    sensor's limit that the model has brighter tells nothing. ``totals`` (8,) gets Huber's cost, the sums of squares of
-    the clipped residuals, of pixels that are not clipped, of |residual|, of model, model squared, model times grey (the
-    three for the correlation), and of pixels that tell nothing. False where the homography does not show the tag.
+    Residuals beyond ``huber`` [levels] count linearly; a pixel at the sensor's limit that the model has brighter tells
+    nothing. False where the homography does not show the tag.
     """
+    grey, us, vs = samples
+    A, totals = sums
     n = cells.shape[0]
     A[:] = 0.0
     totals[:] = 0.0
@@ -212,7 +224,7 @@ def accumulate(grey, us, vs, cells, p, huber, A, totals):
         u, v = us[first : first + size], vs[first : first + size]
         _place(u, v, p, n, work)
         _darken(cells, work, size, across, down)
-        _differentiate(grey[first : first + size], u, v, p, n, work, J)
+        _differentiate(Samples(grey[first : first + size], u, v), p, n, work, J)
         for k in range(size):
             value = work[0, k]
             if grey[first + k] >= SATURATED and value > grey[first + k]:
@@ -245,11 +257,12 @@ def accumulate(grey, us, vs, cells, p, huber, A, totals):
 
 
 @kernel
-def cell_errors(grey, us, vs, cells, p, out):
+def cell_errors(samples, cells, p, out):
     """How far each cell (n, n) is off the grey that the code gives it, in parts of the contrast, into ``out``.
 
     By least squares, so that a neighbour's blur is no error; 0 where a cell has no pixel.
     """
+    grey, us, vs = samples
     n = cells.shape[0]
     across, down = np.zeros((3, n)), np.zeros((3, n))
     wx, wy = across[0], down[0]
@@ -275,62 +288,6 @@ def cell_errors(grey, us, vs, cells, p, out):
         for i in range(n):
             if squares[j, i] > 0.0:
                 out[j, i] = abs(out[j, i]) / squares[j, i]
-
-
-@kernel
-def _sample(image, h, g, u0, v0, side, n, most, grey, us, vs):
-    """Number of the pixels within the tag and its quiet margin, about ``most`` of them on a lattice: ``grey`` (k,) and
-    local places ``us``, ``vs`` (k,), of which no more are written than there is room. ``h``, ``g`` (9,): the
-    to the tag and its inverse; (u0, v0) and ``side`` [px]: origin and unit of local places.
-    """
-    height, width = image.shape
-    low, high = -QUIET_CELLS / n, 1.0 + QUIET_CELLS / n
-    u_low, u_high, v_low, v_high = math.inf, -math.inf, math.inf, -math.inf
-    area, u_last, v_last = 0.0, 0.0, 0.0
-    for k in range(5):
-        x, y = (high if k in (1, 2) else low), (high if k in (2, 3) else low)
-        w = g[6] * x + g[7] * y + 1.0
-        if not w > 1e-6:
-            return 0
-        u, v = (g[0] * x + g[1] * y + g[2]) / w * side + u0, (g[3] * x + g[4] * y + g[5]) / w * side + v0
-        u_low, u_high, v_low, v_high = min(u_low, u), max(u_high, u), min(v_low, v), max(v_high, v)
-        if k:
-            area += 0.5 * (u_last * v - u * v_last)
-        u_last, v_last = u, v
-    if not (u_high > 0.0 and v_high > 0.0 and u_low < width - 1.0 and v_low < height - 1.0):
-        return 0
-    first_u, last_u = int(max(math.floor(u_low), 0)), int(min(math.ceil(u_high), width - 1))
-    first_v, last_v = int(max(math.floor(v_low), 0)), int(min(math.ceil(v_high), height - 1))
-    stride = max(1, math.ceil(abs(area) / most))
-    slant = round(0.618 * stride)
-    count = 0
-    for row in range(first_v, last_v + 1):
-        v = (row - v0) / side
-        for column in range(first_u + (-first_u - slant * row) % stride, last_u + 1, stride):
-            u = (column - u0) / side
-            w = h[6] * u + h[7] * v + 1.0
-            x, y = h[0] * u + h[1] * v + h[2], h[3] * u + h[4] * v + h[5]
-            if w > 0.0 and low * w <= x <= high * w and low * w <= y <= high * w and count < grey.size:
-                grey[count] = image[row, column]
-                us[count], vs[count] = u, v
-                count += 1
-    return count
-
-
-@kernel
-def _percentiles(grey):
-    """Grey levels that a tenth and nine tenths of ``grey`` (m,), whole levels, do not exceed."""
-    counts = np.zeros(256, np.int64)
-    for k in range(grey.size):
-        counts[int(grey[k])] += 1
-    black, white, total = -1, -1, 0
-    for level in range(256):
-        total += counts[level]
-        if black < 0 and total * 10 >= grey.size:
-            black = level
-        if white < 0 and total * 10 >= grey.size * 9:
-            white = level
-    return float(black), float(white)
 
 
 @kernel
@@ -374,25 +331,24 @@ def _correlation(grey, totals):
 
 
 @kernel
-def _approach(grey, us, vs, cells, p, side, A, totals):
+def _approach(samples, cells, p, side, sums):
     """Levenberg-Marquardt with Huber's loss from a start that may be off by some pixels, until a step is shorter than
-    NEAR_PX; ``p``, ``A``, ``totals`` are those of its end. False where it finds nothing like the tag.
+    NEAR_PX; ``p`` and ``sums`` are those of its end. False where it finds nothing like the tag.
     """
+    grey, (A, totals) = samples.grey, sums
     low, high = math.log(LEAST_BLUR / side), math.log(MOST_BLUR / side)
     A_new, totals_new = np.zeros_like(A), np.zeros_like(totals)
+    tried = Sums(A_new, totals_new)
     step, trial = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     huber, damping = 1e6, 1e-3
-    if not accumulate(grey, us, vs, cells, p, huber, A, totals) or _correlation(grey, totals) < HOPELESS:
+    if not accumulate(samples, cells, p, huber, sums) or _correlation(grey, totals) < HOPELESS:
         return False
     for _ in range(FIRST_PASSES):
         if not _step(A, damping, step):
             return False
         trial[:] = p + step
         trial[8] = min(max(trial[8], low), high)
-        if (
-            not accumulate(grey, us, vs, cells, trial, huber, A_new, totals_new)
-            or not totals_new[0] <= totals[0]
-        ):
+        if not accumulate(samples, cells, trial, huber, tried) or not totals_new[0] <= totals[0]:
             damping *= 10.0
             if damping > 1e6:
                 break
@@ -406,12 +362,13 @@ def _approach(grey, us, vs, cells, p, side, A, totals):
 
 
 @kernel
-def _refine(grey, us, vs, cells, p, side, huber, A, totals):
+def _refine(samples, cells, p, side, huber, sums):
     """Gauss-Newton from a near start with Huber's loss, until a step is shorter than SETTLED_PX."""
+    grey, (A, totals) = samples.grey, sums
     low, high = math.log(LEAST_BLUR / side), math.log(MOST_BLUR / side)
     step = np.zeros(PARAMETERS)
     for _ in range(LAST_PASSES):
-        if not accumulate(grey, us, vs, cells, p, huber, A, totals) or not _step(A, 1e-9, step):
+        if not accumulate(samples, cells, p, huber, sums) or not _step(A, 1e-9, step):
             return False
         p[:PARAMETERS] += step
         p[8] = min(max(p[8], low), high)
@@ -423,22 +380,22 @@ def _refine(grey, us, vs, cells, p, side, huber, A, totals):
 
 
 @kernel
-def _clustered(grey, us, vs, cells, p, huber, B):
+def _clustered(samples, cells, p, huber, B):
     """Covariance ``B`` (13, 13) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
     shadow's edge for one, leaves residuals that are alike within a cell, and do not average out as noise does.
     """
+    grey, us, vs = samples
     n = cells.shape[0]
     across, down = np.zeros((3, n)), np.zeros((3, n))
     J, work = np.empty((PARAMETERS + 1, BLOCK)), np.empty((11, BLOCK))
     sums = np.zeros((n + 2, n + 2, PARAMETERS))
     for first in range(0, grey.size, BLOCK):
         size = min(BLOCK, grey.size - first)
-        _place(us[first : first + size], vs[first : first + size], p, n, work)
+        some = Samples(grey[first : first + size], us[first : first + size], vs[first : first + size])
+        _place(some.us, some.vs, p, n, work)
         _darken(cells, work, size, across, down)
         i, j = np.floor(work[1, :size]), np.floor(work[2, :size])
-        _differentiate(
-            grey[first : first + size], us[first : first + size], vs[first : first + size], p, n, work, J
-        )
+        _differentiate(some, p, n, work, J)
         for k in range(size):
             off = J[PARAMETERS, k]
             if grey[first + k] >= SATURATED and off < 0.0:
@@ -456,11 +413,12 @@ def _clustered(grey, us, vs, cells, p, huber, B):
 
 
 @kernel
-def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
+def _corners(place, A, B, variance, corners, covariances):
     """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
     where the gradient's covariance ``B`` (13, 13) is more than that of such noise. Returns the variance [px²] that this
     adds, in the mean over the coordinates; -1 where the normal equations are singular.
     """
+    h, g, u0, v0, side = place
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)
     N, C = np.empty((PARAMETERS, PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
     for a in range(PARAMETERS):
@@ -522,13 +480,14 @@ def _corners(h, g, A, B, variance, u0, v0, side, corners, covariances):
 
 
 @kernel
-def fit_tag(image, start, cells, blur_px, corners, covariances, told):
+def fit_tag(image, start, cells, blur_px, found):
     """Fit the pattern of ``cells`` (n, n) to an image (h, w) about ``start`` (4, 2) [px], with a blur of ``blur_px`` at
-    first: ``corners`` (4, 2), ``covariances`` (4, 2, 2), and in ``told`` (5,) noise variance, contrast, blur,
+    first. Into ``found``: corners (4, 2), covariances (4, 2, 2), and (5,) noise variance, contrast, blur,
     correlation, and the part of the covariances [px²] that is misfit.
 
     False where the fit cannot be believed.
     """
+    corners, covariances, told = found
     n = cells.shape[0]
     u0, v0 = start[:, 0].mean(), start[:, 1].mean()
     area, longest = 0.0, 0.0
@@ -546,38 +505,40 @@ def fit_tag(image, start, cells, blur_px, corners, covariances, told):
     if not square_to_quad(quad, g) or not inverse_of(g, h):
         return False
     grey, us, vs = np.empty(2 * MOST_PIXELS), np.empty(2 * MOST_PIXELS), np.empty(2 * MOST_PIXELS)
-    few = _sample(image, h, g, u0, v0, side, n, FEW_PIXELS, grey, us, vs)
+    place, room = TagPlace(h, g, u0, v0, side), Samples(grey, us, vs)
+    few = sample_tag(image, place, n, FEW_PIXELS, room)
     if few < 4 * PARAMETERS:
         return False
-    black, white = _percentiles(grey[:few])
+    black, white = percentiles(grey[:few])
     p[:8] = h[:8]
     p[8], p[9], p[12] = math.log(blur_px / side), white, black / max(white, 1.0)
     A, totals = np.zeros((PARAMETERS + 1, PARAMETERS + 1)), np.zeros(TOTALS)
-    if not _approach(grey[:few], us[:few], vs[:few], cells, p, side, A, totals):
+    if not _approach(Samples(grey[:few], us[:few], vs[:few]), cells, p, side, Sums(A, totals)):
         return False
     huber = max(HUBER * SIGMA_OF_MEAN * totals[3] / few, 1.0)
     h[:8] = p[:8]
     if not inverse_of(h, g):
         return False
-    m = _sample(image, h, g, u0, v0, side, n, MOST_PIXELS, grey, us, vs)
-    if m < 4 * PARAMETERS or not _refine(grey[:m], us[:m], vs[:m], cells, p, side, huber, A, totals):
+    m = sample_tag(image, place, n, MOST_PIXELS, room)
+    samples = Samples(grey[:m], us[:m], vs[:m])
+    if m < 4 * PARAMETERS or not _refine(samples, cells, p, side, huber, Sums(A, totals)):
         return False
-    correlation = _correlation(grey[:m], totals)
+    correlation = _correlation(samples.grey, totals)
     if not correlation >= MIN_CORRELATION or totals[2] < 2 * PARAMETERS:
         return False
     errors = np.zeros((n, n))
-    cell_errors(grey[:m], us[:m], vs[:m], cells, p, errors)
+    cell_errors(samples, cells, p, errors)
     if not errors.max() <= MAX_CELL_ERROR:
         return False
     # Huber's estimator: E[psi²] / E[psi']², over the matrix of all pixels, whose sum A nearly is
     told_by = m - totals[7]
     variance = max(totals[1] / (told_by - PARAMETERS) * (told_by / totals[2]), QUANTISATION)
     B = np.empty((PARAMETERS, PARAMETERS))
-    _clustered(grey[:m], us[:m], vs[:m], cells, p, huber, B)
+    _clustered(samples, cells, p, huber, B)
     h[:8] = p[:8]
     if not inverse_of(h, g):
         return False
-    told[4] = _corners(h, g, A, B, variance, u0, v0, side, corners, covariances)
+    told[4] = _corners(place, A, B, variance, corners, covariances)
     if not told[4] >= 0.0:
         return False
     shift = 0.0

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, compile_for, given, written
+from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, compile_for, fields, given, written
 from stereoservo_drivers.detectors.tag_fit import fit_tag
 
 FIRST_BLUR_PX = 1.0
@@ -51,7 +51,7 @@ def register_tag(
     """
     corners, covariances, told = np.empty((4, 2)), np.empty((4, 2, 2)), np.empty(5)
     start = np.ascontiguousarray(start, dtype=np.float64)
-    if not fit_tag(np.ascontiguousarray(image), start, cells, blur_px, corners, covariances, told):
+    if not fit_tag(np.ascontiguousarray(image), start, cells, blur_px, (corners, covariances, told)):
         return None
     return Registered(corners, 0.5 * (covariances + covariances.transpose(0, 2, 1)), *told.tolist())
 
@@ -64,9 +64,7 @@ def compile_kernels() -> None:
         given(FLOAT, 2),
         given(FLOAT, 2),
         FLOAT,
-        written(FLOAT, 2),
-        written(FLOAT, 3),
-        written(FLOAT, 1),
+        fields(written(FLOAT, 2), written(FLOAT, 3), written(FLOAT, 1)),
     )
 
 

@@ -16,7 +16,6 @@ from msgspec import Meta
 
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, Frame, Prior
-from stereoservo_drivers.detectors.frame_images import sized_image
 from stereoservo_drivers.edges.line_measurement import (
     MeasuredLine,
     compile_kernels,
@@ -32,6 +31,7 @@ from stereoservo_drivers.edges.part_pose import (
     pose_from_pixels,
     segments_in_sight,
 )
+from stereoservo_drivers.frame_images import sized_image
 from stereoservo_drivers.options import decode_options
 
 Positive = Annotated[float, Meta(gt=0)]

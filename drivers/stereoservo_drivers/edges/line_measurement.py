@@ -8,13 +8,14 @@ smoothed by a Gaussian of ``SMOOTH`` px. The noise of these places is taken from
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
-from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, given, written
+from stereoservo.numerics.compilation import Fields, kernel, plain
+from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, fields, given, written
 
 STEP = 0.5
 """Of profiles [px]."""
@@ -166,8 +167,9 @@ def measure_lines(
         half = 0.5 * float(np.linalg.norm(b - a))
         reach = float(profiles.at[-1]) if coarse else 0.0
         fits = np.zeros((2, 7))
+        places = plain(EdgePlaces(profiles.t[own], offsets[own], slopes[own]))
         for row, sign in enumerate((-1.0, 1.0)):
-            fit_line(profiles.t[own], offsets[own], slopes[own], sign, half, reach, fits[row])
+            fit_line(places, sign, half, reach, fits[row])
         best = fits[int(fits[1, 0] > fits[0, 0])]
         if best[0] < LEAST_SHARE * own.sum():
             continue
@@ -179,23 +181,26 @@ def measure_lines(
     return lines
 
 
+class EdgePlaces(NamedTuple):
+    """Steep places of n profiles across a segment, c of each: ``t`` (n,) [px] along it, ``offsets`` (n, c) [px] from
+    it, NaN where there are fewer, and ``slopes`` (n, c) there.
+    """
+
+    t: FloatArray
+    offsets: FloatArray
+    slopes: FloatArray
+
+
 @kernel
-def fit_line(
-    t: FloatArray,
-    offsets: FloatArray,
-    slopes: FloatArray,
-    sign: float,
-    half: float,
-    reach: float,
-    found: FloatArray,
-) -> None:
-    """Line through the places ``offsets`` (n, c) [px] at ``t`` (n,) [px] whose ``slopes`` have ``sign``: ``found`` (7,)
+def fit_line(places: Fields, sign: float, half: float, reach: float, found: FloatArray) -> None:
+    """Line through those of the ``places`` (the fields of `EdgePlaces`) whose slopes have ``sign``: ``found`` (7,)
     gets how many profiles have a place on it (0: there is no line), offset, tilt, their covariance (1 1, 1 2, 2 2)
     [px²] and the places' rms distance from it.
 
     Places count by their slopes' squares. The search begins at the line on which most places within
     ``reach`` lie, or at 0 where reach is 0; ``half``: half the segment's length.
     """
+    t, offsets, slopes = places
     n, c = offsets.shape
     a, b, gate = 0.0, 0.0, 1.5
     found[:] = 0.0
@@ -249,7 +254,12 @@ def fit_line(
 def compile_kernels() -> None:
     """Compile what the measurement calls, or load it from the cache."""
     compile_for(
-        fit_line, given(FLOAT, 1), given(FLOAT, 2), given(FLOAT, 2), FLOAT, FLOAT, FLOAT, written(FLOAT, 1)
+        fit_line,
+        fields(given(FLOAT, 1), given(FLOAT, 2), given(FLOAT, 2)),
+        FLOAT,
+        FLOAT,
+        FLOAT,
+        written(FLOAT, 1),
     )
 
 

@@ -33,20 +33,24 @@ CHUNK = 1024
 """Measurements whose rows are in memory at once."""
 
 
+class Motions(NamedTuple):
+    """Partial products ``before`` and ``after`` each joint, and the ``basis`` (4, 4, p) of the generators' parameters,
+    those of joint j from ``start`` (n + 1,) j on.
+    """
+
+    before: FloatArray
+    after: FloatArray
+    basis: FloatArray
+    start: IntArray
+
+
 @kernel
-def _displacement_derivative(
-    before: FloatArray,
-    after: FloatArray,
-    generator_basis: FloatArray,
-    generator_start: IntArray,
-    stop: int,
-    half: FloatArray,
-    change: FloatArray,
-) -> None:
+def _displacement_derivative(motions: Motions, stop: int, half: FloatArray, change: FloatArray) -> None:
     """Derivative ``change`` (4, 4, p) of the displacement at a stop by the generators; ``half`` (4, 4, p) is scratch.
 
     ``d exp(qĤ) = [L, exp(qĤ)]``: the joints before it on the left, those behind on the right.
     """
+    before, after, generator_basis, generator_start = motions
     change[:] = 0.0
     for side in range(2):
         sign = 1.0 - 2.0 * side
@@ -108,17 +112,6 @@ def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: Fl
             own[row, a] = total
 
 
-class Motions(NamedTuple):
-    """Partial products ``before`` and ``after`` each joint, and the ``basis`` (4, 4, p) of the generators' parameters,
-    those of joint j from ``start`` (n + 1,) j on.
-    """
-
-    before: FloatArray
-    after: FloatArray
-    basis: FloatArray
-    start: IntArray
-
-
 class Projections(NamedTuple):
     """``cameras`` (c, 3, 4) and ``lenses`` (c, 7), with the bases of their parameters and where each camera's begin."""
 
@@ -140,21 +133,27 @@ class Sightings(NamedTuple):
     sigmas: FloatArray
 
 
+class Markers(NamedTuple):
+    """The markers' ``points`` (m, 4) and the ``basis`` (m, 3 or 0, 4) of each one's parameters."""
+
+    points: FloatArray
+    basis: FloatArray
+
+
 @kernel
 def _rows_into(
-    motions: Motions, projections: Projections, points: FloatArray, point_basis: FloatArray, seen: Sightings,
-    core: FloatArray, own: FloatArray,
+    motions: Motions, projections: Projections, markers: Markers, seen: Sightings, core: FloatArray, own: FloatArray
 ) -> None:  # fmt: skip
     """Fill weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's
     first.
 
     ``core`` (2 k, p + 1), zero on entry: derivatives by generators, cameras and lenses, then the residual. ``own``
-    (2 k, 3 or 0): by the coordinates of the measurement's own marker, with ``point_basis`` (m, 3 or 0, 4).
+    (2 k, 3 or 0): by the coordinates of the measurement's own marker.
     """
-    before, after, generator_basis, generator_start = motions
+    after, width = motions.after, motions.basis.shape[2]
+    points, point_basis = markers
     cameras, camera_basis, camera_start, lenses, lens_basis, lens_start = projections
     camera, stop, marker, pixels, sigmas = seen
-    width = generator_basis.shape[2]
     lens_at = width + camera_basis.shape[0]
     residual_at = core.shape[1] - 1
     half = np.zeros((4, 4, width))
@@ -167,7 +166,7 @@ def _rows_into(
     for k in range(len(camera)):
         s, i, c = stop[k], marker[k], camera[k]
         if s != last_stop:
-            _displacement_derivative(before, after, generator_basis, generator_start, s, half, change)
+            _displacement_derivative(motions, s, half, change)
         H = after[0, s]
         if s != last_stop or i != last_marker:
             _point_derivative(H, change, points[i], world, shift)
@@ -291,7 +290,8 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
         seen = Sightings(
             data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here]
         )
-        _rows_into(motions, projections, np.ascontiguousarray(rig.points), point_basis, seen, core, own)
+        markers = Markers(np.ascontiguousarray(rig.points), point_basis)
+        _rows_into(motions, projections, markers, seen, core, own)
         yield here, Rows(core, own, data.marker[here])
 
 

@@ -73,6 +73,19 @@ class Components(NamedTuple):
     status: IntArray
 
 
+class CentredFace(NamedTuple):
+    """A face, moved in parallel so that its middle is the ``centre`` (4,) of its body: ``points`` (3, 4) now and at the
+    goal, ``targets``, their unit planes ``now`` and ``then`` (4,); ``unit_centre`` (4,): the centre at length 1.
+    """
+
+    centre: FloatArray
+    unit_centre: FloatArray
+    now: FloatArray
+    then: FloatArray
+    points: FloatArray
+    targets: FloatArray
+
+
 @kernel
 def decompose(freedoms: Freedoms, task: FaceTask) -> Components:
     """The components of a motion, of an arm of such freedoms."""
@@ -86,7 +99,7 @@ def decompose(freedoms: Freedoms, task: FaceTask) -> Components:
     A_r = _shifted(targets, centre)
     a = unit(minors(A_c[0], A_c[1], A_c[2]))
     a_t = unit(minors(A_r[0], A_r[1], A_r[2]))
-    _hinge(freedoms, centre, unit_centre, a, a_t, A_c, A_r, system, found)
+    _hinge(freedoms, CentredFace(centre, unit_centre, a, a_t, A_c, A_r), system, found)
     set_plane_columns(freedoms.motions, a, system, 0)
     set_point_columns(freedoms.motions, unit_centre, system, 4)
     found.status[2] = NOT_REACHABLE
@@ -140,14 +153,12 @@ def _translation(
 
 
 @kernel
-def _hinge(
-    freedoms: Freedoms, centre: FloatArray, unit_centre: FloatArray, a: FloatArray, a_t: FloatArray,
-    A_c: FloatArray, A_r: FloatArray, system: FloatArray, found: Components,
-) -> None:  # fmt: skip
-    """The hinge of the face's plane ``a`` (4,) to ``a_t`` into the second of the components.
+def _hinge(freedoms: Freedoms, face: CentredFace, system: FloatArray, found: Components) -> None:
+    """The hinge of the face's plane to that at the goal into the second of the components.
 
-    The face's points at the goal, ``A_r`` (3, 4), are turned back by it; ``A_c`` (3, 4): those now.
+    The face's points at the goal are turned back by it; ``system`` (r, 8): scratch.
     """
+    centre, unit_centre, a, a_t, A_c, A_r = face
     together = dot(a, a_t)
     difference = np.empty(4)
     for k in range(4):

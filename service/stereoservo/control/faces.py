@@ -19,7 +19,7 @@ from stereoservo.control.marker_groups import IN_PLANE, MarkerGroups, find_group
 from stereoservo.control.primitives_kernel import dot, minors
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel, plain
 
 LEAST_ALTITUDE = 10.0
 """Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
@@ -101,9 +101,7 @@ def select_faces(
     counts = np.diff(groups.starts)
     whole = seen_whole(groups.starts, groups.members, seen)
     rank = np.lexsort((-groups.roundness, -counts, -whole))
-    triples, members, sided = outward_faces(
-        groups.triples, groups.starts, groups.members, groups.sides, rank, points, camera_centres, seen
-    )
+    triples, members, sided = outward_faces(groups, rank, points, camera_centres, seen)
     return Faces(triples, members, sided, points)
 
 
@@ -174,10 +172,10 @@ def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT
     more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
     do.
     """
-    face, triple, cameras, kept = choose_face_step(
-        *faces, scene.points, scene.pixels, scene.weights, task.target_points, task.target_known,
-        scene.camera_centres, before.face, before.triple,
-    )  # fmt: skip
+    shown, goal = (scene.points, scene.pixels, scene.weights), (task.target_points, task.target_known)
+    face, triple, cameras, kept = _choose_face(
+        plain(faces), shown, goal, scene.camera_centres, (before.face, before.triple)
+    )
     changed = before.cameras > 0 and (cameras == 0 or set(triple.tolist()) != set(before.triple.tolist()))
     return FaceChoice(face, triple, cameras, kept, changed)
 
@@ -194,6 +192,32 @@ def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
 
 
 # -- kernels, without BLAS ------------------------------------------------------------------------------------
+
+
+class ShownBody(NamedTuple):
+    """The markers of a body as they are: ``points`` (m, 4), and in c cameras ``pixels`` (c, m, 2) and ``weights``
+    (c, m), 0 where a marker is not seen.
+    """
+
+    points: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+
+
+class BodyGoal(NamedTuple):
+    """Where the markers of a body shall be: ``points`` (m, 4) where ``known`` (m,) is 1."""
+
+    points: FloatArray
+    known: FloatArray
+
+
+class Triangle(NamedTuple):
+    """Three markers, ``triple`` (3,), and the ``face`` that they are of: -1 where they are of several, -2 before the
+    first choice.
+    """
+
+    face: int
+    triple: IntArray
 
 
 @kernel
@@ -245,19 +269,13 @@ def covering_groups(
 
 @kernel
 def outward_faces(
-    triples: IntArray,
-    starts: IntArray,
-    members: IntArray,
-    sides: IntArray,
-    rank: IntArray,
-    points: FloatArray,
-    camera_centres: FloatArray,
-    seen: FloatArray,
+    groups: MarkerGroups, rank: IntArray, points: FloatArray, camera_centres: FloatArray, seen: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Triples (f, 3) in outward order, members (f, m) and whether the outward side is known (f,) of the `Faces`.
 
     What cameras see outweighs where the rest of the body is.
     """
+    triples, starts, members, sides, _ = groups
     chosen = covering_groups(starts, members, sides, rank, points.shape[0])
     faces = chosen.shape[0]
     outward = np.empty((faces, 3), np.int64)
@@ -316,22 +334,16 @@ def faces_fronting(
 
 @kernel
 def kept_faces(
-    triples: IntArray,
-    members: FloatArray,
-    sided: FloatArray,
-    body: FloatArray,
-    points: FloatArray,
-    targets: FloatArray,
-    matrices: FloatArray,
-    camera_centres: FloatArray,
+    faces: Faces, points: FloatArray, targets: FloatArray, matrices: FloatArray, camera_centres: FloatArray
 ) -> IntArray:
     """Outward triples (k, 3) of the faces that some camera has both now and at the goal: those that a plan must keep.
 
     That on which a law will work leads, for the way is turned by it: which of two alike faces the model names first is
     a matter of noise. Empty where the body turns so far that no face lasts: the way has to hand over
-    (`sights_along`). Faces whose side is not known ask for nothing. Of `Faces`, and contiguous ``points``,
+    (`sights_along`). Faces whose side is not known ask for nothing. Contiguous ``points``,
     ``targets`` (m, 4), ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4).
     """
+    triples, sided = faces.triples, faces.sided
     eye = np.eye(4).reshape((1, 4, 4))
     now = faces_fronting(points, triples, sided, eye, camera_centres)
     then = faces_fronting(targets, triples, sided, eye, camera_centres)
@@ -346,8 +358,8 @@ def kept_faces(
         pixels = project_points(matrices, points)[0]
         weights, known = np.full(pixels.shape[:2], 1.0 / SEEN_TO_PX), np.ones(len(points))
         face = choose_face_step(
-            triples, members, sided, body, points, pixels, weights, targets, known, camera_centres, -2,
-            np.zeros(3, np.int64),
+            faces, ShownBody(points, pixels, weights), BodyGoal(targets, known), camera_centres,
+            Triangle(-2, np.zeros(3, np.int64)),
         )[0]  # fmt: skip
         if face >= 0 and lasting[face] > 0.0:
             kept[0], lasting[face], count = triples[face], 0.0, 1
@@ -451,13 +463,13 @@ def choose_triangle(
     usable: FloatArray,
     pixels: FloatArray,
     weights: FloatArray,
-    face_now: int,
-    triple_now: IntArray,
+    before: Triangle,
 ) -> tuple[int, IntArray, int]:
     """Face (-1: across faces), its three markers and the cameras that see them (0: there are none).
 
     See `choose_face`; the order of the markers is not yet outward. ``lasting`` (f,), ``usable`` (m,).
     """
+    face_now, triple_now = before
     faces, markers = members.shape
     best = np.zeros(3, np.int64)
     best_face, best_count, best_area = -1, 0, 0.0
@@ -498,20 +510,12 @@ def choose_triangle(
 
 @kernel
 def choose_face_step(
-    triples: IntArray,
-    members: FloatArray,
-    sided: FloatArray,
-    body: FloatArray,
-    points: FloatArray,
-    pixels: FloatArray,
-    weights: FloatArray,
-    targets: FloatArray,
-    target_known: FloatArray,
-    camera_centres: FloatArray,
-    face_now: int,
-    triple_now: IntArray,
+    known_faces: Faces, shown: ShownBody, goal: BodyGoal, camera_centres: FloatArray, before: Triangle
 ) -> tuple[int, IntArray, int, FloatArray]:
     """`choose_face` on arrays: face, outward triple (3,), cameras and kept (c,)."""
+    triples, members, sided, body = known_faces
+    points, pixels, weights = shown
+    targets, target_known = goal
     faces, markers = members.shape
     cameras = camera_centres.shape[0]
     usable = np.zeros(markers)
@@ -525,10 +529,10 @@ def choose_face_step(
         for c in range(cameras):
             if sided[f] > 0.0 and dot(plane, camera_centres[c]) > 0.0:
                 lasting[f] = 1.0
-    face, triple, count = choose_triangle(members, lasting, usable, pixels, weights, face_now, triple_now)
+    face, triple, count = choose_triangle(members, lasting, usable, pixels, weights, before)
     kept = np.zeros(cameras)
     if count == 0:
-        return -2, triple_now.copy(), 0, kept
+        return -2, before.triple.copy(), 0, kept
     i, j, k = triple
     side = 0.0
     if face >= 0 and sided[face] > 0.0:
@@ -547,3 +551,13 @@ def choose_face_step(
         if dot(now, camera_centres[c]) > 0.0 and dot(then, camera_centres[c]) > 0.0:
             kept[c] = 1.0
     return face, triple, count, kept
+
+
+@kernel
+def _choose_face(
+    known_faces: Fields, shown: Fields, goal: Fields, camera_centres: FloatArray, before: Fields
+) -> tuple[int, IntArray, int, FloatArray]:
+    """`choose_face_step` for Python, with the fields of all records."""
+    return choose_face_step(
+        Faces(*known_faces), ShownBody(*shown), BodyGoal(*goal), camera_centres, Triangle(*before)
+    )

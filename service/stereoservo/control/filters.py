@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 
 
 class TrackSettings(msgspec.Struct, frozen=True):
@@ -99,9 +99,9 @@ def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: Floa
     positions, rates, covariance = track.positions.copy(), track.rates.copy(), track.covariance.copy()
     stamps, tracked = track.stamps_s.copy(), track.tracked.copy()
     jumped = update_track(
-        positions, rates, covariance, stamps, tracked, stamp_s, np.ascontiguousarray(pixels, dtype=np.float64),
-        np.ascontiguousarray(wanted, dtype=np.float64), s.sigma_px, s.density_px2_s3, s.rate_px_s, s.jump_sigmas,
-        s.gap_s,
+        (positions, rates, covariance, stamps, tracked), stamp_s, np.ascontiguousarray(pixels, dtype=np.float64),
+        np.ascontiguousarray(wanted, dtype=np.float64),
+        (s.sigma_px, s.density_px2_s3, s.rate_px_s, s.jump_sigmas, s.gap_s),
     )  # fmt: skip
     return TargetTrack(
         s, positions, rates, covariance, stamps, tracked, stamp_s, track.ignored, track.jumps + int(jumped)
@@ -121,21 +121,14 @@ def predict(track: TargetTrack, t_s: float) -> tuple[FloatArray, FloatArray, Flo
 
 @kernel
 def update_track(
-    positions: FloatArray,
-    rates: FloatArray,
-    covariance: FloatArray,
-    stamps: FloatArray,
-    tracked: FloatArray,
-    stamp_s: float,
-    pixels: FloatArray,
-    wanted: FloatArray,
-    sigma: float,
-    density: float,
-    rate: float,
-    jump_sigmas: float,
-    gap_s: float,
+    track: Fields, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: Fields
 ) -> bool:
-    """One observation into a track's arrays; whether a marker jumped. See `observe`."""
+    """One observation into a track's arrays; whether a marker jumped. See `observe`.
+
+    ``track``: the fields of `TargetTrack` from ``positions`` to ``tracked``; ``constants``: those of `TrackSettings`.
+    """
+    positions, rates, covariance, stamps, tracked = track
+    sigma, density, rate, jump_sigmas, gap_s = constants
     cameras, markers = tracked.shape
     noise = sigma * sigma
     jumped = False

@@ -17,7 +17,6 @@ import numpy as np
 
 from stereoservo.control.incidence_kernel import (
     METRIC_FLOOR,
-    Constraints,
     SecondTask,
     fixed_dimension,
     incidence_kernel,
@@ -39,6 +38,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import image_jacobian, invert4
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
+from stereoservo.numerics.compilation import plain
 from stereoservo.planning.visibility_constraints import limit_pull
 
 KINDS = (
@@ -239,11 +239,14 @@ def incidence_step(
     if metric is None:
         metric = joint_metric(scene.operators, scene.matrices, scene.points)
     rest = no_second_task(n) if second is None else second
+    arm, constraints = (
+        (scene.operators, int(scene.composition)),
+        (task.kinds, task.markers, task.fixed, task.drift),
+    )
+    regulation = (task.tolerance_px, options.gain, options.dt_s, options.damping, metric)
     velocity, error, status, rank, conditioning, share = incidence_kernel(
-        scene.operators, int(scene.composition), scene.matrices, scene.points,
-        Constraints(task.kinds, task.markers, task.fixed, task.drift), task.tolerance_px, options.gain, options.dt_s,
-        options.damping, metric, rest,
-    )  # fmt: skip
+        arm, scene.matrices, scene.points, constraints, regulation, plain(rest)
+    )
     return IncidenceStep(velocity, error, status, rank, conditioning, share)
 
 

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.control.laws.stereo import pixel_gradients
-from stereoservo.kinematics.composition import displace
+from stereoservo.kinematics.composition import PresentArm, displace
 from stereoservo.kinematics.kernels import transform_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import damped_least_squares, right_singular
 
 
@@ -110,6 +110,18 @@ class Constraints(NamedTuple):
     drift: FloatArray
 
 
+class Regulation(NamedTuple):
+    """How a task is regulated: ``tolerance_px`` within which an incidence is done; ``gain`` [1/s], ``dt_s`` [s] and
+    ``damping`` as in `control.law.Options`; ``metric`` (n,) > 0: what a unit of each joint's motion costs.
+    """
+
+    tolerance_px: float
+    gain: float
+    dt_s: float
+    damping: float
+    metric: FloatArray
+
+
 class SecondTask(NamedTuple):
     """What to do with the freedoms that are left: ``rows`` (r, n) times the velocity shall be ``rates`` (r,).
 
@@ -153,9 +165,9 @@ class Decomposition(NamedTuple):
 
 @kernel
 def _linearized(
-    operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, constraints: Constraints,
-    metric: FloatArray,
-) -> tuple[Seen, Linearization]:  # fmt: skip
+    arm: PresentArm, matrices: FloatArray, points: FloatArray, constraints: Constraints, metric: FloatArray
+) -> tuple[Seen, Linearization]:
+    operators, composition = arm
     kinds, markers, fixed, drift = constraints
     n, count, rows = operators.shape[0], kinds.shape[0], 2 * matrices.shape[0]
     error = np.zeros(count)
@@ -237,17 +249,24 @@ def _decomposed(J: FloatArray, e: FloatArray) -> Decomposition:
 
 @kernel
 def incidence_kernel(
-    operators: FloatArray, composition: int, matrices: FloatArray, points: FloatArray, constraints: Constraints,
-    tolerance_px: float, gain: float, dt_s: float, damping: float, metric: FloatArray, second: SecondTask,
-) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:  # fmt: skip
+    arm: Fields,
+    matrices: FloatArray,
+    points: FloatArray,
+    constraints: Fields,
+    regulation: Fields,
+    second: Fields,
+) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
     """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
 
-    ``points`` (m, 4); ``metric`` (n,) > 0.
+    ``points`` (m, 4) in cameras ``matrices`` (c, 3, 4); the fields of a `PresentArm`, of `Constraints`, a `Regulation`
+    and a `SecondTask`.
     """
-    n, count = operators.shape[0], constraints.kinds.shape[0]
+    held, rest = Constraints(*constraints), SecondTask(*second)
+    tolerance_px, gain, dt_s, damping, metric = regulation
+    n, count = arm[0].shape[0], held.kinds.shape[0]
     velocity = np.zeros(n)
     status = np.zeros(count, dtype=np.int64)
-    seen, linear = _linearized(operators, composition, matrices, points, constraints, metric)
+    seen, linear = _linearized(PresentArm(*arm), matrices, points, held, metric)
     error = linear.error
     if not linear.finite:
         for k in range(count):
@@ -274,7 +293,7 @@ def incidence_kernel(
     for j in range(n):
         velocity[j] = gain * step[j]
     _feed_forward(velocity, linear, found, metric, damping)
-    _second_task(velocity, found.V, rank, metric, second.rows, second.rates, second.weights, damping)
+    _second_task(velocity, found, rest, metric, damping)
     return velocity, error, status, rank, found.conditioning, share
 
 
@@ -383,16 +402,11 @@ def _blame(J: FloatArray, e: FloatArray, owner: IntArray, rows: int, status: Int
 
 @kernel
 def _second_task(
-    velocity: FloatArray,
-    V: FloatArray,
-    rank: int,
-    metric: FloatArray,
-    rows: FloatArray,
-    rates: FloatArray,
-    weights: FloatArray,
-    damping: float,
+    velocity: FloatArray, found: Decomposition, second: SecondTask, metric: FloatArray, damping: float
 ) -> None:
     """Add to ``velocity`` (n,) what serves the second task in the first one's null space: ``(S N)⁺ (ṡ - S q̇₁)``."""
+    V, rank = found.V, found.rank
+    rows, rates, weights = second
     n = velocity.shape[0]
     count = rates.shape[0]
     if rank == n or count == 0:

@@ -8,29 +8,81 @@ formed: a joint's velocity of a point is ``H̄_{j−1} Ĥ_j (exp_j … exp_n M�
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.kinematics.kernels import invert4, transform_points_into, triangulate_into
+from stereoservo.kinematics.kernels import Chain, invert4, transform_points_into, triangulate_into
 from stereoservo.numerics.arrays import FloatArray, KindArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import add_pixel_equations, damped_solve
 
 DAMPING = 1e-6
 """Default damping, relative to the largest diagonal of the normal matrix."""
 
 
+class StereoArm(NamedTuple):
+    """An arm before cameras: its ``chain``, whose generators have the ``squares`` (n, 4, 4); cameras ``matrices``
+    (c, 3, 4), and marker ``points`` (m, 4) at the chain's zero.
+    """
+
+    chain: Chain
+    squares: FloatArray
+    matrices: FloatArray
+    points: FloatArray
+
+
+class Factors(NamedTuple):
+    """Of a chain of ``generators`` (n, 4, 4) at some joints: its ``exponentials`` (n, 4, 4) in the order of the chain,
+    and the product of those that stand left of each, ``before`` (n + 1, 4, 4), H̄; ``tip_first`` as in `Chain`.
+    """
+
+    generators: FloatArray
+    tip_first: bool
+    exponentials: FloatArray
+    before: FloatArray
+
+
+class PlacedPoints(NamedTuple):
+    """Points (m, 4) ``now`` and ``at_zero``, where they would be at the chain's zero."""
+
+    now: FloatArray
+    at_zero: FloatArray
+
+
+class PointRows(NamedTuple):
+    """Of one point in c cameras: ``rows`` ``J_G P Ĥ_j|_Q M`` (c, 2, n) of its Jacobian, and ``gradients`` (c, 2, 4)
+    ``J_G P``.
+    """
+
+    rows: FloatArray
+    gradients: FloatArray
+
+
+class Sighted(NamedTuple):
+    """Of m markers in c cameras: ``pixels`` and ``set_points`` (c, m, 2), ``weights`` (c, m) = 1/sigma [1/px]."""
+
+    pixels: FloatArray
+    set_points: FloatArray
+    weights: FloatArray
+
+
+class CycleOptions(NamedTuple):
+    """``gain`` [1/s]; ``damping`` relative to the largest diagonal; ``mean``: whether the Jacobian is the mean of here
+    and of the goal; renormalised iterations of ``triangulations``, -1: the points are those of the joints.
+    """
+
+    gain: float
+    damping: float
+    mean: bool
+    triangulations: int
+
+
 @kernel
-def _factors_into(
-    chain: FloatArray,
-    kinds: KindArray,
-    zero: FloatArray,
-    q: FloatArray,
-    tip_first: bool,
-    E: FloatArray,
-    B: FloatArray,
-) -> None:
-    """``exp_j`` (n, 4, 4) in the order of the chain, and what stands left of each: ``H̄`` (n + 1, 4, 4)."""
+def _factors_into(chain: Chain, squares: FloatArray, q: FloatArray, factors: Factors) -> None:
+    """The factors of a chain at ``q`` (n,); ``squares`` (n, 4, 4) of its generators."""
+    generators, kinds, zero, tip_first = chain
+    _, _, E, B = factors
     n = q.shape[0]
     for i in range(4):
         for k in range(4):
@@ -44,7 +96,7 @@ def _factors_into(
             first, second = math.sin(step), 2.0 * half * half
         for i in range(4):
             for k in range(4):
-                E[nth, i, k] = first * chain[0, j, i, k] + second * chain[1, j, i, k]
+                E[nth, i, k] = first * generators[j, i, k] + second * squares[j, i, k]
             E[nth, i, i] += 1.0
         for i in range(4):
             for k in range(4):
@@ -58,22 +110,12 @@ def _factors_into(
 
 @kernel
 def _add_point(
-    chain: FloatArray,
-    E: FloatArray,
-    B: FloatArray,
-    tip_first: bool,
-    matrices: FloatArray,
-    M: FloatArray,
-    M0: FloatArray,
-    p: int,
-    share: float,
-    g: FloatArray,
-    rows: FloatArray,
+    factors: Factors, matrices: FloatArray, points: PlacedPoints, p: int, share: float, point_rows: PointRows
 ) -> None:
-    """``share`` times ``J_G P Ĥ_j|_Q M`` of point ``p`` in all cameras (c, 2, n) onto ``rows``.
-
-    ``M`` (m, 4) now, ``M0`` (m, 4) at the chain's zero; ``g`` (c, 2, 4): scratch.
-    """
+    """``share`` times the rows of point ``p`` onto ``point_rows``, whose gradients are scratch."""
+    generators, tip_first, E, B = factors
+    M, M0 = points
+    rows, g = point_rows
     n, cameras = E.shape[0], matrices.shape[0]
     m0, m1, m2, m3 = M[p, 0], M[p, 1], M[p, 2], M[p, 3]
     for c in range(cameras):
@@ -98,10 +140,30 @@ def _add_point(
         y2 = E[nth, 2, 0] * z0 + E[nth, 2, 1] * z1 + E[nth, 2, 2] * z2 + E[nth, 2, 3] * z3
         y3 = E[nth, 3, 0] * z0 + E[nth, 3, 1] * z1 + E[nth, 3, 2] * z2 + E[nth, 3, 3] * z3
         z0, z1, z2, z3 = y0, y1, y2, y3
-        y0 = chain[0, j, 0, 0] * z0 + chain[0, j, 0, 1] * z1 + chain[0, j, 0, 2] * z2 + chain[0, j, 0, 3] * z3
-        y1 = chain[0, j, 1, 0] * z0 + chain[0, j, 1, 1] * z1 + chain[0, j, 1, 2] * z2 + chain[0, j, 1, 3] * z3
-        y2 = chain[0, j, 2, 0] * z0 + chain[0, j, 2, 1] * z1 + chain[0, j, 2, 2] * z2 + chain[0, j, 2, 3] * z3
-        y3 = chain[0, j, 3, 0] * z0 + chain[0, j, 3, 1] * z1 + chain[0, j, 3, 2] * z2 + chain[0, j, 3, 3] * z3
+        y0 = (
+            generators[j, 0, 0] * z0
+            + generators[j, 0, 1] * z1
+            + generators[j, 0, 2] * z2
+            + generators[j, 0, 3] * z3
+        )
+        y1 = (
+            generators[j, 1, 0] * z0
+            + generators[j, 1, 1] * z1
+            + generators[j, 1, 2] * z2
+            + generators[j, 1, 3] * z3
+        )
+        y2 = (
+            generators[j, 2, 0] * z0
+            + generators[j, 2, 1] * z1
+            + generators[j, 2, 2] * z2
+            + generators[j, 2, 3] * z3
+        )
+        y3 = (
+            generators[j, 3, 0] * z0
+            + generators[j, 3, 1] * z1
+            + generators[j, 3, 2] * z2
+            + generators[j, 3, 3] * z3
+        )
         v0 = B[nth, 0, 0] * y0 + B[nth, 0, 1] * y1 + B[nth, 0, 2] * y2 + B[nth, 0, 3] * y3
         v1 = B[nth, 1, 0] * y0 + B[nth, 1, 1] * y1 + B[nth, 1, 2] * y2 + B[nth, 1, 3] * y3
         v2 = B[nth, 2, 0] * y0 + B[nth, 2, 1] * y1 + B[nth, 2, 2] * y2 + B[nth, 2, 3] * y3
@@ -113,27 +175,26 @@ def _add_point(
 
 @kernel
 def stereo_cycle(
-    chain: FloatArray,
-    kinds: KindArray,
-    zero: FloatArray,
+    arm: Fields,
     q: FloatArray,
-    tip_first: bool,
-    matrices: FloatArray,
-    marker_points: FloatArray,
     target_points: FloatArray,
-    pixels: FloatArray,
-    set_points: FloatArray,
-    weights: FloatArray,
-    gain: float,
-    damping: float,
-    mean: bool,
-    triangulations: int,
+    sighted: Fields,
+    options: Fields,
     velocity: FloatArray,
 ) -> float:
-    """`StereoCycle.step` into ``velocity`` (n,); returns the conditioning."""
+    """`StereoCycle.step` into ``velocity`` (n,); returns the conditioning.
+
+    The fields of a `StereoArm`, with those of its chain, of a `Sighted` and of `CycleOptions`; ``target_points``
+    (m, 4).
+    """
+    chain, squares, matrices, marker_points = arm
+    pixels, set_points, weights = sighted
+    gain, damping, mean, triangulations = options
     n, cameras, markers = q.shape[0], matrices.shape[0], marker_points.shape[0]
+    generators, kinds, zero, tip_first = chain
     E, B = np.empty((n, 4, 4)), np.empty((n + 1, 4, 4))
-    _factors_into(chain, kinds, zero, q, tip_first, E, B)
+    factors = Factors(generators, tip_first, E, B)
+    _factors_into(Chain(generators, kinds, zero, tip_first), squares, q, factors)
     M, M0 = np.empty((markers, 4)), marker_points
     transform_points_into(B[n], marker_points, M)
     back = B[n]
@@ -153,7 +214,8 @@ def stereo_cycle(
         T0 = np.empty((markers, 4))
         transform_points_into(back, target_points, T0)
     N, b = np.zeros((n, n)), np.zeros(n)
-    rows, g = np.empty((cameras, 2, n)), np.empty((cameras, 2, 4))
+    rows = np.empty((cameras, 2, n))
+    point_rows = PointRows(rows, np.empty((cameras, 2, 4)))
     for p in range(markers):
         seen = False
         for c in range(cameras):
@@ -163,9 +225,9 @@ def stereo_cycle(
                 rows[c, 1, j] = 0.0
         if not seen:
             continue
-        _add_point(chain, E, B, tip_first, matrices, M, M0, p, 0.5 if mean else 1.0, g, rows)
+        _add_point(factors, matrices, PlacedPoints(M, M0), p, 0.5 if mean else 1.0, point_rows)
         if mean:
-            _add_point(chain, E, B, tip_first, matrices, target_points, T0, p, 0.5, g, rows)
+            _add_point(factors, matrices, PlacedPoints(target_points, T0), p, 0.5, point_rows)
         for c in range(cameras):
             w = weights[c, p]
             if not w > 0.0:
@@ -225,9 +287,10 @@ class StereoCycle:
         marker_points: FloatArray,
         tip_first: bool = False,
     ) -> None:
-        self._chain = np.ascontiguousarray(np.stack([generators, generators @ generators]))
-        self._kinds, self._zero, self._tip_first = kinds, zero, tip_first
-        self._matrices, self._points = np.ascontiguousarray(matrices), np.ascontiguousarray(marker_points)
+        chain = (np.ascontiguousarray(generators), kinds, zero, tip_first)
+        squares = np.ascontiguousarray(generators @ generators)
+        self._points = np.ascontiguousarray(marker_points)
+        self._arm = (chain, squares, np.ascontiguousarray(matrices), self._points)
 
     def step(
         self,
@@ -246,11 +309,8 @@ class StereoCycle:
         Points are those of the joints (8.35), or, with ``triangulations`` >= 0 renormalised iterations, triangulated
         (8.34) where two cameras see them. With ``target_points`` (m, 4) the Jacobian is the mean of here and there.
         """
-        velocity = np.empty(self._zero.shape[0])
+        velocity = np.empty(len(q))
         mean = target_points is not None
-        conditioning = stereo_cycle(
-            self._chain, self._kinds, self._zero, q, self._tip_first, self._matrices, self._points,
-            target_points if target_points is not None else self._points, pixels, set_points, weights, gain, damping,
-            mean, triangulations, velocity,
-        )  # fmt: skip
-        return velocity, conditioning
+        targets = target_points if target_points is not None else self._points
+        sighted, options = (pixels, set_points, weights), (gain, damping, mean, triangulations)
+        return velocity, stereo_cycle(self._arm, q, targets, sighted, options, velocity)

@@ -9,6 +9,7 @@ loop runs the kernels ``displace`` and ``move_operators``.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,15 @@ class Composition(IntEnum):
     """The tip's joint leftmost: cameras ride on the tip."""
     SIMULTANEOUS = 2
     """All joints act at once, ``exp(Σ Δq_j Ĥ_j)``, with operators that stay: an arm commanded by Cartesian twists."""
+
+
+class PresentArm(NamedTuple):
+    """An arm where it is: its ``operators`` (n, 4, 4) at the present joints (5.21), and their ``composition``, a
+    `Composition`.
+    """
+
+    operators: FloatArray
+    composition: int
 
 
 def displacement(operators: FloatArray, composition: Composition, step: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ caller.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,17 +28,21 @@ def multiply4_into(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j] + A[i, 3] * B[3, j]
 
 
+class Chain(NamedTuple):
+    """A kinematic chain for kernels: ``generators`` (n, 4, 4) at the ``zero`` (n,) [rad or m], ``kinds`` (n,) 0
+    revolute or 1 prismatic, ``tip_first`` as in `chain.ProjectiveChain`.
+    """
+
+    generators: FloatArray
+    kinds: KindArray
+    zero: FloatArray
+    tip_first: bool
+
+
 @kernel
-def chain_forward_into(
-    generators: FloatArray,
-    kinds: KindArray,
-    zero: FloatArray,
-    q: FloatArray,
-    H: FloatArray,
-    operators: FloatArray,
-    tip_first: bool = False,
-) -> None:
-    """``H(q)`` into (4, 4) and ``Ĥ_j|_Q`` into (n, 4, 4) (5.18, 5.21); ``tip_first`` as in `ProjectiveChain`."""
+def chain_forward_into(chain: Chain, q: FloatArray, H: FloatArray, operators: FloatArray) -> None:
+    """``H(q)`` into (4, 4) and ``Ĥ_j|_Q`` into (n, 4, 4) (5.18, 5.21) at ``q`` (n,)."""
+    generators, kinds, zero, tip_first = chain
     n = q.shape[0]
     inverse = np.empty((4, 4))
     first = np.empty((4, 4))
@@ -84,7 +89,7 @@ def chain_forward(
     """``H(q)`` (4, 4) and the operators ``Ĥ_j|_Q`` (n, 4, 4) of a chain at ``q`` (n,) (5.18, 5.21)."""
     H = np.empty((4, 4))
     operators = np.empty((q.shape[0], 4, 4))
-    chain_forward_into(generators, kinds, zero, q, H, operators, tip_first)
+    chain_forward_into(Chain(generators, kinds, zero, tip_first), q, H, operators)
     return H, operators
 
 
@@ -273,17 +278,20 @@ def _eliminated_and_free(row: FloatArray) -> tuple[int, int, int, int]:
     return k, 1 if k == 0 else 0, 2 if k <= 1 else 1, 3 if k <= 2 else 2
 
 
+class Views(NamedTuple):
+    """What c cameras ``Ps`` (c, 3, 4) see of m points: ``pixels`` (c, m, 2) [px], ``weights`` (c, m) = 1/sigma [1/px],
+    0 where missing.
+    """
+
+    Ps: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+
+
 @kernel
-def _triangulate_point(
-    Ps: FloatArray,
-    pixels: FloatArray,
-    weights: FloatArray,
-    p: int,
-    iterations: int,
-    M: FloatArray,
-    work: FloatArray,
-) -> bool:
+def _triangulate_point(views: Views, p: int, iterations: int, M: FloatArray, work: FloatArray) -> bool:
     """One point into ``M[p]``; ``work`` (3,) scratch. False where its rays do not determine it."""
+    Ps, pixels, weights = views
     cameras = Ps.shape[0]
     if _views(weights, p) < 2:
         return False
@@ -357,9 +365,9 @@ def triangulate_into(
     Ps: FloatArray, pixels: FloatArray, weights: FloatArray, iterations: int, M: FloatArray, ok: BoolArray
 ) -> None:
     """Points into (m, 4) and validity into (m,) bool; see `triangulate`."""
-    work = np.empty(3)
+    work, views = np.empty(3), Views(Ps, pixels, weights)
     for p in range(pixels.shape[1]):
-        good = _triangulate_point(Ps, pixels, weights, p, iterations, M, work)
+        good = _triangulate_point(views, p, iterations, M, work)
         ok[p] = good
         if not good:
             for i in range(4):

@@ -20,6 +20,14 @@ from stereoservo.numerics.kernel_cache import KernelCache
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
+Fields = tuple[Any, ...]
+"""The fields of a record in a plain tuple, as a kernel takes them that Python calls in each step or frame.
+
+numba looks up the type of a NamedTuple anew at every call from Python, for more than a microsecond; that of a plain
+tuple by what is in it, for a tenth of that. The kernel unpacks the fields in their order, or makes the record of them:
+``View(*view)``.
+"""
+
 LOG_VARIABLE = "STEREOSERVO_COMPILE_LOG"
 """Environment variable: a file to which every process appends a line of JSON for each signature that it compiles."""
 
@@ -61,6 +69,11 @@ def reassociating_kernel(function: _F) -> _F:
     are what they are elsewhere.
     """
     return _compile(function, fastmath={"reassoc", "nsz", "contract"})
+
+
+def plain(record: tuple[Any, ...]) -> Fields:
+    """The `Fields` of a NamedTuple."""
+    return tuple(record)
 
 
 def overloads() -> Iterator[Overload]:

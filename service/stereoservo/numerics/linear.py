@@ -7,6 +7,7 @@ Explicit loops in a fixed order: the same input gives the same bits on one machi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,13 @@ NEGLIGIBLE = 1e-17
 """One-sided Jacobi: columns are orthogonal below this cosine; and a column below this share of the matrix is
 rounding.
 """
+
+
+class NormalSystem(NamedTuple):
+    """``N x = b``: ``N`` (n, n) symmetric, of which the lower triangle may be all, and ``b`` (n,)."""
+
+    N: FloatArray
+    b: FloatArray
 
 
 @kernel

@@ -328,50 +328,70 @@ def _record_sample(
     return broken
 
 
+class Way(NamedTuple):
+    """What a ``stage`` of `path_search` tries: a ``path`` of the body in closed form (`motion_frame`) with ``residual``
+    (m, 3), the distance of each point from its goal at the path's end, distributed over the path; or, straight in the
+    joints, ``joint_step`` (n,) a sample.
+    """
+
+    stage: int
+    path: FloatArray
+    residual: FloatArray
+    joint_step: FloatArray
+
+
+class SampleRange(NamedTuple):
+    """Samples of a path, from ``first`` to before ``last``."""
+
+    first: int
+    last: int
+
+
+class Following(NamedTuple):
+    """How an arm has to follow: ``redundant``: it has self-motion, which keeps its joints away from their limits;
+    ``tolerance`` [px] between path and arm: beyond it the path is not reachable; infinite for arms that lack freedoms,
+    which leave the path between its ends.
+    """
+
+    redundant: bool
+    tolerance: float
+
+
 @kernel
-def check_path(
-    path: FloatArray,
-    first: int,
-    last: int,
-    samples: int,
-    constraints: Constraints,
-    residual: FloatArray,
-    table: FloatArray,
-) -> tuple[int, int]:
-    """Kind of limit broken or −1, and where, of samples ``first`` to before ``last`` of a path in closed form."""
-    for k in range(first, last):
+def check_path(way: Way, some: SampleRange, constraints: Constraints, record: PathRecord) -> tuple[int, int]:
+    """Kind of limit broken or −1, and where, of ``some`` samples of a path in closed form; of the ``record`` the table
+    of closest approaches is kept.
+    """
+    samples = record.joints.shape[0]
+    for k in range(some.first, some.last):
         path_parameter = k / (samples - 1.0)
-        points = _points_on_path(path, path_parameter, constraints.body, residual)
-        broken = check_view(points, path_parameter, constraints, table, True)
+        points = _points_on_path(way.path, path_parameter, constraints.body, way.residual)
+        broken = check_view(points, path_parameter, constraints, record.table, True)
         if broken >= 0:
             return broken, k
-    return -1, last
+    return -1, some.last
 
 
 @kernel
 def follow_path(
-    path: FloatArray,
-    first: int,
-    last: int,
+    way: Way,
+    some: SampleRange,
     constraints: Constraints,
-    residual: FloatArray,
     arm: Arm,
-    redundant: bool,
-    tolerance: float,
+    following: Following,
     record: PathRecord,
 ) -> tuple[int, int]:
-    """Kind of limit broken or −1, and where, of the arm along samples ``first`` to before ``last`` of a path.
+    """Kind of limit broken or −1, and where, of the arm along ``some`` samples of a path.
 
-    ``residual`` (m, 3): distance of each point from its goal at the path's end, distributed over the path. The arm
-    moves in place; ``record`` is filled. ``tolerance`` [px] between path and arm: beyond it the path is not
-    reachable; infinite for arms that lack freedoms, which leave the path between its ends.
+    The arm moves in place; ``record`` is filled.
     """
     s = constraints
+    redundant, tolerance = following
     samples = record.joints.shape[0]
-    for k in range(first, last):
+    for k in range(some.first, some.last):
         path_parameter = k / (samples - 1.0)
         if k > 0:
-            required = _points_on_path(path, path_parameter, s.body, residual)
+            required = _points_on_path(way.path, path_parameter, s.body, way.residual)
             firm = math.isfinite(tolerance) or k == samples - 1
             left = reach(required, s, arm, redundant, ITERATIONS if firm else LENIENT_ITERATIONS)
             distance, marker, limit = 0.0, 0, tolerance
@@ -393,22 +413,22 @@ def follow_path(
         broken = _record_sample(k, path_parameter, s, arm, record)
         if broken >= 0:
             return broken, k
-    return -1, last
+    return -1, some.last
 
 
 @kernel
 def follow_joint_line(
-    step: FloatArray, first: int, last: int, constraints: Constraints, arm: Arm, record: PathRecord
+    way: Way, some: SampleRange, constraints: Constraints, arm: Arm, record: PathRecord
 ) -> tuple[int, int]:
-    """As `follow_path`, of a path that is a straight line in joint space, by ``step`` (n,) a sample."""
+    """As `follow_path`, of a way that is a straight line in joint space."""
     samples = record.joints.shape[0]
-    for k in range(first, last):
+    for k in range(some.first, some.last):
         if k > 0:
-            move_arm(arm, step)
+            move_arm(arm, way.joint_step)
         broken = _record_sample(k, k / (samples - 1.0), constraints, arm, record)
         if broken >= 0:
             return broken, k
-    return -1, last
+    return -1, some.last
 
 
 SEEDS = 32

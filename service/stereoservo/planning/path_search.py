@@ -23,7 +23,7 @@ import numpy as np
 
 from stereoservo.kinematics.composition import Composition
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel, plain
 from stereoservo.planning.motion_frame import (
     EXPONENTIAL,
     FIRST,
@@ -38,7 +38,10 @@ from stereoservo.planning.path_ik import (
     SEEDS,
     TURN,
     Arm,
+    Following,
     PathRecord,
+    SampleRange,
+    Way,
     check_path,
     follow_joint_line,
     follow_path,
@@ -49,7 +52,7 @@ from stereoservo.planning.path_ik import (
 )
 from stereoservo.planning.plan import ClosestApproach, Plan, PlanRequest, Profile
 from stereoservo.planning.primitives import HINGE, PLANAR, RIGID_FREEDOMS, TRANSLATION
-from stereoservo.planning.time_scaling import sample_times
+from stereoservo.planning.time_scaling import JointPace, sample_times
 from stereoservo.planning.visibility_constraints import (
     JOINT_LIMIT,
     KEEP_OUT,
@@ -320,36 +323,26 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
     unconstrained = p.stage == Stage.UNCONSTRAINED_IK
     # an arm that lacks freedoms leaves the path between its ends
     tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
+    constraints = _unlimited(p.constraints) if unconstrained else p.constraints
     broken, reached = _go_on(
-        int(p.stage), p.path, p.joint_step, p.sample, until,
-        _unlimited(p.constraints) if unconstrained else p.constraints, p.residual,
-        Arm(int(p.request.composition), p.operators, p.joints, p.displacement, p.bias), len(p.joints) > p.rank,
-        tolerance, PathRecord(p.all_joints, p.all_displacements, p.table),
+        (int(p.stage), p.path, p.residual, p.joint_step), (p.sample, until), plain(constraints),
+        (int(p.request.composition), p.operators, p.joints, p.displacement, p.bias),
+        (len(p.joints) > p.rank, tolerance), (p.all_joints, p.all_displacements, p.table),
     )  # fmt: skip
     return int(broken), int(reached)
 
 
 @kernel
 def _go_on(
-    stage: int,
-    path: FloatArray,
-    joint_step: FloatArray,
-    first: int,
-    last: int,
-    constraints: Constraints,
-    residual: FloatArray,
-    arm: Arm,
-    redundant: bool,
-    tolerance: float,
-    record: PathRecord,
+    way: Fields, some: Fields, constraints: Fields, arm: Fields, following: Fields, record: Fields
 ) -> tuple[int, int]:
-    """Samples ``first`` to before ``last`` of a ``stage``: kind of limit broken or −1, and where (`path_ik`)."""
-    if stage == CLOSED_FORM:
-        samples = record.joints.shape[0]
-        return check_path(path, first, last, samples, constraints, residual, record.table)
-    if stage == STRAIGHT_IN_JOINTS:
-        return follow_joint_line(joint_step, first, last, constraints, arm, record)
-    return follow_path(path, first, last, constraints, residual, arm, redundant, tolerance, record)
+    """Kind of limit broken or −1, and where, of samples of a way (`path_ik`), with the fields of all records."""
+    tried, span, bounds, kept = Way(*way), SampleRange(*some), Constraints(*constraints), PathRecord(*record)
+    if tried.stage == CLOSED_FORM:
+        return check_path(tried, span, bounds, kept)
+    if tried.stage == STRAIGHT_IN_JOINTS:
+        return follow_joint_line(tried, span, bounds, Arm(*arm), kept)
+    return follow_path(tried, span, bounds, Arm(*arm), Following(*following), kept)
 
 
 def _unlimited(constraints: Constraints) -> Constraints:
@@ -465,10 +458,12 @@ def _straight_to(p: Planning, joints: FloatArray) -> None:
 
 def _finish(p: Planning) -> None:
     r = p.request
-    times, displacements = _in_time(
-        p.all_joints, p.all_displacements, p.frame, p.inverse, r.speed_scale * r.limits.velocity_max,
-        r.speed_scale * r.limits.acceleration_max, r.profile == "exponential",
-    )  # fmt: skip
+    velocity_max, acceleration_max = (
+        r.speed_scale * r.limits.velocity_max,
+        r.speed_scale * r.limits.acceleration_max,
+    )
+    pace = JointPace(velocity_max, acceleration_max, r.profile == "exponential")
+    times, displacements = _in_time(p.all_joints, p.all_displacements, p.frame, p.inverse, pace)
     candidate = CANDIDATES[p.candidate]
     profile = other_profile(r.profile, candidate.profile) or r.profile
     p.plan = Plan(
@@ -484,16 +479,10 @@ def _finish(p: Planning) -> None:
 
 @kernel
 def _in_time(
-    joints: FloatArray,
-    displacements: FloatArray,
-    frame: FloatArray,
-    inverse: FloatArray,
-    velocity_max: FloatArray,
-    acceleration_max: FloatArray,
-    even: bool,
+    joints: FloatArray, displacements: FloatArray, frame: FloatArray, inverse: FloatArray, pace: JointPace
 ) -> tuple[FloatArray, FloatArray]:
     """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) out of the motion ``frame``."""
-    times = sample_times(joints, velocity_max, acceleration_max, even)
+    times = sample_times(joints, pace.velocity_max, pace.acceleration_max, pace.even)
     return times, conjugate_all(frame, displacements, inverse)
 
 

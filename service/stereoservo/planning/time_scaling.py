@@ -8,6 +8,7 @@ greedy pass forwards give the fastest (Pham and Pham, 2018). Starts and ends at 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -128,6 +129,16 @@ def _excess(
                 if change > ACCELERATION_EXCESS * acceleration_max[j] and acceleration_max[j] > 0.0:
                     found = max(found, change / acceleration_max[j])
     return found
+
+
+class JointPace(NamedTuple):
+    """How fast joints may go: ``velocity_max`` (n,) [rad/s or m/s], ``acceleration_max`` (n,) [rad/s² or m/s²], and
+    whether samples follow each other at an ``even`` pace.
+    """
+
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    even: bool
 
 
 @kernel

@@ -77,28 +77,32 @@ def empty_table() -> FloatArray:
     return table
 
 
+class Margin(NamedTuple):
+    """How far a pose is from one limit: the ``value`` that has the ``limit``, and the ``clearance`` that is left, all
+    in the limit's unit; the number of the joint, camera or keep-out, ``whose``, and of the ``marker`` that it is of, -1
+    for none; the ``path_parameter`` in [0, 1].
+    """
+
+    value: float
+    limit: float
+    clearance: float
+    whose: int
+    marker: int
+    path_parameter: float
+
+
 @kernel
-def _enter(
-    table: FloatArray,
-    kind: int,
-    scale: float,
-    value: float,
-    limit: float,
-    clearance: float,
-    index: int,
-    marker: int,
-    path_parameter: float,
-) -> bool:
-    """Whether a limit is broken; the table keeps the closest approach."""
-    if clearance / scale < table[kind, 0]:
-        table[kind, 0] = clearance / scale
-        table[kind, 1] = clearance
-        table[kind, 2] = value
-        table[kind, 3] = limit
-        table[kind, 4] = index
-        table[kind, 5] = marker
-        table[kind, 6] = path_parameter
-    return clearance < -ROUNDING * scale
+def _enter(table: FloatArray, kind: int, scale: float, margin: Margin) -> bool:
+    """Whether a limit of a ``kind`` is broken; the table keeps the closest approach, relative to ``scale``."""
+    if margin.clearance / scale < table[kind, 0]:
+        table[kind, 0] = margin.clearance / scale
+        table[kind, 1] = margin.clearance
+        table[kind, 2] = margin.value
+        table[kind, 3] = margin.limit
+        table[kind, 4] = margin.whose
+        table[kind, 5] = margin.marker
+        table[kind, 6] = margin.path_parameter
+    return margin.clearance < -ROUNDING * scale
 
 
 @kernel
@@ -181,22 +185,19 @@ def check_view(
             if broken < 0 and clearance - margin < -ROUNDING * width and depth > 0.0:
                 broken = 2
         # of each camera the closest one alone can be the closest of all
-        _enter(table, 4, 1.0, nearest_depth, NEAREST_DEPTH, nearest, c, nearest_marker, path_parameter)
-        _enter(
-            table, 2, width, outermost_px, margin, outermost_px - margin if outermost_marker >= 0 else math.inf,
-            c, outermost_marker, path_parameter,
-        )  # fmt: skip
+        depth_margin = Margin(nearest_depth, NEAREST_DEPTH, nearest, c, nearest_marker, path_parameter)
+        _enter(table, 4, 1.0, depth_margin)
+        left_px = outermost_px - margin if outermost_marker >= 0 else math.inf
+        _enter(table, 2, width, Margin(outermost_px, margin, left_px, c, outermost_marker, path_parameter))
         for f in range(s.faces.shape[0]):
             if s.sides[f, c] != 0.0:
                 angle = elevation(points, s.faces, f, s.sides[f, c], s.camera_centres[c])
                 limit = s.grazing[f, c] if bounded else 0.0
-                if (
-                    _enter(
-                        table, 3, 1.0, math.degrees(angle), math.degrees(limit), math.degrees(angle - limit),
-                        c, s.faces[f, 0], path_parameter,
-                    )
-                    and broken < 0
-                ):  # fmt: skip
+                above = Margin(
+                    math.degrees(angle), math.degrees(limit), math.degrees(angle - limit), c, s.faces[f, 0],
+                    path_parameter,
+                )  # fmt: skip
+                if _enter(table, 3, 1.0, above) and broken < 0:
                     broken = 3
     return broken
 
@@ -211,22 +212,19 @@ def check_joints(
     broken = -1
     for j in range(n):
         if math.isfinite(s.upper[j]):
-            clearance = s.upper[j] - joints[j]
-            if _enter(table, 0, 1.0, joints[j], s.upper[j], clearance, j, -1, path_parameter) and broken < 0:
+            below = Margin(joints[j], s.upper[j], s.upper[j] - joints[j], j, -1, path_parameter)
+            if _enter(table, 0, 1.0, below) and broken < 0:
                 broken = 0
         if math.isfinite(s.lower[j]):
-            clearance = joints[j] - s.lower[j]
-            if _enter(table, 0, 1.0, joints[j], s.lower[j], clearance, j, -1, path_parameter) and broken < 0:
+            above = Margin(joints[j], s.lower[j], joints[j] - s.lower[j], j, -1, path_parameter)
+            if _enter(table, 0, 1.0, above) and broken < 0:
                 broken = 0
     for k in range(s.keep_outs.shape[0]):
         outside = -math.inf
         for j in range(n):
             outside = max(outside, s.keep_outs[k, j, 0] - joints[j], joints[j] - s.keep_outs[k, j, 1])
-        if (
-            math.isfinite(outside)
-            and _enter(table, 1, 1.0, outside, 0.0, outside, k, -1, path_parameter)
-            and broken < 0
-        ):
+        beside = Margin(outside, 0.0, outside, k, -1, path_parameter)
+        if math.isfinite(outside) and _enter(table, 1, 1.0, beside) and broken < 0:
             broken = 1
     return broken
 

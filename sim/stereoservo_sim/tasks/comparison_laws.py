@@ -8,7 +8,7 @@ import numpy as np
 
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.laws.image import image
-from stereoservo.control.laws.points import points_step
+from stereoservo.control.laws.points import step_by_points
 from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS, held_gain, limited
 from stereoservo.numerics.arrays import FloatArray
 
@@ -51,10 +51,10 @@ def euclidean_points(
         jacobian = (
             JacobianChoice.CURRENT if options.jacobian == JacobianChoice.FIXED_DEPTH else options.jacobian
         )
-        velocity, conditioning = points_step(
-            operators, X, X_star, (_seen(scene, task) > 0.0).astype(np.float64), metres, held_gain(options),
-            int(jacobian), options.damping,
-        )  # fmt: skip
+        seen = (_seen(scene, task) > 0.0).astype(np.float64)
+        velocity, conditioning = step_by_points(
+            operators, (X, X_star, seen, metres), (held_gain(options), int(jacobian), options.damping)
+        )
         return limited(scene, task, options, velocity, conditioning)
 
     return step

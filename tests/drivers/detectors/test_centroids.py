@@ -31,7 +31,8 @@ def tilted_circle(rng, radius, tilt):
 def measure(image, dark=False, half=20):
     out = np.zeros(components.FIELDS)
     window = 32 - half, 32 - half, 33 + half, 33 + half
-    status = centroids.measure(image, dark, *window, 32.0, 32.0, 30, 5, SCRATCH, out)
+    sought = components.Sought(32.0, 32.0, 30, 5)
+    status = centroids.measure(components.Picture(image, dark), window, sought, SCRATCH, out)
     return status, out
 
 
@@ -156,7 +157,8 @@ def test_dots_at_the_border_are_refused():
         conic = conic_of_circle(np.eye(3), np.array([offset, 32.0]), 6.0)
         image = Scene(size=SIZE, clutter=[conic]).render(rng)
         out = np.zeros(components.FIELDS)
-        status = centroids.measure(image, False, -20, 12, 21, 53, offset, 32.0, 30, 5, SCRATCH, out)
+        sought = components.Sought(offset, 32.0, 30, 5)
+        status = centroids.measure(components.Picture(image, False), (-20, 12, 21, 53), sought, SCRATCH, out)
         assert status != components.OK
 
 

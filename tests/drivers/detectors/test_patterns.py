@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.dot_plates import DEFAULT_BODY
-from stereoservo_drivers.detectors.homographies import fit_homography, image_of_circle, reject_outliers
+from stereoservo_drivers.detectors.homographies import (
+    OutlierGates,
+    fit_homography,
+    image_of_circle,
+    reject_outliers,
+)
 
 from .rendering import conic_of_circle, look, project
 
@@ -92,7 +97,7 @@ def test_one_stranger_is_dropped_and_it_is_the_right_one(seed):
     angle = rng.uniform(0, 2 * np.pi)
     pixels[bad] += rng.uniform(0.8, 6.0) * np.array([np.cos(angle), np.sin(angle)])
     used = ALL.copy()
-    assert reject_outliers(PATTERN, pixels, used, 0.3, 0.01, 5, np.zeros((3, 3)))
+    assert reject_outliers(PATTERN, pixels, used, OutlierGates(0.3, 0.01, 5), np.zeros((3, 3)))
     assert np.flatnonzero(~used).tolist() == [bad]
 
 
@@ -105,7 +110,7 @@ def test_no_dot_of_seven_hides_far_from_where_the_others_put_it(seed):
     error = rng.uniform(0, 2)
     pixels[seed % 7] += error * np.array([0.6, 0.8])
     used = ALL.copy()
-    assert reject_outliers(PATTERN, pixels, used, 0.3, 0.0, 5, np.zeros((3, 3)))
+    assert reject_outliers(PATTERN, pixels, used, OutlierGates(0.3, 0.0, 5), np.zeros((3, 3)))
     if used.all():
         assert error < 0.33
     else:
@@ -118,5 +123,5 @@ def test_noise_alone_drops_nobody():
     for _ in range(200):
         pixels = project(random_view(rng), PATTERN) + rng.normal(0, 0.05, (7, 2))
         used = ALL.copy()
-        assert reject_outliers(PATTERN, pixels, used, 0.05, 0.05, 5, np.zeros((3, 3)))
+        assert reject_outliers(PATTERN, pixels, used, OutlierGates(0.05, 0.05, 5), np.zeros((3, 3)))
         assert used.all()

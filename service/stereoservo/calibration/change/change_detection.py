@@ -26,6 +26,7 @@ import numpy as np
 from stereoservo.calibration.change import change_detection_kernel
 from stereoservo.calibration.change.hypothesis_test import Thresholds
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.compilation import plain
 
 ChangeKind = Literal["nothing", "camera", "cameras", "marker", "joint", "joints", "unexplained"]
 KINDS: tuple[ChangeKind, ...] = ("nothing", "camera", "cameras", "marker", "joint", "joints", "unexplained")
@@ -96,11 +97,14 @@ def diagnose(
     count = cameras + 3 + markers + joints
     sizes, answer = np.zeros(count, dtype=np.int64), np.zeros(3, dtype=np.int64)
     chi2, amounts, effects = np.zeros(count), np.zeros(count), np.zeros(count)
-    change_detection_kernel.explain_innovations(
+    seen = change_detection_kernel.Innovations(
         np.ascontiguousarray(matrices), np.ascontiguousarray(X), markers, np.ascontiguousarray(e),
         np.ascontiguousarray(w), np.ascontiguousarray(operators), np.zeros((0, 4, 4)) if twists is None else twists,
-        thresholds.ratios, thresholds.log_alpha, thresholds.least_px, sizes, chi2, amounts, effects, answer,
     )  # fmt: skip
+    found = change_detection_kernel.Explanations(sizes, chi2, amounts, effects, answer)
+    change_detection_kernel.explain_innovations(
+        plain(seen), thresholds.ratios, thresholds.log_alpha, thresholds.least_px, plain(found)
+    )
 
     def cause(h: int) -> IsolatedChange | None:
         if h < 1:

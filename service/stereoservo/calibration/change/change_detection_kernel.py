@@ -14,6 +14,7 @@ import numpy as np
 from stereoservo.calibration.change.hypothesis_test import (
     MAX_SIZE,
     UNCLEAR,
+    Tested,
     is_unexplained,
     noise_level,
     select_candidates,
@@ -21,8 +22,8 @@ from stereoservo.calibration.change.hypothesis_test import (
 )
 from stereoservo.kinematics.kernels import exp_twist, multiply4_into
 from stereoservo.numerics.arrays import FloatArray, IntArray
-from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import add_pixel_equations, damped_solve
+from stereoservo.numerics.compilation import Fields, kernel
+from stereoservo.numerics.linear import NormalSystem, add_pixel_equations, damped_solve
 
 NOTHING, CAMERA, CAMERAS, MARKER, JOINT, JOINTS, UNEXPLAINED = range(7)
 ROUNDS = 6
@@ -34,17 +35,36 @@ EXPLAINED = 0.05
 """Share of chi-square that an explanation may leave besides the noise: models are not exact far from where they are."""
 
 
+class SightedPoints(NamedTuple):
+    """Points ``X`` (p, 4) in cameras ``Ps`` (c, 3, 4): where they are seen, ``pixels`` (c, p, 2), or are predicted to
+    be, and with what ``weights`` (c, p) [1/px], 0 where not seen.
+    """
+
+    Ps: FloatArray
+    X: FloatArray
+    pixels: FloatArray
+    weights: FloatArray
+
+
+class DisplacementGroup(NamedTuple):
+    """A group of displacements, of which rows ``first`` to ``last`` of ``algebra`` (…, 4, 4) are a basis."""
+
+    algebra: FloatArray
+    first: int
+    last: int
+
+
+class Displaced(NamedTuple):
+    """An element ``D`` (4, 4) of a group of d dimensions, and the ``total`` (d,) of the steps to it."""
+
+    D: FloatArray
+    total: FloatArray
+
+
 @kernel
-def _effect(
-    Ps: FloatArray,
-    camera: int,
-    D: FloatArray,
-    X: FloatArray,
-    count: int,
-    pixels: FloatArray,
-    weights: FloatArray,
-) -> float:
-    """Rms motion [px] of the seen points in one camera, or all (-1), by a displacement ``D``."""
+def _effect(predicted: SightedPoints, camera: int, D: FloatArray, count: int) -> float:
+    """Rms motion [px] of the first ``count`` points, where seen, in one camera, or all (-1), by a displacement."""
+    Ps, X, pixels, weights = predicted
     low, high = (0, Ps.shape[0]) if camera < 0 else (camera, camera + 1)
     squares, seen = 0.0, 0.0
     x = np.empty(4)
@@ -94,16 +114,17 @@ def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result:
     Ps, X, markers, pixels, observed, weights, operators, twists = moment
     cameras, joints = Ps.shape[0], operators.shape[0]
     D, total = np.empty((4, 4)), np.empty(MAX_SIZE)
+    seen_points, predicted = SightedPoints(Ps, X, observed, weights), SightedPoints(Ps, X, pixels, weights)
     result[2] = 0.0
     if h <= cameras or h == cameras + 1:
         camera = h - 1 if h <= cameras else -1
         if twists.shape[0] == 6 and sizes[h] == 6:
             result[0], result[1] = fit_displacement(
-                Ps, camera, twists, 0, 6, X, X.shape[0], observed, weights, rounds, D, total
+                seen_points, camera, DisplacementGroup(twists, 0, 6), X.shape[0], rounds, Displaced(D, total)
             )
             if rounds > 0:
                 result[2] = _angle(D)
-                result[3] = _effect(Ps, camera, D, X, X.shape[0], pixels, weights)
+                result[3] = _effect(predicted, camera, D, X.shape[0])
             return
         moved = np.empty((X.shape[0], 2))
         result[0], result[1] = fit_image_motion(
@@ -134,12 +155,12 @@ def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result:
             result[0], result[1] = 0.0 if rounds > 0 else chi2, chi2
         else:
             place = np.empty(4)
-            result[0], result[1] = fit_point(Ps, X, p, observed, weights, rounds, place)
+            result[0], result[1] = fit_point(seen_points, p, rounds, place)
         return
     j = h - cameras - 2 - markers
     first, last = (j, j + 1) if j < joints else (0, joints)
     result[0], result[1] = fit_displacement(
-        Ps, -1, operators, first, last, X, markers, observed, weights, rounds, D, total
+        seen_points, -1, DisplacementGroup(operators, first, last), markers, rounds, Displaced(D, total)
     )
     if rounds > 0:
         largest = 0.0
@@ -147,7 +168,7 @@ def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result:
             if abs(total[k]) > abs(largest):
                 largest = total[k]
         result[2] = largest
-        result[3] = _effect(Ps, -1, D, X, markers, pixels, weights)
+        result[3] = _effect(predicted, -1, D, markers)
 
 
 @kernel
@@ -197,12 +218,36 @@ def _kind(h: int, cameras: int, markers: int, joints: int) -> int:
     return JOINT if h < cameras + 2 + markers + joints else JOINTS
 
 
+class Innovations(NamedTuple):
+    """``innovations`` (c, p, 2) [px] with ``weights`` (c, p) [1/px] of points ``X`` (p, 4), the first ``markers`` of
+    the arm, then static ones, in cameras ``Ps`` (c, 3, 4); ``operators`` and ``twists`` as in `Moment`.
+    """
+
+    Ps: FloatArray
+    X: FloatArray
+    markers: int
+    innovations: FloatArray
+    weights: FloatArray
+    operators: FloatArray
+    twists: FloatArray
+
+
+class Explanations(NamedTuple):
+    """Of H hypotheses: ``sizes``, their parameters, ``chi2`` that each leaves, ``amounts`` and ``effects`` [px], (H,)
+    each; the ``answer`` (3,): kind, hypothesis, runner-up or -1.
+    """
+
+    sizes: IntArray
+    chi2: FloatArray
+    amounts: FloatArray
+    effects: FloatArray
+    answer: IntArray
+
+
 @kernel
-def _predict(
-    Ps: FloatArray, X: FloatArray, innovations: FloatArray, weights: FloatArray,
-    pixels: FloatArray, observed: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
+def _predict(shown: Fields, pixels: FloatArray, observed: FloatArray) -> tuple[float, float]:
     """``pixels`` (c, p, 2) as predicted and ``observed``, where seen; chi-square and rms [px] of the innovations."""
+    Ps, X, _, innovations, weights, _, _ = shown
     chi2, square_px, seen = 0.0, 0.0, 0.0
     for c in range(Ps.shape[0]):
         P = Ps[c]
@@ -223,19 +268,17 @@ def _predict(
 
 @kernel
 def explain_innovations(
-    Ps: FloatArray, X: FloatArray, markers: int, innovations: FloatArray, weights: FloatArray,
-    operators: FloatArray, twists: FloatArray, thresholds: FloatArray, log_alpha: float, least_px: float,
-    sizes: IntArray, chi2: FloatArray, amounts: FloatArray, effects: FloatArray, answer: IntArray,
-) -> None:  # fmt: skip
-    """Estimates of all hypotheses and the decision among them.
-
-    ``X`` (p, 4): the markers, then the static points; ``innovations`` (c, p, 2) [px], ``weights`` (c, p) [1/px].
-    Out: ``sizes``, ``chi2``, ``amounts``, ``effects`` (H,); ``answer`` (3,): kind, hypothesis, runner-up or -1.
+    seen: Fields, thresholds: FloatArray, log_alpha: float, least_px: float, found: Fields
+) -> None:
+    """Estimates of all hypotheses and the decision among them, into ``found``, the fields of `Explanations`; ``seen``:
+    those of `Innovations`. ``thresholds``, ``log_alpha`` and ``least_px`` are those of a `hypothesis_test.Thresholds`.
     """
+    Ps, X, markers, _, weights, operators, twists = seen
+    sizes, chi2, amounts, effects, answer = found
     cameras, points, joints = Ps.shape[0], X.shape[0], operators.shape[0]
     count = cameras + 3 + markers + joints
     pixels, observed = np.empty((cameras, points, 2)), np.empty((cameras, points, 2))
-    whole, rms_px = _predict(Ps, X, innovations, weights, pixels, observed)
+    whole, rms_px = _predict(seen, pixels, observed)
     total = hypothesis_sizes(weights, cameras, markers, joints, twists.shape[0] == 6, sizes)
     penalty = math.log(max(total, 2))
     large = rms_px >= least_px
@@ -268,7 +311,8 @@ def explain_innovations(
             chi2[h] = whole - now[h] + result[0]
             amounts[h], effects[h] = result[2], result[3]
     noise = noise_level(chi2, sizes, candidates, total)
-    first, second = two_best(whole, chi2, sizes, effects, candidates, noise, penalty, thresholds, least_px)
+    tested = Tested(chi2, sizes, effects, candidates)
+    first, second = two_best(whole, tested, noise, penalty, thresholds, least_px)
     if first < 0:
         if large and is_unexplained(whole, total, log_alpha, 0.0):
             answer[0] = UNEXPLAINED
@@ -296,18 +340,31 @@ SETTLED = 1e-4
 DAMPING = 1e-10
 
 
+class CameraPoints(NamedTuple):
+    """Points ``X`` (p, 4), moved by ``D`` (4, 4), in a camera ``P`` (3, 4): where they are ``observed`` (p, 2), and
+    ``weights`` (p,).
+    """
+
+    P: FloatArray
+    D: FloatArray
+    X: FloatArray
+    observed: FloatArray
+    weights: FloatArray
+
+
 @kernel
 def _equations(
-    E: FloatArray, P: FloatArray, D: FloatArray, X: FloatArray, observed: FloatArray, weights: FloatArray,
-    first: int, last: int, N: FloatArray, b: FloatArray, rows: FloatArray,
-) -> float:  # fmt: skip
-    """Equations of points ``first`` to ``last`` of one camera, moved by ``D``, into ``N``, ``b``; their chi-square.
+    E: FloatArray, points: CameraPoints, count: int, equations: NormalSystem, rows: FloatArray
+) -> float:
+    """Equations of the first ``count`` points onto ``equations``; their chi-square.
 
     ``E`` (d, 3, 4) = P times the algebra; ``rows`` (2, d) scratch. Infinite where a point is not ahead.
     """
+    P, D, X, observed, weights = points
+    N, b = equations
     chi2 = 0.0
     d = b.shape[0]
-    for p in range(first, last):
+    for p in range(count):
         w = weights[p]
         if not w > 0.0:
             continue
@@ -359,15 +416,16 @@ def _solved(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
 
 @kernel
 def fit_displacement(
-    Ps: FloatArray, camera: int, algebra: FloatArray, first: int, last: int, X: FloatArray, count: int,
-    observed: FloatArray, weights: FloatArray, rounds: int, D: FloatArray, total: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
-    """Chi-square of the first ``count`` points in one camera, or all (-1), moved by the best element of a group.
+    seen: SightedPoints, camera: int, group: DisplacementGroup, count: int, rounds: int, found: Displaced
+) -> tuple[float, float]:
+    """Chi-square of the first ``count`` points in one camera, or all (-1), moved by the best element of a group, which
+    goes into ``found``.
 
-    The group's algebra is rows ``first`` to ``last`` of ``algebra``; ``D`` (4, 4) is its element, ``total`` (d,) the
-    sum of the steps. With ``rounds`` 0: chi-square of the model as it is. Second: the gain to first order of the
-    first step.
+    With ``rounds`` 0: chi-square of the model as it is. Second: the gain to first order of the first step.
     """
+    Ps, X, observed, weights = seen
+    algebra, first, last = group
+    D, total = found
     d = last - first
     low, high = (0, Ps.shape[0]) if camera < 0 else (camera, camera + 1)
     E = np.empty((high - low, d, 3, 4))
@@ -387,7 +445,8 @@ def fit_displacement(
         b[:] = 0.0
         chi2 = 0.0
         for c in range(low, high):
-            chi2 += _equations(E[c - low], Ps[c], here, X, observed[c], weights[c], 0, count, N, b, rows)
+            points = CameraPoints(Ps[c], here, X, observed[c], weights[c])
+            chi2 += _equations(E[c - low], points, count, NormalSystem(N, b), rows)
         if not chi2 < math.inf or (turn > 0 and not chi2 <= best):
             break
         best = chi2
@@ -480,19 +539,12 @@ def fit_image_motion(
 
 
 @kernel
-def fit_point(
-    Ps: FloatArray,
-    X: FloatArray,
-    p: int,
-    observed: FloatArray,
-    weights: FloatArray,
-    rounds: int,
-    found: FloatArray,
-) -> tuple[float, float]:
+def fit_point(sighted: SightedPoints, p: int, rounds: int, found: FloatArray) -> tuple[float, float]:
     """Chi-square of point ``p`` alone at its best place ``found`` (4,); second: gain to first order of the first step.
 
     Two views or more: three of its coordinates are free, all but the largest.
     """
+    Ps, X, observed, weights = sighted
     largest = 0
     for i in range(1, 4):
         if abs(X[p, i]) > abs(X[p, largest]):

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -165,16 +166,27 @@ def penalised_chi2(chi2: float, size: int, noise: float, penalty: float) -> floa
     return chi2 / noise + size * penalty
 
 
+class Tested(NamedTuple):
+    """Hypotheses that were tested: ``chi2`` (h,) that each leaves, ``sizes`` (h,): its parameters, ``effects`` (h,)
+    [px], and which are ``candidates`` (h,).
+    """
+
+    chi2: FloatArray
+    sizes: IntArray
+    effects: FloatArray
+    candidates: BoolArray
+
+
 @kernel
 def two_best(
-    before: float, chi2: FloatArray, sizes: IntArray, effects: FloatArray, candidates: BoolArray,
-    noise: float, penalty: float, ratios: FloatArray, least_px: float,
-) -> tuple[int, int]:  # fmt: skip
+    before: float, tested: Tested, noise: float, penalty: float, ratios: FloatArray, least_px: float
+) -> tuple[int, int]:
     """Indices of the significant candidates of least and second least penalised chi-square, -1 for none.
 
-    ``before``: chi-square without a change; ``chi2`` (h,) with each; ``effects`` (h,) [px]; ``ratios`` and ``least_px``
-    as in `Thresholds`.
+    ``before``: chi-square without a change; ``noise`` and ``penalty`` as in `penalised_chi2`; ``ratios`` and
+    ``least_px`` as in `Thresholds`.
     """
+    chi2, sizes, effects, candidates = tested
     first, second = -1, -1
     for h in range(chi2.shape[0]):
         significant = candidates[h] and (before - chi2[h]) / noise > ratios[sizes[h]]

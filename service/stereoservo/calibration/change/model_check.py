@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.change.hypothesis_test import (
+    Tested,
     Thresholds,
     check_thresholds,
     is_unexplained,
@@ -229,10 +230,8 @@ def _add_best_cause(
     }
     chi2 = np.array([estimates[h].chi2 if h in estimates else np.inf for h in range(len(others))])
     noise = noise_level(chi2, sizes, candidates, count - found.x.size)
-    best, _ = two_best(
-        found.chi2, chi2, sizes, np.zeros(len(others)), candidates, noise, penalty, thresholds.ratios,
-        thresholds.least_px,
-    )  # fmt: skip
+    tested = Tested(chi2, sizes, np.zeros(len(others)), candidates)
+    best, _ = two_best(found.chi2, tested, noise, penalty, thresholds.ratios, thresholds.least_px)
     return estimates.get(best)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from stereoservo.calibration.change.hypothesis_test import (
     REFINED,
     UNCLEAR,
+    Tested,
     check_thresholds,
     noise_level,
     penalised_chi2,
@@ -110,7 +111,7 @@ def best_change(
     noise *= _correlation(problem, views, found[int(np.argmin(scores))])
     effects = np.array([one.effect_px for one in found])
     best, second = two_best(
-        chi2, left, sizes, effects, every, noise, math.log(count), limits.ratios, LEAST_PX
+        chi2, Tested(left, sizes, effects, every), noise, math.log(count), limits.ratios, LEAST_PX
     )
     if best < 0:
         return None

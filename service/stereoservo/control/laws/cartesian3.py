@@ -38,10 +38,11 @@ from stereoservo.control.step_correction import (
     exponential_into,
     rigid_motions,
 )
+from stereoservo.kinematics.composition import PresentArm
 from stereoservo.kinematics.kernels import multiply4_into, transform_points, transform_points_into
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.planning.primitives import (
     HINGE,
     PLANAR,
@@ -185,7 +186,7 @@ def cartesian_step(
             if singular:
                 freedoms = Freedoms(rigid, np.eye(FREEDOMS))
     parts = decompose(freedoms, task)
-    sight = _kept_in_view(freedoms, task, face, target_face, camera_centres, single, parts)
+    sight = _kept_in_view(freedoms, task, FacePlanes(face, target_face), camera_centres, single, parts)
     steps = _paced(parts, sight, pace, errors, allowed, shown)
     if singular:
         wanted = np.zeros((4, 4))
@@ -199,7 +200,7 @@ def cartesian_step(
             for j in range(n):
                 velocity[j] *= share
     else:
-        _exact_into(operators, composition, task, parts, steps, dt_s, velocity)
+        _exact_into(PresentArm(operators, composition), task, parts, steps, dt_s, velocity)
     if sight.hinge_first:
         errors[1] = sight.whole
         shown[1] = WAITS
@@ -217,13 +218,13 @@ def _shortened(step: FloatArray) -> float:
 
 @kernel
 def _exact_into(
-    operators: FloatArray, composition: int, task: FaceTask, parts: Components, steps: FloatArray, dt_s: float,
-    velocity: FloatArray,
-) -> None:  # fmt: skip
+    arm: PresentArm, task: FaceTask, parts: Components, steps: FloatArray, dt_s: float, velocity: FloatArray
+) -> None:
     """The joint ``velocity`` (n,) of the components' ``steps`` (k,), corrected for the time that it is held.
 
     A step that would take a joint too far is shortened as a whole: no correction holds for it.
     """
+    operators, composition = arm
     points, centre = task.points, task.centre
     n, count = velocity.shape[0], steps.shape[0]
     for i in range(count):
@@ -256,19 +257,50 @@ def _exact_into(
         velocity[j] = step[j] / dt_s
 
 
+class BodyTask(NamedTuple):
+    """All ``marker_points`` (m, 4) now and at the goal, ``target_points`` (m, 4); the markers of the face, ``corners``
+    (3,); ``centre`` and ``centre_target`` (4,): all points of height ``a∞ᵀM = 1``.
+    """
+
+    marker_points: FloatArray
+    target_points: FloatArray
+    corners: IntArray
+    centre: FloatArray
+    centre_target: FloatArray
+
+
+class Rates(NamedTuple):
+    """The ``gain`` [1/s] of all components; ``dt_s`` [s] and the rates as in `control.law.Options`."""
+
+    gain: float
+    dt_s: float
+    rotation_rate: float
+    translation_rate: float
+
+
+class Stepped(NamedTuple):
+    """What a step makes: joint ``velocity`` (n,), task error and allowed in ``components`` (2, k), status ``shown``
+    (k,).
+    """
+
+    velocity: FloatArray
+    components: FloatArray
+    shown: IntArray
+
+
 @kernel
 def _normalised_step_into(
-    operators: FloatArray, composition: int, marker_points: FloatArray, target_points: FloatArray, corners: IntArray,
-    centre: FloatArray, centre_target: FloatArray, eyes: FloatArray, options: tuple[float, float, float, float],
-    velocity: FloatArray, components: FloatArray, shown: IntArray,
-) -> None:  # fmt: skip
+    arm: PresentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped
+) -> None:
     """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
     the task error are those of the frame that the arguments are in.
 
-    Into the last three: joint velocity (n,), task error and allowed (2, k), status (k,). ``corners`` (3,): markers of
-    the face; ``options``: gain, ``dt_s``, both rates of `control.law.Options`.
+    Into ``stepped``; ``eyes`` (c, 4): camera centres.
     """
-    gain, dt_s, rotation_rate, translation_rate = options
+    operators, composition = arm
+    marker_points, target_points, corners, centre, centre_target = task
+    gain, dt_s, rotation_rate, translation_rate = rates
+    velocity, components, shown = stepped
     n, count = operators.shape[0], shown.shape[0]
     points, targets = np.empty((3, 4)), np.empty((3, 4))
     for p in range(3):
@@ -300,12 +332,24 @@ def _normalised_step_into(
         shown[i] = found[3][i]
 
 
+class FacePlanes(NamedTuple):
+    """The plane of a face, (4,), ``now`` and ``then``, at the goal."""
+
+    now: FloatArray
+    then: FloatArray
+
+
 @kernel
 def _kept_in_view(
-    freedoms: Freedoms, task: FaceTask, face: FloatArray, target_face: FloatArray, camera_centres: FloatArray,
-    single: bool, parts: Components,
-) -> Sight:  # fmt: skip
+    freedoms: Freedoms,
+    task: FaceTask,
+    planes: FacePlanes,
+    camera_centres: FloatArray,
+    single: bool,
+    parts: Components,
+) -> Sight:
     """How far the components may go with the face in view; the rotation, in its sense, goes into ``parts``."""
+    face, target_face = planes
     centre, centre_target = task.centre, task.centre_target
     n, cameras = freedoms.basis.shape[0], camera_centres.shape[0]
     screws, generators, amount, status = parts
@@ -396,17 +440,26 @@ def cartesian3_step(
 
 
 @kernel
+def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields, stepped: Fields) -> None:
+    """`_normalised_step_into` for Python, with the fields of all records."""
+    _normalised_step_into(PresentArm(*arm), BodyTask(*task), eyes, Rates(*rates), Stepped(*stepped))
+
+
+@kernel
 def fill_step(room: Record, gain: float, dt_s: float, count: int) -> None:
     """The step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
     work = room[0]
     n, m, c = work.joints, work.markers, work.eye_count
-    options = (gain, dt_s, math.inf, math.inf)
-    _normalised_step_into(
-        work.operators[: 16 * n].reshape((n, 4, 4)), work.composition, work.body[: 4 * m].reshape((m, 4)),
-        work.target_points[: 4 * m].reshape((m, 4)), work.face, work.centre, work.centre_target,
-        work.eyes[: 4 * c].reshape((c, 4)), options, work.velocity[:n],
-        work.components[: 2 * count].reshape((2, count)), work.component_status[:count],
+    arm = PresentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
+    task = BodyTask(
+        work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.face, work.centre,
+        work.centre_target,
     )  # fmt: skip
+    stepped = Stepped(
+        work.velocity[:n], work.components[: 2 * count].reshape((2, count)), work.component_status[:count]
+    )
+    eyes = work.eyes[: 4 * c].reshape((c, 4))
+    _normalised_step_into(arm, task, eyes, Rates(gain, dt_s, math.inf, math.inf), stepped)
     work.conditioning = 1.0
 
 
@@ -420,11 +473,10 @@ def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> Law
     """The step of a law with ``count`` components, 3 or 2, each at the gain of ``options``."""
     velocity, components = np.empty(len(scene.operators)), np.empty((2, count))
     status = np.empty(count, np.int64)
+    body = (scene.points, task.target_points, task.face, task.centre, task.centre_target)
     rates = (options.gain, options.dt_s, options.rotation_rate, options.translation_rate)
-    _normalised_step_into(
-        scene.operators, scene.composition, scene.points, task.target_points, task.face, task.centre,
-        task.centre_target, scene.camera_centres, rates, velocity, components, status,
-    )  # fmt: skip
+    arm = (scene.operators, int(scene.composition))
+    _normalised_step(arm, body, scene.camera_centres, rates, (velocity, components, status))
     return LawStep(velocity, components[0], components[1], status, 1.0)
 
 

@@ -8,6 +8,7 @@ cameras. The command then does not depend on the frame.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from stereoservo.control.law import DAMPING, Law, LawProperties, LawStep, Option
 from stereoservo.control.laws.stereo import (
     DESIRED,
     MEAN,
+    Gains,
     gain_held,
     held_gain,
     image_reasons,
@@ -23,7 +25,7 @@ from stereoservo.control.laws.stereo import (
     velocities_into,
 )
 from stereoservo.numerics.arrays import FloatArray, Record
-from stereoservo.numerics.compilation import kernel
+from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import add_equation, damped_solve
 
 
@@ -36,18 +38,22 @@ def pixel_metrics(matrices: FloatArray, points: FloatArray) -> FloatArray:
     return out
 
 
+class PointTask(NamedTuple):
+    """Marker ``points`` (m, 4) and where they shall be, ``target_points`` (m, 4), with ``weights`` (m,), 0 where that
+    is not known; ``metrics`` (m, k, 4): what k numbers, such as pixels, a displacement of each is measured by.
+    """
+
+    points: FloatArray
+    target_points: FloatArray
+    weights: FloatArray
+    metrics: FloatArray
+
+
 @kernel
-def points_step(
-    operators: FloatArray,
-    points: FloatArray,
-    target_points: FloatArray,
-    weights: FloatArray,
-    metrics: FloatArray,
-    gain: float,
-    choice: int,
-    damping: float,
-) -> tuple[FloatArray, float]:
+def points_step(operators: FloatArray, task: PointTask, gains: Gains) -> tuple[FloatArray, float]:
     """The law's step as a kernel: joint velocity (n,) and conditioning."""
+    points, target_points, weights, metrics = task
+    gain, choice, damping = gains
     n, markers, rows = operators.shape[0], points.shape[0], metrics.shape[1]
     N = np.zeros((n, n))
     b = np.zeros(n)
@@ -100,6 +106,12 @@ def points_step(
 
 
 @kernel
+def step_by_points(operators: FloatArray, task: Fields, gains: Fields) -> tuple[FloatArray, float]:
+    """`points_step` for Python, with the fields of a `PointTask` and of `Gains`."""
+    return points_step(operators, PointTask(*task), Gains(*gains))
+
+
+@kernel
 def points_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
     """The law's ``kernel``."""
     work = room[0]
@@ -110,10 +122,13 @@ def points_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None
         for k in range(c):
             seen[i] = max(seen[i], work.usable[k * m + i])
         seen[i] *= 1.0 if work.target_known[i] > 0.0 else 0.0
-    velocity, work.conditioning = points_step(
-        work.operators[: 16 * n].reshape((n, 4, 4)), body, work.target_points[: 4 * m].reshape((m, 4)), seen,
-        pixel_metrics(work.matrices[: 12 * c].reshape((c, 3, 4)), body), gain_held(gain, dt_s), jacobian, DAMPING,
+    task = PointTask(
+        body, work.target_points[: 4 * m].reshape((m, 4)), seen,
+        pixel_metrics(work.matrices[: 12 * c].reshape((c, 3, 4)), body),
     )  # fmt: skip
+    velocity, work.conditioning = points_step(
+        work.operators[: 16 * n].reshape((n, 4, 4)), task, Gains(gain_held(gain, dt_s), jacobian, DAMPING)
+    )
     work.velocity[:n] = velocity
 
 
@@ -123,10 +138,11 @@ def points(scene: Scene, task: Task, options: Options) -> LawStep:
     With the mean Jacobian ``Ĥ_j (M + M*)/2`` the motion is the screw from here to the goal, from anywhere short of
     half a turn. There is no fixed depth in space: that choice is the present points.
     """
-    velocity, conditioning = points_step(
-        scene.operators, scene.points, task.target_points, _seen(scene, task),
-        pixel_metrics(scene.matrices, scene.points), held_gain(options), int(options.jacobian), options.damping,
+    measured = (
+        scene.points, task.target_points, _seen(scene, task), pixel_metrics(scene.matrices, scene.points)
     )  # fmt: skip
+    gains = (held_gain(options), int(options.jacobian), options.damping)
+    velocity, conditioning = step_by_points(scene.operators, measured, gains)
     return limited(scene, task, options, velocity, conditioning)
 
 

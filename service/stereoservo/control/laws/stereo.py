@@ -26,8 +26,8 @@ from stereoservo.control.law import (
 from stereoservo.messages.goals import DEFAULT_LAW
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, Record
-from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import add_pixel_equations, damped_solve
+from stereoservo.numerics.compilation import Fields, kernel
+from stereoservo.numerics.linear import NormalSystem, add_pixel_equations, damped_solve
 
 ILL_CONDITIONED = 1e-5
 NO_COMPONENTS = np.zeros(0)
@@ -58,6 +58,16 @@ class Body(NamedTuple):
     points: FloatArray
     target_points: FloatArray
     target_known: FloatArray
+
+
+class Gains(NamedTuple):
+    """How a law in the images works: ``gain`` [1/s] of a velocity as it is held, ``choice`` of the Jacobian
+    (`JacobianChoice`), ``damping`` relative to the largest diagonal of the normal matrix.
+    """
+
+    gain: float
+    choice: int
+    damping: float
 
 
 @kernel
@@ -103,11 +113,12 @@ def add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, r
 
 @kernel
 def image_equations_into(
-    operators: FloatArray, view: View, body: Body, gain: float, choice: int, N: FloatArray, b: FloatArray
+    operators: FloatArray, view: View, body: Body, gain: float, choice: int, equations: NormalSystem
 ) -> None:
-    """The normal equations ``N x = b`` of `image_step`, undamped; of ``N`` (n, n) the lower triangle."""
+    """The normal equations of `image_step`, undamped; of the matrix the lower triangle."""
     matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
     points, target_points, target_known = body
+    N, b = equations
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
     for i in range(n):
         b[i] = 0.0
@@ -159,31 +170,32 @@ def image_equations_into(
 
 
 @kernel
-def image_step(
-    operators: FloatArray, view: View, body: Body, gain: float, choice: int, damping: float
-) -> tuple[FloatArray, float]:
+def image_step(operators: FloatArray, view: View, body: Body, gains: Gains) -> tuple[FloatArray, float]:
     """Velocity (n,) of least ``Σ w²|J q̇ − gain (s* − s) − ṡ*|²``, damped, and the conditioning; see `control.law`."""
+    gain, choice, damping = gains
     n = operators.shape[0]
     N, b, x = np.empty((n, n)), np.empty(n), np.zeros(n)
-    image_equations_into(operators, view, body, gain, choice, N, b)
+    image_equations_into(operators, view, body, gain, choice, NormalSystem(N, b))
     conditioning = damped_solve(N, b, damping, x)
     return x, conditioning
 
 
 @kernel
 def _image_step_into(
-    operators: FloatArray,
-    view: View,
-    body: Body,
-    gain: float,
-    choice: int,
-    damping: float,
-    velocity: FloatArray,
+    operators: FloatArray, view: View, body: Body, gains: Gains, velocity: FloatArray
 ) -> float:
     """`image_step` into ``velocity`` (n,); the conditioning."""
-    x, conditioning = image_step(operators, view, body, gain, choice, damping)
+    x, conditioning = image_step(operators, view, body, gains)
     velocity[:] = x
     return conditioning
+
+
+@kernel
+def _image_step(
+    operators: FloatArray, view: Fields, body: Fields, gains: Fields, velocity: FloatArray
+) -> float:
+    """`_image_step_into` for Python, with the fields of a `View`, a `Body` and of `Gains`."""
+    return _image_step_into(operators, View(*view), Body(*body), Gains(*gains), velocity)
 
 
 @kernel
@@ -202,7 +214,7 @@ def image_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
     )
     operators = work.operators[: 16 * n].reshape((n, 4, 4))
     work.conditioning = _image_step_into(
-        operators, view, body, gain_held(gain, dt_s), jacobian, DAMPING, work.velocity[:n]
+        operators, view, body, Gains(gain_held(gain, dt_s), jacobian, DAMPING), work.velocity[:n]
     )
 
 
@@ -251,14 +263,13 @@ def image_velocity_step(
     scene: Scene, task: Task, options: Options, jacobian: int, rates: FloatArray
 ) -> LawStep:
     """The kernel's step for a choice of the Jacobian and a feed-forward (c, m, 2) [px/s]."""
-    view = View(
+    view = (
         scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted
-    )
-    body = Body(scene.points, task.target_points, task.target_known)
+    )  # fmt: skip
+    body = (scene.points, task.target_points, task.target_known)
+    gains = (held_gain(options), int(jacobian), options.damping)
     velocity = np.empty(len(scene.operators))
-    conditioning = _image_step_into(
-        scene.operators, view, body, held_gain(options), int(jacobian), options.damping, velocity
-    )
+    conditioning = _image_step(scene.operators, view, body, gains, velocity)
     return limited(scene, task, options, velocity, conditioning)
 
 

@@ -12,10 +12,11 @@ import numpy as np
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.laws.stereo import Body, View, image_equations_into, image_reasons, limited
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, joint_screws, step_into
+from stereoservo.kinematics.composition import PresentArm
 from stereoservo.kinematics.kernels import project_points, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import cholesky_solve, damped_solve
+from stereoservo.numerics.compilation import Fields, kernel
+from stereoservo.numerics.linear import NormalSystem, cholesky_solve, damped_solve
 
 JOINT_SHARE = 1e-4
 """Squared weight of a planned joint, relative to the images' in the same joint.
@@ -43,26 +44,41 @@ class Pull(NamedTuple):
     planned: bool
 
 
+class HeldStep(NamedTuple):
+    """The ``gain`` [1/s], how long the velocity is held, ``dt_s`` [s], and ``damping`` relative to the largest diagonal
+    of the normal matrix.
+    """
+
+    gain: float
+    dt_s: float
+    damping: float
+
+
 @kernel
 def trajectory_step(
-    operators: FloatArray, composition: int, view: View, points: FloatArray, plan: PlannedJoints, gain: float,
-    dt_s: float, damping: float,
-) -> tuple[FloatArray, float]:  # fmt: skip
-    """Joint velocity (n,) and conditioning; for ``dt_s`` > 0 refined by Newton's method on the images."""
+    arm: Fields, view: Fields, points: FloatArray, plan: Fields, held_step: Fields
+) -> tuple[FloatArray, float]:
+    """Joint velocity (n,) and conditioning; for ``dt_s`` > 0 refined by Newton's method on the images.
+
+    The fields of a `PresentArm`, a `View`, of `PlannedJoints` and of a `HeldStep`; ``points`` (m, 4).
+    """
+    seen, joints = View(*view), PlannedJoints(*plan)
+    operators, composition = arm
+    gain, dt_s, damping = held_step
     n = operators.shape[0]
     x, pull, meant = np.zeros(n), np.zeros(n), np.zeros(n)
     known = np.zeros(points.shape[0])
     held = -math.expm1(-gain * dt_s) / dt_s if dt_s > 0.0 else gain
     N, b = np.empty((n, n)), np.empty(n)
-    image_equations_into(operators, view, Body(points, points, known), held, 0, N, b)
-    planned = plan.rates.shape[0] == n
+    image_equations_into(operators, seen, Body(points, points, known), held, 0, NormalSystem(N, b))
+    planned = joints.rates.shape[0] == n
     if planned:
         largest = 0.0
         for j in range(n):
             largest = max(largest, N[j, j])
         for j in range(n):
-            pull[j] = damping * largest + plan.weight * JOINT_SHARE * N[j, j]
-            meant[j] = plan.rates[j] + plan.weight * held * plan.error[j]
+            pull[j] = damping * largest + joints.weight * JOINT_SHARE * N[j, j]
+            meant[j] = joints.rates[j] + joints.weight * held * joints.error[j]
             if not math.isfinite(pull[j] * meant[j]):
                 return x, 0.0
             N[j, j] += pull[j]
@@ -71,16 +87,20 @@ def trajectory_step(
     else:
         conditioning = damped_solve(N, b, damping, x)
     if dt_s > 0.0 and conditioning != 0.0:
-        _refine(operators, composition, view, points, Pull(pull, meant, planned), held, dt_s, damping, x)
+        present, longer = PresentArm(operators, composition), HeldStep(held, dt_s, damping)
+        _refine(present, seen, points, Pull(pull, meant, planned), longer, x)
     return x, conditioning
 
 
 @kernel
 def _refine(
-    operators: FloatArray, composition: int, view: View, points: FloatArray, plan: Pull, held: float, dt_s: float,
-    damping: float, x: FloatArray,
-) -> None:  # fmt: skip
-    """Refine a velocity ``x`` (n,), held for ``dt_s``, so that the images move as meant to all orders."""
+    arm: PresentArm, view: View, points: FloatArray, plan: Pull, held_step: HeldStep, x: FloatArray
+) -> None:
+    """Refine a velocity ``x`` (n,), held, so that the images move as meant to all orders; the gain is that of a
+    velocity that is held.
+    """
+    operators, composition = arm
+    held, dt_s, damping = held_step
     matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
     pull, meant, planned = plan
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
@@ -120,7 +140,7 @@ def _refine(
         for j in range(n):
             best[j] = found[j]
         ahead = View(matrices, camera_centres, seen, goal, no_rates, weights, wanted)
-        image_equations_into(turned, ahead, Body(moved, moved, known), 1.0, 0, N, b)
+        image_equations_into(turned, ahead, Body(moved, moved, known), 1.0, 0, NormalSystem(N, b))
         if planned:
             for j in range(n):
                 N[j, j] += pull[j]
@@ -155,26 +175,14 @@ def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
             f"an arm of {n} joints takes {n} planned rates and errors, or none of both; got "
             f"{len(task.joint_rates)} and {len(task.joint_error)}"
         )
-    view = View(
-        scene.matrices,
-        scene.camera_centres,
-        scene.pixels,
-        task.set_points,
-        task.rates,
-        scene.weights,
-        task.wanted,
-    )
-    plan = PlannedJoints(task.joint_rates, task.joint_error, task.joint_weight)
+    view = (
+        scene.matrices, scene.camera_centres, scene.pixels, task.set_points, task.rates, scene.weights, task.wanted
+    )  # fmt: skip
+    plan = (task.joint_rates, task.joint_error, task.joint_weight)
     velocity, conditioning = trajectory_step(
-        scene.operators,
-        scene.composition,
-        view,
-        scene.points,
-        plan,
-        options.gain,
-        options.dt_s,
-        options.damping,
-    )
+        (scene.operators, int(scene.composition)), view, scene.points, plan,
+        (options.gain, options.dt_s, options.damping),
+    )  # fmt: skip
     return limited(scene, task, options, velocity, conditioning)
 
 

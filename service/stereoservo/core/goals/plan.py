@@ -99,7 +99,7 @@ def _plan_request(
         kept=kept,
         centre=centre_of(source, joints + context.state.block.correction, arrays, points),
         centre_target=source.centre_target.copy(),
-        faces=kept_faces(*source.faces, points, source.target_points, matrices, camera_centres),
+        faces=kept_faces(source.faces, points, source.target_points, matrices, camera_centres),
         limits=PlanLimits(
             position_min=limits.position_min + margin,
             position_max=limits.position_max - margin,

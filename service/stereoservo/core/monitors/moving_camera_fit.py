@@ -10,7 +10,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from stereoservo.calibration.change.change_detection_kernel import ROUNDS, fit_displacement
+from stereoservo.calibration.change.change_detection_kernel import (
+    ROUNDS,
+    Displaced,
+    DisplacementGroup,
+    SightedPoints,
+    fit_displacement,
+)
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
 from stereoservo.core.monitor_state import LATE_S
 from stereoservo.kinematics.kernels import project_points
@@ -58,8 +64,9 @@ def adjust(
         count = int((weights > 0.0).sum())
         if count < FEWEST:
             return None
+        seen = SightedPoints(matrices, points, targets, weights[None])
         chi2, _ = fit_displacement(
-            matrices, 0, basis, 0, FREEDOMS, points, len(points), targets, weights[None], ROUNDS, D, twist
+            seen, 0, DisplacementGroup(basis, 0, FREEDOMS), len(points), ROUNDS, Displaced(D, twist)
         )
         moved = moved_matrix(P, D)
         if not math.isfinite(chi2) or _side(moved, points, weights) != side:

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError, distinct, nearest_turns
-from stereoservo.kinematics.kernels import chain_forward, chain_forward_into, transform_points_into
-from stereoservo.numerics.arrays import FloatArray, KindArray
+from stereoservo.kinematics.kernels import Chain, chain_forward, chain_forward_into, transform_points_into
+from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
 
 BATCH = 64
@@ -284,10 +284,7 @@ def _normal_equations_into(
 
 @kernel
 def descend(
-    generators: FloatArray,
-    kinds: KindArray,
-    zero: FloatArray,
-    tip_first: bool,
+    chain: Chain,
     points: FloatArray,
     targets: FloatArray,
     starts: FloatArray,
@@ -312,10 +309,10 @@ def descend(
     g = np.empty(n)
     step = np.empty(n)
     trial = np.empty(n)
-    weight = _sum_of_squares(generators.reshape(n * 4, 4)) * _sum_of_squares(points) / n
+    weight = _sum_of_squares(chain.generators.reshape(n * 4, 4)) * _sum_of_squares(points) / n
     for a in range(s):
         q = ends[a]
-        chain_forward_into(generators, kinds, zero, q, H, operators, tip_first)
+        chain_forward_into(chain, q, H, operators)
         transform_points_into(H, points, moved)
         error = _squared_error(moved, targets)
         share = damping0
@@ -335,7 +332,7 @@ def descend(
                     factor = 1.0 if longest <= LONGEST else LONGEST / longest
                     for j in range(n):
                         trial[j] = q[j] + factor * step[j]
-                    chain_forward_into(generators, kinds, zero, trial, H, operators, tip_first)
+                    chain_forward_into(chain, trial, H, operators)
                     transform_points_into(H, points, moved)
                     reached = _squared_error(moved, targets)
                     if reached < error:
@@ -366,10 +363,7 @@ def descended(
 ) -> tuple[FloatArray, FloatArray]:
     """Run `descend` on ``chain``: ends (s, n) and their residuals (s,), ``|H(q)M - M*| / |M*|`` over all points."""
     ends, errors = descend(
-        chain.generators,
-        chain.kind_codes,
-        chain.zero,
-        chain.tip_first,
+        Chain(chain.generators, chain.kind_codes, chain.zero, chain.tip_first),
         np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(targets, dtype=np.float64),
         np.ascontiguousarray(starts, dtype=np.float64),
