@@ -340,7 +340,7 @@ def telling_motion(
             continue
         moved = postures + by * np.eye(len(readings))[joint]
         pixels = predicted_pixels(seen_chain(model), moved, model.marker_points)
-        inside = ((pixels > -0.5) & (pixels < sizes[:, None] - 0.5)).all(axis=-1)
+        inside: BoolArray = np.asarray(((pixels > -0.5) & (pixels < sizes[:, None] - 0.5)).all(axis=-1))
         apart = np.linalg.norm(pixels[first] - pixels[second], axis=-1)
         apart = np.where(inside[first] & inside[second], apart, 0.0).max(axis=(1, 2))
         told = apart >= least_px
