@@ -6,8 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.calibration.diagnosis.outlier_causes import expected_pixels
-from stereoservo.calibration.rig_model import projective_rig
+from stereoservo.calibration.rig_model import expected_pixels, projective_rig
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo_sim.experiments.arms.thesis_robot import thesis_cell, trial_motions

@@ -83,6 +83,9 @@ REMEDIES = {
     "moved_together": "something under all the cameras, or the marker body itself, was moved during the trials: fasten "
     "it, calibrate again. Where it happens at the same stop again it is the play of a joint: take another base",
     "camera_moved": "a camera was moved during the trials: fasten it, calibrate again",
+    "camera_or_body_moved": "something moved during the trials, and they do not tell what: look whether cameras, body "
+    "and the arm's base are fast, calibrate again. At the same stop again it is the play of a joint; [scene] static "
+    "markers tell a camera from the rest",
     "marker_slipped": "a marker slipped during the trials: fasten it, calibrate again",
     "markers_disagree": "run the trials again, with larger motions (calibration.range) or less noise; look whether the "
     "markers named sit on the same rigid body as the others",

@@ -335,6 +335,16 @@ def predicted(rig: RigModel, data: Measurements, moved: FloatArray | None = None
     return pixels
 
 
+def expected_pixels(rig: RigModel, offsets: FloatArray) -> FloatArray:
+    """Pixels (c, s, m, 2) of a rig at ``offsets`` (s, n)."""
+    shape = (len(rig.cameras), len(offsets), len(rig.points))
+    camera, stop, marker = (index.ravel() for index in np.indices(shape))
+    blank = np.zeros((len(camera), 2))
+    return predicted(rig, Measurements(offsets, camera, stop, marker, blank, np.ones(len(camera)))).reshape(
+        *shape, 2
+    )
+
+
 def _through(lens: FloatArray, ideal: FloatArray) -> FloatArray:
     """Raw pixels (k, 2) of ideal ones through a lens (7,), which has terms or is only radial."""
     if not bends(lens):

@@ -268,13 +268,13 @@ def _with_exact_joints(
     where there is none.
     """
 
-    def otherwise(cause: CalibrationError) -> CalibrationFit:
-        """The fit from other lenses where one explains the data; else ``cause`` is raised."""
+    def otherwise(cause: CalibrationError, refused: CalibrationFit | None = None) -> CalibrationFit:
+        """The fit from other lenses where one explains the data; else the cause is raised, of a fit ``refused`` too."""
         free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
         bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
         found = others() if bent else None
         if found is None:
-            raise cause
+            raise cause if refused is None else diagnose_failure(chain, cause, refit, options, refused)
         return found
 
     try:
@@ -289,7 +289,7 @@ def _with_exact_joints(
         result = otherwise(diagnose_failure(chain, broken, refit, options))
     implausible = implausible_lens(result)
     if implausible is not None:
-        result = otherwise(implausible)
+        result = otherwise(implausible, result)
     try:
         notes = review_notes(chain, result, refit, options)
     except CalibrationError as cause:

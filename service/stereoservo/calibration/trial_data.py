@@ -44,7 +44,8 @@ class CalibrationError(Exception):
             ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``;
             of the diagnosis ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``, ``joint_order``,
             ``wrong_scale``, ``views_exchanged``, ``views_unrelated``, ``no_baseline``, ``markers_exchanged``,
-            ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``;
+            ``noise_understated``, ``marker_slipped``, ``markers_disagree``, ``camera_moved``, ``moved_together``,
+            ``camera_or_body_moved``;
             of relocalization ``too_few_points``, ``points_coplanar``, ``not_explained``, ``too_uncertain``.
         data: the values in the message.
     """

@@ -27,7 +27,7 @@ from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.wire import FeaturesMessage
 
 if TYPE_CHECKING:
-    from stereoservo.kinematics.joint_angles import JointZeros
+    from stereoservo.kinematics.joint_angles import JointZeros, TellingMotion
     from stereoservo.numerics.arrays import FloatArray
 
 SPEED = 0.5
@@ -37,6 +37,8 @@ FRAMES, LOOK_S, SETTLE_S = 15, 5.0, 0.4
 LOOKS = 6
 PROBE = 0.15
 """Longest way of a joint [rad or m] before the looks agree on one answer."""
+TELLS_PX = 2.0
+"""Least difference of the pictures of two postures that a motion is made for, beside the model's own."""
 AGREES = 5.0
 """Deviations within which zeros count as right."""
 
@@ -95,11 +97,15 @@ def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, 
         looks.append(_look(client, arm))
         found, error_px = _zeros(arm, looks), _from_home_px(arm, looks[-1], target)
         sure = not found.alternatives and (len(looks) > 1 or _right(found))
+        telling = _telling(arm, looks[-1], found)
         if check or (sure and error_px <= _tolerance_px(arm)):
-            _report(arm, looks, found, error_px, check, as_json)
+            _report(arm, looks, found, telling, error_px, check, as_json)
             return
         way = target - found.offset - looks[-1].readings
-        if not sure:
+        if telling is not None:
+            way = 0.0 * way
+            way[telling.joint] = telling.step
+        elif not sure:
             way = way * min(1.0, PROBE / max(float(abs(way).max()), 1e-12))
         _move(client, arm, looks[-1].readings + way, SPEED * speed_scale)
     raise CommandError(
@@ -165,7 +171,9 @@ def _look(client: Client, arm: LearntArm) -> Look:
 
 
 def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
-    """What to add to the readings, by all looks. Raises CommandError where the pictures do not tell."""
+    """What to add to the readings, by all looks. Raises CommandError where the pictures do not tell, or tell of a
+    posture that the cell's limits forbid.
+    """
     import numpy as np
 
     from stereoservo.kinematics.joint_angles import joint_zeros
@@ -173,13 +181,52 @@ def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
 
     pixels, sigmas = np.array([look.pixels for look in looks]), np.array([look.sigmas for look in looks])
     readings = np.array([look.readings for look in looks])
+    check = f"`stereoservo calibrate {arm.cell.cell.name} --check`"
     try:
-        return joint_zeros(seen_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
+        found = joint_zeros(seen_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
     except JointAnglesError as error:
-        check = f"`stereoservo calibrate {arm.cell.cell.name} --check`"
         other = f"; zeros alone do not explain them: {check} looks for other causes"
         told = f"the pictures do not tell the joints' zeros: {error}"
         raise CommandError(error.code, told + (other if error.code == "no_agreement" else "")) from error
+    beyond = [] if found.alternatives or _right(found) else _beyond_limits(arm, readings[-1], found)
+    if beyond:
+        raise CommandError(
+            "outside_limits",
+            f"the pictures show {'; '.join(beyond)}: that is no correction of a zero. {check} looks for other causes "
+            "(a body, base or camera that moved); where the arm does stand there, bring it within its limits first",
+        )
+    return found
+
+
+def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> list[str]:
+    """Joints that stand beyond the cell's limits by the pictures, in words; whole turns are not seen."""
+    import numpy as np
+
+    at = readings + found.offset
+    slack = arm.cell.safety.position_margin + AGREES * found.deviations
+    low, high = arm.limits[:, 0] - slack, arm.limits[:, 1] + slack
+    turns = np.array(
+        [[0.0, 1.0, -1.0] if kind == "revolute" else [0.0] * 3 for kind in arm.model.joint_kinds]
+    )
+    turned = at[:, None] + 2.0 * np.pi * turns
+    inside = ((turned >= low[:, None]) & (turned <= high[:, None])).any(axis=1)
+    return [
+        f"{arm.model.joint_names[j]} at {at[j]:+.4f}, its limits are {arm.limits[j, 0]:+.4f} to {arm.limits[j, 1]:+.4f}"
+        for j in np.flatnonzero(~inside)
+    ]
+
+
+def _telling(arm: LearntArm, look: Look, found: JointZeros) -> TellingMotion | None:
+    """Motion that tells the postures of a look from each other; None where one is left, or no motion tells."""
+    import numpy as np
+
+    from stereoservo.kinematics.joint_angles import telling_motion
+
+    if not found.alternatives:
+        return None
+    postures = look.readings + np.array([found.offset, *found.alternatives])
+    least_px = TELLS_PX + _tolerance_px(arm)
+    return telling_motion(arm.model, postures, look.readings, arm.limits, PROBE, least_px)
 
 
 def _right(found: JointZeros) -> bool:
@@ -212,45 +259,92 @@ def _move(client: Client, arm: LearntArm, readings: FloatArray, speed_scale: flo
 
 
 def _report(
-    arm: LearntArm, looks: list[Look], found: JointZeros, error_px: float, check: bool, as_json: bool
-) -> None:
-    rows: list[dict[str, Any]] = []
-    for j, name in enumerate(arm.model.joint_names):
-        reading, off = float(looks[-1].readings[j]), float(found.offset[j])
-        rows.append(
-            {
-                "joint": name,
-                "reads": reading,
-                "is_at": reading + off,
-                "zero_off_by": -off,
-                "deviation": float(found.deviations[j]),
-            }
-        )
-    lines = [
-        f"{row['joint']:>8}  reads {row['reads']:+.4f}, is at {row['is_at']:+.4f}: off by {row['zero_off_by']:+.4f} "
-        f"± {row['deviation']:.4f} {'m' if kind == 'prismatic' else 'rad'}"
-        for row, kind in zip(rows, arm.model.joint_kinds, strict=True)
+    arm: LearntArm, looks: list[Look], found: JointZeros, telling: TellingMotion | None, error_px: float, check: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    name, model = arm.cell.cell.name, arm.model
+    readings, decided = looks[-1].readings, not found.alternatives
+    rows: list[dict[str, Any]] = [
+        {
+            "joint": joint,
+            "reads": float(readings[j]),
+            "is_at": float(readings[j] + found.offset[j]) if decided else None,
+            "zero_off_by": -float(found.offset[j]) if decided else None,
+            "deviation": float(found.deviations[j]) if decided else None,
+        }
+        for j, joint in enumerate(model.joint_names)
     ]
+    postures = [(readings + offset).tolist() for offset in (found.offset, *found.alternatives)]
+    lines = _told(arm, rows) if decided else _undecided(arm, rows, postures, telling, _right(found))
     state = "not moved" if check else "home"
     lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(looks)} looks")
-    if found.alternatives:
-        lines.append(
-            f"{len(found.alternatives)} other postures show the same from here; a look from elsewhere decides"
-        )
-    if not _right(found):
+    if decided and not _right(found):
         note(
-            f"set the encoders' zeros, or move those of the model: `stereoservo calibrate {arm.cell.cell.name} --check "
+            f"one look may show a body, base or cameras that moved as zeros that are off: `stereoservo home {name} "
+            "--by-vision` looks again from elsewhere"
+            if len(looks) == 1
+            else f"set the encoders' zeros, or move those of the model: `stereoservo calibrate {name} --check "
             "--reset-zeros`"
         )
     emit(
         {
             "home": not check,
+            "decided": decided,
             "error_px": error_px,
             "joints": rows,
             "looks": len(looks),
             "alternatives": len(found.alternatives),
-            "model_epoch": arm.model.epoch,
+            "postures": [dict(zip(model.joint_names, posture, strict=True)) for posture in postures],
+            "told_by": None
+            if telling is None
+            else {"joint": model.joint_names[telling.joint], "by": telling.step, "px": telling.pixels},
+            "model_epoch": model.epoch,
         },
         "\n".join(lines),
         as_json,
     )
+
+
+def _units(arm: LearntArm) -> list[str]:
+    return ["m" if kind == "prismatic" else "rad" for kind in arm.model.joint_kinds]
+
+
+def _told(arm: LearntArm, rows: list[dict[str, Any]]) -> list[str]:
+    return [
+        f"{row['joint']:>8}  reads {row['reads']:+.4f}, is at {row['is_at']:+.4f}: off by {row['zero_off_by']:+.4f} "
+        f"± {row['deviation']:.4f} {unit}"
+        for row, unit in zip(rows, _units(arm), strict=True)
+    ]
+
+
+def _undecided(
+    arm: LearntArm,
+    rows: list[dict[str, Any]],
+    postures: list[list[float]],
+    telling: TellingMotion | None,
+    right: bool,
+) -> list[str]:
+    """Lines of a look that several postures explain."""
+    lines = [
+        f"{row['joint']:>8}  reads {row['reads']:+.4f}, is at "
+        + " or ".join(f"{posture[j]:+.4f}" for posture in postures)
+        + f" {unit}"
+        for j, (row, unit) in enumerate(zip(rows, _units(arm), strict=True))
+    ]
+    readings = (
+        "what the joints read is the first of them: nothing speaks against the zeros"
+        if right
+        else "what the joints read is none of them: zeros are off, or the body, the base or the cameras moved"
+    )
+    lines.append(f"not decided: {len(postures)} postures show these pictures; {readings}")
+    command = f"stereoservo home {arm.cell.cell.name} --by-vision"
+    if telling is None:
+        lines.append(f"no motion of one joint by {PROBE:g} tells: stand elsewhere, then `{command}`")
+    else:
+        joint, unit = rows[telling.joint]["joint"], _units(arm)[telling.joint]
+        most = len(postures) * (len(postures) - 1) // 2
+        lines.append(
+            f"a motion of {joint} by {telling.step:+.2f} {unit} tells {telling.told} of {most} pairs of them apart, by "
+            f"{telling.pixels:.1f} px or more: `{command}` makes it and looks again"
+        )
+    return lines

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +22,10 @@ from stereoservo.kinematics.joint_reprojection import (
     SeenChain,
     joint_problem,
     points_seen,
+    predicted_pixels,
+    seen_chain,
 )
+from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 STARTS = 512
@@ -30,6 +34,8 @@ GRID = 16
 RAY_STEPS = 25
 """Steps by rays, before those by pixels."""
 PIXEL_STEPS = 60
+VALLEY_STEPS = 400
+"""Further steps for the ends that the pixels leave possible."""
 SETTLED = 1e-12
 """Relative change of the cost, or step [rad or m], at which a descent has come to its end."""
 LONGEST_STEP = 0.5
@@ -94,7 +100,10 @@ def measured_joints(
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
     _refuse_open(problem, q[ordered[0]], largest_deviation)
-    found = _distinct_configurations(problem, q[ordered], costs[ordered])
+    # Few are left: those that crept along a valley go on to its bottom, where they are one configuration.
+    ends, costs, _ = _descent(problem.linearise, q[ordered], VALLEY_STEPS)
+    ordered = np.argsort(costs, kind="stable")
+    found = _distinct_configurations(problem, _wrapped(ends, bounds, seen)[ordered], costs[ordered])
     inside = tuple(angles for angles in found if _inside(angles, bounds))
     if not inside:
         raise _outside(found[0].q, bounds)
@@ -244,7 +253,8 @@ def homing_displacement(
 @dataclass(frozen=True, eq=False)
 class JointZeros:
     """``offset`` (n,) [rad or m] to add to the encoders so that they read what the cameras see, ``deviations`` (n,) and
-    ``covariance`` (n, n) of it; ``cost``, ``freedom``; ``alternatives`` that the images leave possible.
+    ``covariance`` (n, n) of it; ``cost``, ``freedom``; ``alternatives`` that the images leave possible, farther from
+    the readings: where there is one, nothing is told of the zeros.
     """
 
     offset: FloatArray
@@ -285,15 +295,58 @@ def joint_zeros(
     found = measured_joints(
         problem, limits=default if limits is None else limits, largest_deviation=largest_deviation
     )
-    best = found[0]
+    # The images tell these from each other by chance alone.
+    nearest, *others = sorted(found, key=lambda angles: float(np.linalg.norm(angles.q)))
     return JointZeros(
-        best.q,
-        best.deviations,
-        best.covariance,
-        best.cost,
-        best.freedom,
-        tuple(other.q for other in found[1:]),
+        nearest.q,
+        nearest.deviations,
+        nearest.covariance,
+        nearest.cost,
+        nearest.freedom,
+        tuple(other.q for other in others),
     )
+
+
+@dataclass(frozen=True)
+class TellingMotion:
+    """A motion of one joint, by index, by ``step`` [rad or m], after which ``told`` of the pairs of postures that show
+    the same images differ in them; ``pixels``: the least distance [px] of these.
+    """
+
+    joint: int
+    step: float
+    told: int
+    pixels: float
+
+
+def telling_motion(
+    model: CellModel,
+    postures: FloatArray,
+    readings: FloatArray,
+    limits: FloatArray,
+    step: float,
+    least_px: float,
+) -> TellingMotion | None:
+    """Motion of one joint by ``step`` [rad or m] to either side that tells most of the ``postures`` (p, n), which show
+    the same images, from each other, by ``least_px`` or more at a marker inside an image; None where none does.
+
+    ``readings`` (n,) stay within ``limits`` (n, 2), those of the cell.
+    """
+    first, second = np.triu_indices(len(postures), 1)
+    sizes = np.array([[camera.width, camera.height] for camera in model.cameras], dtype=np.float64)
+    found: list[TellingMotion] = []
+    for joint, by in product(range(len(readings)), (step, -step)):
+        if not limits[joint, 0] <= readings[joint] + by <= limits[joint, 1]:
+            continue
+        moved = postures + by * np.eye(len(readings))[joint]
+        pixels = predicted_pixels(seen_chain(model), moved, model.marker_points)
+        inside: BoolArray = np.asarray(((pixels > -0.5) & (pixels < sizes[:, None] - 0.5)).all(axis=-1))
+        apart = np.linalg.norm(pixels[first] - pixels[second], axis=-1)
+        apart = np.where(inside[first] & inside[second], apart, 0.0).max(axis=(1, 2))
+        told = apart >= least_px
+        if told.any():
+            found.append(TellingMotion(joint, by, int(told.sum()), float(apart[told].min())))
+    return max(found, key=lambda motion: (motion.told, motion.pixels), default=None)
 
 
 def sensitivity(

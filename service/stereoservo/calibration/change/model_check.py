@@ -38,7 +38,7 @@ from stereoservo.calibration.change.model_changes import (
     start_state,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.kinematics.joint_angles import joint_zeros
+from stereoservo.kinematics.joint_angles import AMBIGUOUS, joint_zeros
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.check_report import CheckReport, Drift, FoundCause, Status
@@ -142,16 +142,23 @@ def estimate_joint_zeros(
     """Drifts of all joints' zeros estimated jointly, without the insignificant ones; for an arm that was switched
     on again, or got new encoders, where several zeros may be far off.
 
-    None where the images do not determine the joints, or no drift is significant.
+    None where the images do not determine the joints, leave several postures possible, or no drift is significant.
     """
     by_name = {cause.subject: cause for cause in hypotheses if cause.kind == "joint"}
     named = tuple(by_name[name] for name in model.joint_names)
     found = estimate_changes(problem, named)
     if not _explains(problem, found):
-        start = _search_zeros(model, problem)
-        if start is None:
+        ends = [estimate_changes(problem, named, start=start) for start in _search_zeros(model, problem)]
+        if not ends:
             return None
-        found = estimate_changes(problem, named, start=start)
+        best = min(ends, key=lambda one: one.chi2)
+        noise = max(1.0, best.chi2 / max(1, 2 * len(problem.data.camera) - best.x.size))
+        for one in ends:
+            apart = _without_turns(model, one.x - best.x)
+            other = float(apart @ best.information @ apart) > AMBIGUOUS
+            if other and one.chi2 - best.chi2 < AMBIGUOUS * noise:
+                return None  # two postures that the pictures do not tell apart
+        found = estimate_changes(problem, named, start=_without_turns(model, best.x))
     kept = _best_subset(found, float(_thresholds(problem, hypotheses).ratios[1]))
     return estimate_changes(problem, tuple(named[k] for k in kept), start=found.x[kept]) if kept else None
 
@@ -171,9 +178,15 @@ def _best_subset(found: ChangeEstimate, price: float) -> list[int]:
     return best[1]
 
 
-def _search_zeros(model: CellModel, problem: LinearisedProblem) -> FloatArray | None:
-    """Drifts (n,) of all joints' zeros by a global search (4.45) over a few stops; None where those do not
-    determine them.
+def _without_turns(model: CellModel, drifts: FloatArray) -> FloatArray:
+    """Drifts (n,) less whole turns of revolute joints, which no picture shows."""
+    revolute = np.array([kind == "revolute" for kind in model.joint_kinds])
+    return np.where(revolute, np.mod(drifts + np.pi, 2.0 * np.pi) - np.pi, drifts)
+
+
+def _search_zeros(model: CellModel, problem: LinearisedProblem) -> tuple[FloatArray, ...]:
+    """Drifts (n,) of all joints' zeros by a global search (4.45) over a few stops: all that these leave possible; none
+    where they do not determine them.
     """
     data = problem.data
     stops = np.unique(data.stop)[:SEARCHED]
@@ -186,9 +199,10 @@ def _search_zeros(model: CellModel, problem: LinearisedProblem) -> FloatArray | 
     encoders += model.zero
     seen = seen_chain(model)
     try:
-        return joint_zeros(seen, model.marker_points, pixels[stops], sigmas[stops], encoders[stops]).offset
+        zeros = joint_zeros(seen, model.marker_points, pixels[stops], sigmas[stops], encoders[stops])
     except JointAnglesError:
-        return None
+        return ()
+    return zeros.offset, *zeros.alternatives
 
 
 def _thresholds(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> Thresholds:

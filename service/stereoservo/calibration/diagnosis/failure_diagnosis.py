@@ -37,13 +37,13 @@ from stereoservo.calibration.diagnosis.input_corrections import (
 )
 from stereoservo.calibration.diagnosis.joint_scales import prismatic_ratios
 from stereoservo.calibration.diagnosis.marker_tracks import find_step, path_noise, paths_are_smooth
-from stereoservo.calibration.diagnosis.outlier_causes import (
+from stereoservo.calibration.diagnosis.moved_parts import (
     camera_moved,
-    explain_outliers,
-    marker_slipped,
+    every_pixel,
+    moved_part,
     moved_together,
-    predictions,
 )
+from stereoservo.calibration.diagnosis.outlier_causes import explain_outliers, marker_slipped, predictions
 from stereoservo.calibration.lens_significance import lenses_explain_more
 from stereoservo.calibration.single_joint_fit import MIN_SHOWN
 from stereoservo.calibration.stratum_selection import FitOptions
@@ -56,14 +56,19 @@ PLAIN = frozenset(
         "too_few_cameras",
         "mixed_mounts",
         "joint_did_not_move",
-        "joint_without_effect",
     }
 )
 """Codes that name their cause themselves."""
+STEPS_IMITATE = frozenset({"joint_without_effect", "lens_implausible"})
+"""Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that bends after it."""
 MISFITS = frozenset(
     {"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"}
 )
 """Codes of data that contradict themselves: the misfit may show why."""
+LASTING = frozenset(
+    {"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"}
+)
+"""Codes of what has changed for good during the trials."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 """Shares of outliers with which a fit serves to explain them."""
 
@@ -76,12 +81,19 @@ MOVED = 0.02
 
 
 def diagnose_failure(
-    trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
+    trials: TrialData,
+    error: CalibrationError,
+    refit: Refit,
+    options: FitOptions,
+    result: CalibrationFit | None = None,
 ) -> CalibrationError:
     """Error that names the cause of ``error``; else ``error`` itself with a list of possible causes.
 
-    ``refit`` fits trial data again. Tries hypotheses until one makes the data fit; costs some fits.
+    ``refit`` fits trial data again. Tries hypotheses until one makes the data fit; costs some fits. ``result``: the fit
+    that is refused for its lens.
     """
+    if error.code in STEPS_IMITATE:
+        return _step_error(trials, result) or error
     if error.code in PLAIN:
         return error
     if error.code == "views_degenerate" and "rms_px" in error.data:
@@ -101,13 +113,13 @@ def diagnose_failure(
 
 
 def _first_cause(
-    trials: TrialData, refit: Refit, options: FitOptions, left: TrialData | None = None
+    trials: TrialData, refit: Refit, options: FitOptions, result: CalibrationFit | None = None
 ) -> CalibrationError | None:
-    """Error of the first cause that holds, cheap tests first. ``left``: the model's residuals of the trials."""
+    """Error of the first cause that holds, cheap tests first. ``result``: the fit, where there is one."""
     for hypothesis in exchange_hypotheses(trials):
         if fit_of_correction(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
-    stepped = _step_error(trials if left is None else left)
+    stepped = _step_error(trials, result)
     if stepped is not None:
         return stepped
     noisier = underestimated_noise(trials, refit, options)
@@ -135,15 +147,18 @@ def _first_cause(
     return None
 
 
-def _step_error(trials: TrialData) -> CalibrationError | None:
-    """Error of a step in the markers' tracks; None where there is none."""
-    step = find_step(trials)
+def _step_error(trials: TrialData, result: CalibrationFit | None = None) -> CalibrationError | None:
+    """Error of a step in the markers' tracks, or in what a fit leaves of them; None where there is none."""
+    left = trials if result is None else residual_trials(trials, result)
+    step = find_step(left)
     if step is None:
         return None
+    if result is not None and len(step.markers) == len(left.marker_ids):
+        return moved_part(trials, every_pixel(trials, result), step.stop)
     if len(step.cameras) < len(trials.cameras):
         return camera_moved(trials, step.cameras[0], step.stop)
-    if len(step.markers) < len(trials.marker_ids):
-        return marker_slipped(trials.marker_ids[step.markers[0]], step.stop)
+    if len(step.markers) < len(left.marker_ids):
+        return marker_slipped(left.marker_ids[step.markers[0]], step.stop)
     return moved_together(step.stop)
 
 
@@ -156,7 +171,7 @@ def _outlier_error(
         result = refit(trials, lenient)
         notes = explain_outliers(trials, result)
     except CalibrationError as other:
-        if other.code in ("camera_moved", "marker_slipped", "moved_together", "markers_disagree"):
+        if other.code in LASTING:
             return other
         notes = ()
     except (GeometryError, np.linalg.LinAlgError):
@@ -220,8 +235,7 @@ def review_notes(
     notes = list(explain_outliers(trials, result))
     if not statistics.chi2_ok:
         suspicious = float(outliers.mean()) > SUSPICIOUS_OUTLIERS
-        left = residual_trials(trials, result)
-        named = _first_cause(trials, refit, options, left) if suspicious else _step_error(left)
+        named = _first_cause(trials, refit, options, result) if suspicious else _step_error(trials, result)
         if named is not None:
             raise named
     nearly = not statistics.chi2_ok or any("follow" in note for note in result.report.notes)

@@ -21,11 +21,10 @@ from stereoservo.calibration.diagnosis.epipolar_faults import (
     with_ids_exchanged,
     with_views_exchanged,
 )
-from stereoservo.calibration.diagnosis.outlier_causes import expected_pixels
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
 from stereoservo.calibration.lens_estimation import prior_of_lenses, straight_lenses, undistorted
-from stereoservo.calibration.rig_model import Measurements, projective_rig, stratum_rig
+from stereoservo.calibration.rig_model import Measurements, expected_pixels, projective_rig, stratum_rig
 from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData

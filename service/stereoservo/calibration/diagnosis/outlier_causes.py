@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.rig_model import Measurements, RigModel, predicted, projective_rig
+from stereoservo.calibration.diagnosis.moved_parts import every_pixel, moved_part
+from stereoservo.calibration.rig_model import RigModel, expected_pixels, projective_rig
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
@@ -47,16 +48,6 @@ class PredictedTrials:
         return np.asarray(np.where(np.isfinite(distance), distance, np.inf) <= NEAR * self.sigmas)
 
 
-def expected_pixels(rig: RigModel, offsets: FloatArray) -> FloatArray:
-    """Pixels (c, s, m, 2) of a rig at ``offsets`` (s, n)."""
-    shape = (len(rig.cameras), len(offsets), len(rig.points))
-    camera, stop, marker = (index.ravel() for index in np.indices(shape))
-    blank = np.zeros((len(camera), 2))
-    return predicted(rig, Measurements(offsets, camera, stop, marker, blank, np.ones(len(camera)))).reshape(
-        *shape, 2
-    )
-
-
 def predictions(trials: TrialData, result: CalibrationFit) -> PredictedTrials:
     """The fit's predictions at the trials' stops."""
     model = result.model
@@ -82,13 +73,13 @@ def predictions(trials: TrialData, result: CalibrationFit) -> PredictedTrials:
 def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ...]:
     """Notes on the causes of the outliers of ``result``.
 
-    Raises CalibrationError (``camera_moved``, ``marker_slipped``, ``moved_together``) for what has changed for good
-    during the trials: the model describes the cell before that.
+    Raises CalibrationError (``camera_moved``, ``marker_slipped``, ``moved_together``, ``camera_or_body_moved``) for
+    what has changed for good during the trials: the model describes the cell before that.
     """
     found = predictions(trials, result)
     if not found.outliers.any():
         return ()
-    check_lasting_outliers(trials, found)
+    check_lasting_outliers(trials, result, found)
     notes: list[str] = []
     rest = found.outliers.copy()
     crossed = _exchanged_stops(found)
@@ -108,17 +99,15 @@ def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ..
     return tuple(notes)
 
 
-def check_lasting_outliers(trials: TrialData, found: PredictedTrials) -> None:
+def check_lasting_outliers(trials: TrialData, result: CalibrationFit, found: PredictedTrials) -> None:
     """Raise CalibrationError where outliers begin at a stop and last: of one camera, of one marker, or of
     everything.
     """
     c, _, m = found.seen.shape
     cameras = [_lasting(found.outliers[k], found.seen[k]) for k in range(c)]
-    moved = [(k, stop) for k, stop in enumerate(cameras) if stop is not None]
-    if len(moved) == c:
-        raise moved_together(min(stop for _, stop in moved))
+    moved = [stop for stop in cameras if stop is not None]
     if moved:
-        raise camera_moved(trials, *moved[0])
+        raise moved_part(trials, every_pixel(trials, result), min(moved))
     slipped = {}
     for marker in range(m):
         stop = _lasting(found.outliers[:, :, marker].T, found.seen[:, :, marker].T)
@@ -137,18 +126,6 @@ def check_lasting_outliers(trials: TrialData, found: PredictedTrials) -> None:
         raise marker_slipped(*next(iter(slipped.items())))
 
 
-def camera_moved(trials: TrialData, camera: int, stop: int) -> CalibrationError:
-    """Error that a camera was moved before ``stop``."""
-    name = trials.cameras[camera].name
-    return CalibrationError(
-        "camera_moved",
-        f"camera {name!r} moved between stops {stop - 1} and {stop}: all markers jump in its images and stay off, in "
-        "no other camera. Fasten it and run the trials again",
-        camera=name,
-        stop=stop,
-    )
-
-
 def marker_slipped(marker: int, stop: int) -> CalibrationError:
     """Error that a marker was moved on its body before ``stop``."""
     return CalibrationError(
@@ -156,17 +133,6 @@ def marker_slipped(marker: int, stop: int) -> CalibrationError:
         f"marker {marker} slipped between stops {stop - 1} and {stop}: it jumps in all cameras and stays off, the "
         "others do not. Fasten it, or leave it out, and run the trials again",
         marker=marker,
-        stop=stop,
-    )
-
-
-def moved_together(stop: int) -> CalibrationError:
-    """Error that everything jumps in all cameras before ``stop``."""
-    return CalibrationError(
-        "moved_together",
-        f"all markers jump in all cameras between stops {stop - 1} and {stop} and stay off. The images from there on "
-        "are of another arm or body, or the body, the arm's base or both cameras moved, or a joint fell through its "
-        "play where its load changed sides. Run all trials again: only a joint does it at the same stop again",
         stop=stop,
     )
 
