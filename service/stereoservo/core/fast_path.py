@@ -342,3 +342,7 @@ def copy_large(block: Record, into: Record, frames: bool) -> None:
     other.frame_spread[: 4 * rows] = memory.frame_spread[: 4 * rows]
     other.frame_seen[:rows] = memory.frame_seen[:rows]
     other.frame_velocity[: 2 * rows] = memory.frame_velocity[: 2 * rows]
+    other.settled_innovation[: 2 * sights] = memory.settled_innovation[: 2 * sights]
+    other.settled_variance[:sights] = memory.settled_variance[:sights]
+    other.settled_count[:sights] = memory.settled_count[:sights]
+    other.settled_ns[:c] = memory.settled_ns[:c]

@@ -16,6 +16,7 @@ from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene
 from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.control.pd import damped_velocity
+from stereoservo.core.agreement import disagreement
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
@@ -327,6 +328,13 @@ def run_ended(
             np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,)
         )
     if found == SETTLED and may_end:
+        frames = context.state.block.numbers.run.last_frames
+        if source.apart_frames != frames:
+            source.apart, source.apart_frames = disagreement(source, context, wanted), frames
+        if source.apart is not None:
+            return SourceOutput(
+                np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(source.apart,)
+            )
         context.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
         return SourceOutput(np.zeros_like(context.q), finished=True, reached=True, error_px=error_px)
     return None
@@ -452,14 +460,18 @@ def _law_failed(
 
 
 def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -> SourceOutput:
-    reason = Reason(
-        "TIME_LIMIT", "hold", "", context.state.block.numbers.run.moved_s, source.time_limit_s, "s",
-        "no error was measured" if error_px is None
-        else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
-    )  # fmt: skip
+    run = context.state.block.numbers.run
+    held = () if source.apart is None or run.held < source.hold_frames else (source.apart,)
+    if error_px is None:
+        hint = "no error was measured"
+    elif held:
+        hint = f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
+    else:
+        hint = f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)"
+    reason = Reason("TIME_LIMIT", "hold", "", run.moved_s, source.time_limit_s, "s", hint)
     context.emit(
         "goal_aborted", id=source.goal.id, message="not reached in time", error_px=error_px,
-        reasons=(reason, *source.reasons),
+        reasons=(reason, *held, *source.reasons),
     )  # fmt: skip
     return SourceOutput(np.zeros_like(context.q), finished=True, error_px=error_px)
 
