@@ -9,9 +9,11 @@ its tolerance.
 These mean innovations ``d`` are Gaussian with the covariance ``C = Σ/N + S P Sᵀ + J_q S_q J_qᵀ`` of the detector's noise
 over N frames, the model's parameters and the errors that the model states of joint readings. For each camera the
 hypothesis that it was displaced, ``d = E ξ``, reduces the chi-square ``dᵀ C⁻¹ d`` by a chi-square of six freedoms where
-nothing was displaced: a healthy camera is called displaced with a probability of at most `FALSE_ALARMS` a goal, all
-cameras together. Displacements of less than `SHARE` of the goal's tolerance are none. What the joints explain better
-than any one camera leaves the cameras in agreement: the goal is where its pictures show it.
+nothing was displaced: a healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each look,
+all cameras together. Displacements of less than `SHARE` of the goal's tolerance are none. What the joints explain better
+than any one camera leaves the cameras in agreement: the goal is where its pictures show it. Where a gain is in `DOUBT`,
+which noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: the bound is then at most so
+many times `FALSE_ALARMS` for that goal.
 """
 
 from __future__ import annotations
@@ -42,7 +44,11 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import cholesky_solve, damped_solve, factor_solve
 
 FALSE_ALARMS = 1e-6
-"""Probability, at most, that noise as stated calls any camera displaced where a goal ends."""
+"""Probability, at most, that noise as stated calls any camera displaced at one look."""
+DOUBT = 1e-2
+"""Probability below which a gain is not taken for noise before more frames are averaged."""
+MOST_FRAMES = 50
+"""Of a camera that are averaged before what is still in doubt is taken for noise."""
 SHARE = 0.5
 """Of a goal's tolerance: rms change of a camera's pixels up to which its displacement is tolerated."""
 FREEDOMS = 6
@@ -56,7 +62,8 @@ MOST_ROWS = 64
 DAMPING = 1e-9
 LENS_STEP = 1e-3
 """Deviations of a lens parameter over which derivatives by it are taken."""
-AGREED, UNDECIDED, DISPLACED = range(3)
+AGREED, DOUBTFUL, UNDECIDED, DISPLACED = range(4)
+"""What `decide` has found."""
 
 
 # -- the mean innovations -----------------------------------------------------------------------------------
@@ -309,24 +316,26 @@ def compare_causes(
 
 
 @lru_cache(maxsize=16)
-def significant_gain(cameras: int) -> float:
-    """Fall of chi-square that noise exceeds for one of so many cameras with the probability `FALSE_ALARMS`."""
-    return chi2_quantile(FALSE_ALARMS / cameras, FREEDOMS)
+def significant_gain(cameras: int, probability: float = FALSE_ALARMS) -> float:
+    """Fall of chi-square that noise exceeds for one of so many cameras with this probability."""
+    return chi2_quantile(probability / cameras, FREEDOMS)
 
 
 def decide(
-    gains: FloatArray, effects: FloatArray, measurements: int, freedoms: int, limit_px: float, judged: FloatArray
-) -> tuple[int, list[int]]:
+    gains: FloatArray, effects: FloatArray, measurements: int, freedoms: int, limit_px: float, judged: FloatArray,
+    *, may_wait: bool = False,
+) -> tuple[int, list[int]]:  # fmt: skip
     """What the ``gains`` (c + 1,) and ``effects`` (c,) of `compare_causes` mean, and for which cameras.
 
     `AGREED`: none of the cameras that are ``judged`` (c,) > 0 was displaced by more than ``limit_px``. `DISPLACED`: one
-    was. `UNDECIDED`: one of several, or the joints, all ``freedoms`` of them, explain as much (Schwarz).
+    was. `UNDECIDED`: one of several, or the joints, all ``freedoms`` of them, explain as much (Schwarz). `DOUBTFUL`,
+    where it ``may_wait``: more frames tell whether it is noise.
     """
     cameras = effects.size
     penalty = math.log(measurements)
     scores = [FREEDOMS * penalty - float(gains[c]) for c in range(cameras)]
     joints = freedoms * penalty - float(gains[cameras])
-    least = significant_gain(cameras)
+    least = significant_gain(cameras, DOUBT if may_wait else FALSE_ALARMS)
     found = [c for c in range(cameras) if judged[c] > 0.0 and gains[c] > least and effects[c] >= limit_px]
     if not found or joints < min(scores[c] for c in found) - UNCLEAR:
         return AGREED, []
@@ -334,6 +343,8 @@ def decide(
     likely = [c for c in found if scores[c] < best + UNCLEAR]
     if not likely:  # a camera that is not judged explains it better
         return AGREED, []
+    if max(float(gains[c]) for c in likely) <= significant_gain(cameras):
+        return DOUBTFUL, likely
     alone = len(likely) == 1 and joints > best + UNCLEAR
     return (DISPLACED if alone else UNDECIDED), likely
 
@@ -363,7 +374,10 @@ def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None
         return None
     judged = source.used if wanted is None else source.used * (wanted > 0.0).any(axis=1)
     limit_px = SHARE * source.tolerance_px
-    found, cameras = decide(gains, effects, int(begins[-1]), len(context.q), limit_px, judged)
+    may_wait = float(state.block.settled_count.max()) < MOST_FRAMES
+    found, cameras = decide(
+        gains, effects, int(begins[-1]), len(context.q), limit_px, judged, may_wait=may_wait
+    )
     if found == AGREED:
         return None
     names = tuple(context.settings.cameras[c].name for c in cameras)
@@ -438,6 +452,12 @@ def _affine_motions(
 def _reason(
     names: tuple[str, ...], effect_px: float, limit_px: float, tolerance_px: float, found: int
 ) -> Reason:
+    if found == DOUBTFUL:
+        return Reason(
+            "CAMERAS_COMPARED", "slow", ", ".join(names), effect_px, limit_px, "px",
+            f"camera {' or '.join(names)} may be off by {effect_px:.3g} px rms (limit {limit_px:.3g} px): more frames are "
+            "averaged before the goal counts as reached",
+        )  # fmt: skip
     words = named(names) if found == DISPLACED else f"camera {' or '.join(names)}"
     causes = f"{words} crept or was moved"
     if found == UNDECIDED:
