@@ -1,19 +1,19 @@
 """Whether the cameras agree with each other and with the joints where a goal ends, as far as the noise of the pictures
 and the accuracy of the model tell.
 
-A camera that creeps is explained by the law: the arm goes where both pictures show the set-points, and that is beside
-the goal. What remains is a difference between observed and predicted pixels in that camera alone. It is far below what
-one frame shows (`monitors.fault_isolation`), and is seen in the mean over the frames in which the goal's error is inside
-its tolerance.
+The law takes the arm along with a camera that creeps: where both pictures show the set-points the arm is beside the
+goal. A difference between observed and predicted pixels remains in that camera alone. It is too small for one round of
+frames (`monitors.fault_isolation`), and is seen in the mean over the frames in which the goal's error is inside its
+tolerance.
 
-These mean innovations ``d`` are Gaussian with the covariance ``C = Σ/N + S P Sᵀ + J_q S_q J_qᵀ`` of the detector's noise
-over N frames, the model's parameters and the errors that the model states of joint readings. For each camera the
+These mean innovations ``d`` are Gaussian with the covariance ``C = Σ/N + S P Sᵀ + J_q S_q J_qᵀ`` of the detector's
+noise over N frames, the model's parameters and the errors that the model states of joint readings. For each camera the
 hypothesis that it was displaced, ``d = E ξ``, reduces the chi-square ``dᵀ C⁻¹ d`` by a chi-square of six freedoms where
 nothing was displaced: a healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each look,
-all cameras together. Displacements of less than `SHARE` of the goal's tolerance are none. What the joints explain better
-than any one camera leaves the cameras in agreement: the goal is where its pictures show it. Where a gain is in `DOUBT`,
-which noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: the bound is then at most so
-many times `FALSE_ALARMS` for that goal.
+all cameras together. Displacements of less than `SHARE` of the goal's tolerance are tolerated. If the joints explain
+``d`` better than any one camera, the cameras agree: the goal is where they show it. Where a gain is in `DOUBT`, which
+noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: by the union bound a false alarm
+then has at most so many times `FALSE_ALARMS` for that goal.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def forget_frames(block: Record) -> None:
 
 @kernel
 def take_frames(block: Record) -> None:
-    """Add the newest frame of each camera to the means, where it was not added yet: its markers that passed the gate."""
+    """Add the newest frame of each camera to the sums, once: its markers that passed the gate."""
     memory = block[0]
     m, rows = memory.markers, memory.rows
     for c in range(memory.cameras):
@@ -111,8 +111,8 @@ GENERATOR, MATRIX, LENS, POINT = range(4)
 @dataclass(frozen=True, eq=False)
 class ModelParameters:
     """The free parameters of a model as kernels take them: ``directions`` (p, 16), of a generator, a camera's matrix, a
-    lens or a point, padded; the ``part`` (p,) that each changes, `GENERATOR` to `POINT`, and the ``index`` (p,) of the joint, camera
-    (in the cell's order) or marker; their ``covariance`` (p, p).
+    lens or a point, padded; the ``part`` (p,) that each changes, `GENERATOR` to `POINT`, and the ``index`` (p,) of the
+    joint, camera (in the cell's order) or marker; their ``covariance`` (p, p).
     """
 
     directions: FloatArray
@@ -256,8 +256,8 @@ def added_covariance(C: FloatArray, slopes: FloatArray, covariance: FloatArray) 
 def explained(
     d: FloatArray, C: FloatArray, columns: FloatArray, first: int, last: int, x: FloatArray
 ) -> float:
-    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, ``A`` (r, k) being
-    the ``columns`` in the rows from ``first`` to ``last``; by how much chi-square falls.
+    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A``
+    (r, k) has the ``columns`` in the rows from ``first`` to ``last``; by how much chi-square falls.
     """
     rows, count = d.size, columns.shape[1]
     weighted = np.empty((count, rows))
@@ -422,8 +422,8 @@ def _moment(
     jacobian = image_jacobian(operators, arrays.matrices, points)[cameras, markers].reshape(len(d), -1)
     C = np.diag(np.repeat(block.settled_variance[cameras, markers] / count**2 + BIAS_PX**2, 2))
     slopes = pixel_slopes(
-        (directions, part, index, covariance), (arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first), q, arrays.marker_points, arrays.matrices,
-        arrays.lenses, cameras, markers,
+        (directions, part, index, covariance), (arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first), q,
+        arrays.marker_points, arrays.matrices, arrays.lenses, cameras, markers,
     )  # fmt: skip
     added_covariance(C, slopes, covariance)
     if arrays.joint_accuracy is not None:
@@ -455,18 +455,16 @@ def _reason(
     if found == DOUBTFUL:
         return Reason(
             "CAMERAS_COMPARED", "slow", ", ".join(names), effect_px, limit_px, "px",
-            f"camera {' or '.join(names)} may be off by {effect_px:.3g} px rms (limit {limit_px:.3g} px): more frames are "
-            "averaged before the goal counts as reached",
+            f"camera {' or '.join(names)} may be off by {effect_px:.3g} px rms (limit {limit_px:.3g} px): more frames "
+            "are averaged before the goal counts as reached",
         )  # fmt: skip
     words = named(names) if found == DISPLACED else f"camera {' or '.join(names)}"
     causes = f"{words} crept or was moved"
     if found == UNDECIDED:
-        causes = (
-            f"either {words} crept or was moved, or a joint's zero is off, or the marker body slipped on the arm"
-        )
+        causes = f"either {words} crept or was moved, or a joint's zero is off, or the marker body slipped on the arm"
     return Reason(
         "CAMERAS_DISAGREE", "hold", ", ".join(names), effect_px, limit_px, "px",
-        f"the error is within its tolerance of {tolerance_px:g} px, but {words} is off by {effect_px:.3g} px rms beside "
-        f"what the joints and the other cameras show (limit {limit_px:.3g} px): {causes}. Run calibrate --check; put "
-        "back what moved, or calibrate",
+        f"the error is within its tolerance of {tolerance_px:g} px, but {words} is off by {effect_px:.3g} px rms "
+        f"beside what the joints and the other cameras show (limit {limit_px:.3g} px): {causes}. Run calibrate "
+        "--check; put back what moved, or calibrate",
     )  # fmt: skip

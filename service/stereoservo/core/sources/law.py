@@ -465,7 +465,9 @@ def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -
     if error_px is None:
         hint = "no error was measured"
     elif held:
-        hint = f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
+        hint = (
+            f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
+        )
     else:
         hint = f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)"
     reason = Reason("TIME_LIMIT", "hold", "", run.moved_s, source.time_limit_s, "s", hint)

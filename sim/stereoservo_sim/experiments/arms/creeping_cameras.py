@@ -1,10 +1,11 @@
-"""Experiment: a camera creeps slowly while goals are sent, one a minute: how many goals are called reached although the
-pictures of cameras that had not crept show the body beside the set-points; and how many goals of healthy cells are held.
+"""Experiment: a camera creeps slowly while goals are sent, one a minute: how many are called reached although cameras
+that had not crept show the body beside the set-points; and how many goals of healthy cells are held.
 
 Cells are those of `random_rigs`, with one imperfection of the arm or of the stamps each, in turn; every model is learnt
-from the same cell's trial motions. A case with ``creep`` has one camera, drawn, that turns and moves about drawn axes by
-``CREEP_PX`` a minute, rms over the markers; a healthy case is the same without. A case ends with the first goal that is
-refused, or waits without an end. A range of seeds is continued with another: ``--seed 100 --seeds 100`` are the cases behind ``--seeds 100``.
+from the same cell's trial motions. A case with ``creep`` has one camera, drawn, that turns and moves about drawn axes
+by ``CREEP_PX`` a minute, rms over the markers; a healthy case is the same without. A case ends with the first goal that
+is refused, or waits without an end. A range of seeds is continued with another: ``--seed 100 --seeds 100`` are the
+cases behind ``--seeds 100``.
 """
 
 from __future__ import annotations
@@ -99,7 +100,9 @@ def drawn_creep(cell: SyntheticCell, rng: np.random.Generator) -> Creep:
         twist[3 * (1 - k) : 3 * (2 - k)] = 1e-5 * direction
         sizes.append(twist * (TURNED, 1.0 - TURNED)[k] / _rms(cell, Creep(camera, twist), 1.0, cell.home))
     twist = sizes[0] + sizes[1]
-    return Creep(camera, twist * CREEP_PX / 60.0 / _rms(cell, Creep(camera, 1e-3 * twist), 1.0, cell.home) * 1e-3)
+    return Creep(
+        camera, twist * CREEP_PX / 60.0 / _rms(cell, Creep(camera, 1e-3 * twist), 1.0, cell.home) * 1e-3
+    )
 
 
 def _rms(cell: SyntheticCell, creep: Creep, seconds: float, q: FloatArray) -> float:
@@ -113,7 +116,11 @@ def judged_creep(seed: int, *, creeps: bool, goals: int = GOALS) -> list[CreepVe
     case, kind, wrong = creeping_case(seed)
     assert wrong.mechanics is not None
     trials = mechanical_trials(
-        case.cell, wrong.mechanics, wrong.noise_px, np.random.default_rng([seed, 1]), positions=driven_stops(case)
+        case.cell,
+        wrong.mechanics,
+        wrong.noise_px,
+        np.random.default_rng([seed, 1]),
+        positions=driven_stops(case),
     )
     model = fit_model(hidden_out_of_view(case.cell, trials), epoch=1).model
     rng = np.random.default_rng([seed, 7])
@@ -130,7 +137,9 @@ def judged_creep(seed: int, *, creeps: bool, goals: int = GOALS) -> list[CreepVe
         driven.rest(max(0.0, first_s + k * EVERY_S - driven.seconds))
         end = driven.run_goal(case.cell.pixels(place[None])[:, 0], time_limit_s=LIMIT_S)
         crept = _rms(case.cell, creep, driven.seconds, driven.links) if creeps else 0.0
-        outcome = {"goal_reached": "reached", "refused": "refused", "goal_aborted": "aborted"}.get(end.kind, "held")
+        outcome = {"goal_reached": "reached", "refused": "refused", "goal_aborted": "aborted"}.get(
+            end.kind, "held"
+        )
         shown, _ = driven.rest(AVERAGED_S)
         error = float(np.linalg.norm(shown - case.cell.pixels(place[None])[:, 0], axis=-1).max())
         beside = np.linalg.norm(
