@@ -181,24 +181,19 @@ def _warm_up_agreement() -> None:
     """A goal is reached, with a model that states its accuracy: whether the cameras agree is asked at no other time."""
     plain, settings = example_model(), example_settings()
     pixels = _example_pixels(plain)
-    directions = (
-        tuple(generator[None] for generator in plain.generators),
-        tuple(camera.matrix[None] for camera in plain.cameras),
-        tuple(np.ones((1, len(camera.lens))) for camera in plain.cameras),
-        tuple(point[None] for point in plain.marker_points),
-    )
-    count = sum(map(len, directions))
+    matrices, lenses = [c.matrix for c in plain.cameras], [np.ones_like(c.lens) for c in plain.cameras]
+    parts = (plain.generators, np.array(matrices), np.array(lenses), plain.marker_points)
     model = msgspec.structs.replace(
-        plain, covariance=ModelCovariance(*directions, 1e-12 * np.eye(count)),
+        plain,
+        covariance=ModelCovariance(*(tuple(part[:, None]) for part in parts), 1e-12 * np.eye(sum(map(len, parts)))),
         joint_accuracy=JointAccuracy(*np.full((4, 6), 1e-6)),
     )  # fmt: skip
     cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
     core = ServoCore(msgspec.structs.replace(settings, cameras=cameras, hold_frames=1))
-    target = FeatureTarget(
-        {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, pixels, strict=True)}
-    )
+    target = {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, pixels, strict=True)}
     for step in range(1, STEPS):
-        requests = (Request(1, "warmup", RunGoal(Goal("00000000-0000", target))),) if step == 5 else ()
+        goal = RunGoal(Goal("00000000-0000", FeatureTarget(target)))
+        requests = (Request(1, "warmup", goal),) if step == 5 else ()
         inputs = _inputs(step, pixels, model)
         core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
     if not isinstance(core.state.source, Holding):
