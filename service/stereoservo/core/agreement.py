@@ -226,7 +226,8 @@ def _motion(generator: FloatArray, prismatic: bool, step: float, motion: FloatAr
 
 @kernel
 def _times(row: FloatArray, X: FloatArray) -> float:
-    return row[0] * X[0] + row[1] * X[1] + row[2] * X[2] + row[3] * X[3]
+    product: float = row[0] * X[0] + row[1] * X[1] + row[2] * X[2] + row[3] * X[3]
+    return product
 
 
 @kernel
