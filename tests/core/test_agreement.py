@@ -12,8 +12,8 @@ import pytest
 from scipy.stats import binom
 
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
-from stereoservo.core import agreement
-from stereoservo.core.agreement import (
+from stereoservo.core.monitors import agreement
+from stereoservo.core.monitors.agreement import (
     AGREED,
     DISPLACED,
     DOUBTFUL,

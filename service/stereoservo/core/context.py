@@ -63,7 +63,7 @@ class Derived:
     monitors: tuple[tuple[Any, ...], bool] | None = None
     """`core.monitor.MONITORS` as they last were, and whether `core.fast_path` knows them all."""
     parameters: tuple[CellModel, Any] | None = None
-    """The model whose parameters `core.agreement` has, and these."""
+    """The model whose parameters `core.monitors.agreement` has, and these."""
     model_health: tuple[tuple[object, ...], bytes, tuple[ModelDiagnosis, Health]] | None = None
     """The diagnosis and the health that the status last showed: of what, and with which markers left out."""
 

@@ -16,10 +16,10 @@ from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene
 from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.control.pd import damped_velocity
-from stereoservo.core.agreement import disagreement
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitors.agreement import disagreement
 from stereoservo.core.prediction import body_points, centre_into, centre_of, scene_of, triangulated
 from stereoservo.core.sources.progress import (
     OUT_OF_TIME,
@@ -461,10 +461,10 @@ def _law_failed(
 
 def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -> SourceOutput:
     run = context.state.block.numbers.run
-    held = () if source.apart is None or run.held < source.hold_frames else (source.apart,)
+    held = () if source.apart is None else (source.apart,)
     if error_px is None:
         hint = "no error was measured"
-    elif held:
+    elif held and error_px <= source.tolerance_px:
         hint = (
             f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
         )

@@ -11,9 +11,9 @@ import numpy as np
 
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
-from stereoservo.core.agreement import forget_frames, take_frames
 from stereoservo.core.block import Block
 from stereoservo.core.context import StepContext
+from stereoservo.core.monitors.agreement import forget_frames, take_frames
 from stereoservo.core.state import LawRun
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, Record
