@@ -125,8 +125,10 @@ ARRAYS: Shapes = {
     "innovation": ("cameras", "markers", 2), "sigma": ("cameras", "markers"), "seen_ns": ("cameras", "markers"),
     "frame_innovation": ("cameras", "rows", 2), "frame_spread": ("cameras", "rows", 2, 2),
     "frame_seen": ("cameras", "rows"), "frame_velocity": ("cameras", "rows", 2), "frame_q": ("cameras", "joints"),
+    "settled_innovation": ("cameras", "markers", 2), "settled_variance": ("cameras", "markers"),
+    "settled_count": ("cameras", "markers"), "settled_ns": ("cameras",),
 }  # fmt: skip
-OTHER_TYPES: dict[str, Any] = {"history_ns": np.int64, "seen_ns": np.int64}
+OTHER_TYPES: dict[str, Any] = {"history_ns": np.int64, "seen_ns": np.int64, "settled_ns": np.int64}
 """Of arrays that are not of float64."""
 CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, ...]]] = {
     "estimates": (CameraEstimate, ("innovation", "sigma", "seen_ns")),
@@ -138,6 +140,8 @@ CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, 
 """Of each camera, by name of their field: what has numbers there, and the arrays of which it has a row."""
 SIGHTS = tuple(name for _, names in CAMERAS.values() for name in names)
 """These arrays are written out with the cameras, and not with the block."""
+SETTLED_FRAMES = ("settled_innovation", "settled_variance", "settled_count", "settled_ns")
+"""Sums over frames, which begin anew with another model."""
 
 
 def packed_type(
@@ -198,8 +202,10 @@ class Block:
     them.
 
     Cameras: ``round_due``: one has given two frames since the last round, the others are not waited for; ``estimates``
-    and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns``
-    (c, m), and ``frame_…`` (c, k, …) for the newest frames, have the arrays, a row a camera.
+    and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns`` (c, m), and ``frame_…`` (c, k, …) for the newest frames, have the arrays, a row a camera. Of the frames in which the
+    error of the law at work has been inside its tolerance (see `core.monitors.agreement`): the sums of their
+    innovations, ``settled_innovation`` (c, m, 2), and variances, ``settled_variance`` (c, m) [px²], how many they are,
+    ``settled_count`` (c, m), and the stamp of each camera's last one, ``settled_ns`` (c,).
     """
 
     record: np.ndarray[Any, Any]
@@ -244,6 +250,10 @@ class Block:
     frame_seen: FloatArray
     frame_velocity: FloatArray
     frame_q: FloatArray
+    settled_innovation: FloatArray
+    settled_variance: FloatArray
+    settled_count: FloatArray
+    settled_ns: IntArray
     estimates: list[CameraEstimate]
     sightings: list[CameraMonitor]
 
@@ -290,7 +300,7 @@ class Block:
     def begin_sights(self, markers: int, rows: int) -> None:
         """Cameras that have seen nothing yet of so many markers, ``rows`` with the static points."""
         self._count({**self.counts(), "markers": markers, "rows": rows})
-        for name in SIGHTS:
+        for name in SIGHTS + SETTLED_FRAMES:
             getattr(self, name)[:] = 0
         self.sigma[:] = 1.0
         for camera, frame in zip(self.estimates, self.sightings, strict=True):

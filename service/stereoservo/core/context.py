@@ -53,6 +53,8 @@ class Derived:
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
     """What the status last said of the model's health, and of what."""
+    parameters: tuple[CellModel, Any] | None = None
+    """The model whose parameters `core.monitors.agreement` has, and these."""
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""

@@ -119,7 +119,8 @@ class LawRun(Leased, eq=False, kw_only=True):
     """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
 
     Gains [1/s] as in `messages.goals.AdaptiveGain`, ``damping`` as in `control.pd`. ``reasons``: what was found when
-    its progress, which is in the block (`core.block.RunProgress`), was last looked at.
+    its progress, which is in the block (`core.block.RunProgress`), was last looked at. ``apart``: why it is held inside
+    its tolerance (see `core.monitors.agreement`), as of the first ``apart_frames`` frames of all cameras.
     """
 
     goal: Goal
@@ -134,6 +135,8 @@ class LawRun(Leased, eq=False, kw_only=True):
     used: FloatArray
     damping: float = 0.0
     reasons: list[Reason] = []
+    apart: Reason | None = None
+    apart_frames: int = -1
 
 
 class FollowedTarget(msgspec.Struct, eq=False, kw_only=True):

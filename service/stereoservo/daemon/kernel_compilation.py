@@ -43,11 +43,12 @@ from stereoservo.core.prediction import camera_chi2, joint_step, joints_at, rows
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.core.sources.law import adaptive_gain
-from stereoservo.core.state import IncidenceGoal
+from stereoservo.core.state import Holding, IncidenceGoal
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.kernels import distort_pixel
-from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel
+from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, ModelCovariance
 from stereoservo.messages.cell_file import Mount
 from stereoservo.messages.compilation_progress import CompilationProgress, progress_path
 from stereoservo.messages.files import write_atomically
@@ -120,6 +121,7 @@ def warm_up() -> None:
     warm_up_laws()
     warm_up_planner()
     _warm_up_goals()
+    _warm_up_agreement()
     warm_up_incidences()
     rehearse_mobile()
     for mount in ("eye_in_hand", "eye_to_hand"):
@@ -173,6 +175,29 @@ def _warm_up_goals() -> None:
             requests = () if command is None else (Request(1, "warmup", command),)
             inputs = _inputs(step, pixels, model)
             core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
+
+
+def _warm_up_agreement() -> None:
+    """A goal is reached, with a model that states its accuracy: whether the cameras agree is asked at no other time."""
+    plain, settings = example_model(), example_settings()
+    pixels = _example_pixels(plain)
+    matrices, lenses = [c.matrix for c in plain.cameras], [np.ones_like(c.lens) for c in plain.cameras]
+    parts = (plain.generators, np.array(matrices), np.array(lenses), plain.marker_points)
+    model = msgspec.structs.replace(
+        plain,
+        covariance=ModelCovariance(*(tuple(part[:, None]) for part in parts), 1e-12 * np.eye(sum(map(len, parts)))),
+        joint_accuracy=JointAccuracy(*np.full((4, 6), 1e-6)),
+    )  # fmt: skip
+    cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
+    core = ServoCore(msgspec.structs.replace(settings, cameras=cameras, hold_frames=1))
+    target = {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, pixels, strict=True)}
+    for step in range(1, STEPS):
+        goal = RunGoal(Goal("00000000-0000", FeatureTarget(target)))
+        requests = (Request(1, "warmup", goal),) if step == 5 else ()
+        inputs = _inputs(step, pixels, model)
+        core.step(msgspec.structs.replace(inputs, requests=requests, driver_active=True))
+    if not isinstance(core.state.source, Holding):
+        raise AssertionError("the example cell's goal was to be reached, and is not")
 
 
 OTHERS = tuple(range(20, 26))

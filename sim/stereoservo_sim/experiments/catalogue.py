@@ -106,6 +106,12 @@ EXPERIMENTS: dict[str, Experiment] = {
             ),
         ),
         Experiment(
+            "creeping-cameras",
+            "a camera creeps by 0.5 px a minute: goals called reached beside their place, and goals held for nothing",
+            "arms.creeping_cameras",
+            (repetitions(10),),
+        ),
+        Experiment(
             "late-drives",
             "drives 100 to 200 ms late with friction, unstated: goals with the learnt model and with the true one",
             "arms.late_drives",

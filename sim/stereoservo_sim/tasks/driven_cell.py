@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -35,6 +35,7 @@ from stereoservo_sim.world.mechanics import Mechanics, Transmission, quantised
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 RATE_HZ, CAMERA_HZ = 100.0, 25.0
+BEGIN_NS = 1_000_000_000
 TOLERANCE_PX = 0.25
 HOLD_FRAMES = 5
 TIME_LIMIT_S = 60.0
@@ -52,10 +53,33 @@ ENDS = ("goal_reached", "goal_aborted", "goal_cancelled")
 
 
 @dataclass(frozen=True)
+class Creep:
+    """A camera that creeps at a constant rate from the first step on: the ``twist`` (6,) [m/s, rad/s] of its
+    translation and its rotation vector, in the camera's own frame.
+    """
+
+    camera: int
+    twist: FloatArray
+
+    def moved(self, cell: SyntheticCell, seconds: float) -> SyntheticCell:
+        """The cell with the camera where it is after so many seconds."""
+        turn, angle = np.eye(4), float(np.linalg.norm(self.twist[3:])) * seconds
+        if angle > 0.0:
+            x, y, z = self.twist[3:] / np.linalg.norm(self.twist[3:])
+            cross = np.array([(0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)])
+            turn[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+        turn[:3, 3] = self.twist[:3] * seconds
+        poses = cell.poses.copy()
+        poses[self.camera] = turn @ poses[self.camera]
+        return replace(cell, poses=poses)
+
+
+@dataclass(frozen=True)
 class Imperfections:
     """What is not as the core believes. ``mechanics`` of each joint, None: none. ``zero_offset`` (n,) [rad or m]: by
     which encoders tell more than when the model was learnt; None: nothing. ``late_s``: by which pictures are older than
-    their stamps tell, with ``jitter_s`` uniform in addition. ``noise_px`` of each coordinate.
+    their stamps tell, with ``jitter_s`` uniform in addition. ``noise_px`` of each coordinate. ``creep``: a camera that
+    does not stay where it was when the model was learnt.
     """
 
     mechanics: Sequence[Mechanics] | None = None
@@ -63,6 +87,7 @@ class Imperfections:
     late_s: float = 0.0
     jitter_s: float = 0.0
     noise_px: float = 0.05
+    creep: Creep | None = None
 
 
 @dataclass(frozen=True)
@@ -97,7 +122,7 @@ class DrivenCell:
         self.settings = _settings(cell, q, imperfections.mechanics, law, limit)
         self.core = ServoCore(self.settings)
         self._period_ns = round(1e9 / RATE_HZ)
-        self._now_ns, self._seq, self._active = 1_000_000_000, 0, False
+        self._now_ns, self._seq, self._active = BEGIN_NS, 0, False
         self._pending: list[CameraObservation] = []
         self._past: list[tuple[int, FloatArray]] = []
         self.command = np.zeros_like(q)
@@ -114,6 +139,11 @@ class DrivenCell:
         return self._wrong.mechanics or [Mechanics()] * len(self.links)
 
     @property
+    def seconds(self) -> float:
+        """Time since the beginning."""
+        return 1e-9 * (self._now_ns - BEGIN_NS)
+
+    @property
     def readings(self) -> FloatArray:
         """What the encoders tell (n,)."""
         if self._gears is None:
@@ -121,7 +151,7 @@ class DrivenCell:
         return quantised(self._gears.readings + self._offset, self._gears.encoder_step)
 
     def pixels(self) -> FloatArray:
-        """Exact pixels (c, m, 2) of the markers now."""
+        """Exact pixels (c, m, 2) of the markers now, before cameras that stand where they stood at first."""
         return self.cell.pixels(self.links[None])[:, 0]
 
     def step(self, *commands: Command, model_update: ModelUpdate | None = None) -> StepOutputs:
@@ -231,7 +261,8 @@ class DrivenCell:
         """Pictures stamped now, of the arm where it was ``late_s`` ago."""
         wrong = self._wrong
         late_ns = round(1e9 * (wrong.late_s + wrong.jitter_s * self._rng.uniform()))
-        exact = self.cell.pixels(self._links_at(self._now_ns - late_ns)[None])[:, 0]
+        now = self.cell if wrong.creep is None else wrong.creep.moved(self.cell, self.seconds)
+        exact = now.pixels(self._links_at(self._now_ns - late_ns)[None])[:, 0]
         inside = (exact > -0.5).all(axis=-1) & (exact < (self.cell.width - 0.5, self.cell.height - 0.5)).all(
             axis=-1
         )

@@ -524,7 +524,9 @@ def _order_auxiliary(command: OrderAuxiliary, request: Request, context: StepCon
     return "ordered: " + ", ".join(f"{name} {value:g}" for name, value in command.values.items())
 
 
-def _of_command(carry_out: Callable[[Any, StepContext], str]) -> Callable[[Any, Request, StepContext], str]:
+def _of_command(
+    carry_out: Callable[[Any, StepContext], str | None],
+) -> Callable[[Any, Request, StepContext], str | None]:
     """A handler that needs nothing of the request but its command."""
     return lambda command, request, context: carry_out(command, context)
 

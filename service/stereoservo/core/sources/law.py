@@ -18,6 +18,7 @@ from stereoservo.control.pd import damped_velocity
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitors.agreement import disagreement
 from stereoservo.core.prediction import (
     Centre,
     arm_in,
@@ -137,7 +138,8 @@ def _kernel_step(source: ServoGoal, context: StepContext, law: Law) -> SourceOut
         aim_at(room, source)
         follow_goal(record, room.record)
     if work.run_found != GOES_ON or work.seen < work.markers_needed:
-        ended = _ended(source, context, work.run_found, error_now(room), work.seen, work.markers_needed)
+        found = Found(work.run_found, error_now(room), work.seen, work.markers_needed)
+        ended = _ended(source, context, found, source.wanted)
         if ended is not None:
             return ended
     if law.components:
@@ -357,17 +359,24 @@ def run_ended(
         context.state.block.record, error_px is not None, math.nan if error_px is None else error_px, seen >= needed,
         context.dt_s, terms,
     )  # fmt: skip
-    return _ended(source, context, found, error_px, seen, needed, may_end=may_end)
+    return _ended(source, context, Found(found, error_px, seen, needed), wanted, may_end=may_end)
+
+
+class Found(NamedTuple):
+    """Of a law's step: what `account_run` has found, the error [px], the markers seen, and how many are needed."""
+
+    run: int
+    error_px: float | None
+    seen: int
+    needed: int
 
 
 def _ended(
-    source: LawRun, context: StepContext, found: int, error_px: float | None, seen: int, needed: int, *,
-    may_end: bool = True,
-) -> SourceOutput | None:  # fmt: skip
-    """What a step comes to of which `account_run` has ``found`` something, or which shows too few markers; None: it
-    goes on.
-    """
-    if found == OUT_OF_TIME:
+    source: LawRun, context: StepContext, found: Found, wanted: FloatArray | None, *, may_end: bool = True
+) -> SourceOutput | None:
+    """What a step comes to that is out of time, sees too little, or is there; None: it goes on."""
+    run, error_px, seen, needed = found
+    if run == OUT_OF_TIME:
         return _out_of_time(source, context, error_px)
     if seen < needed:
         reason = Reason(
@@ -377,7 +386,14 @@ def _ended(
         return SourceOutput(
             np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,)
         )
-    if found == SETTLED and may_end:
+    if run == SETTLED and may_end:
+        frames = context.state.block.numbers.run.last_frames
+        if source.apart_frames != frames:
+            source.apart, source.apart_frames = disagreement(source, context, wanted), frames
+        if source.apart is not None:
+            return SourceOutput(
+                np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(source.apart,)
+            )
         context.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
         return SourceOutput(np.zeros_like(context.q), finished=True, reached=True, error_px=error_px)
     return None
@@ -503,14 +519,20 @@ def _law_failed(
 
 
 def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -> SourceOutput:
-    reason = Reason(
-        "TIME_LIMIT", "hold", "", context.state.block.numbers.run.moved_s, source.time_limit_s, "s",
-        "no error was measured" if error_px is None
-        else f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)",
-    )  # fmt: skip
+    run = context.state.block.numbers.run
+    held = () if source.apart is None else (source.apart,)
+    if error_px is None:
+        hint = "no error was measured"
+    elif held and error_px <= source.tolerance_px:
+        hint = (
+            f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
+        )
+    else:
+        hint = f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)"
+    reason = Reason("TIME_LIMIT", "hold", "", run.moved_s, source.time_limit_s, "s", hint)
     context.emit(
         "goal_aborted", id=source.goal.id, message="not reached in time", error_px=error_px,
-        reasons=(reason, *source.reasons),
+        reasons=(reason, *held, *source.reasons),
     )  # fmt: skip
     return SourceOutput(np.zeros_like(context.q), finished=True, error_px=error_px)
 

@@ -13,6 +13,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.core.block import Block
 from stereoservo.core.context import StepContext
+from stereoservo.core.monitors.agreement import forget_frames, take_frames
 from stereoservo.core.state import LawRun
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, Record
@@ -43,6 +44,7 @@ def begin_run(block: Record) -> None:
     run.moved_s, run.held, run.last_frames = 0.0, 0, frames
     run.measured, run.newest_px, run.first_px = False, 0.0, 0.0
     run.mean_px, run.least_px, run.least_s = 0.0, 0.0, 0.0
+    forget_frames(block)
 
 
 class RunTerms(NamedTuple):
@@ -76,7 +78,12 @@ def account_run(
     new = frames - run.last_frames
     if new >= memory.cameras:
         run.last_frames = frames
-        run.held = run.held + new // memory.cameras if measured and error_px <= terms.tolerance_px else 0
+        if measured and error_px <= terms.tolerance_px:
+            run.held += new // memory.cameras
+            take_frames(block)
+        elif run.held > 0:
+            run.held = 0
+            forget_frames(block)
     return SETTLED if run.held >= terms.hold_frames else GOES_ON
 
 
