@@ -36,7 +36,8 @@ class Derived:
 
     ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
     ``frame_timeout_s``: age from which on a frame is refused; ``features_fresh_s``: up to which features are fresh
-    enough not to coast. ``prior_every``: steps between priors. ``laws``: those
+    enough not to coast. ``prior_every``: steps between priors; ``look_every``: between two
+    examinations of why a law is slow or stuck. ``laws``: those
     that are installed, by name. ``cameras``: indices by name. ``room``: for the results of kernels, with the constants
     that they take. ``load_limits``:
     collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
@@ -47,6 +48,7 @@ class Derived:
     frame_timeout_s: float
     features_fresh_s: float
     prior_every: int
+    look_every: int
     laws: Mapping[str, Law]
     cameras: Mapping[str, int]
     room: Workspace

@@ -285,36 +285,32 @@ def frame_timeout_s(settings: CoreSettings) -> float:
 def put_inputs(context: StepContext) -> None:
     """The step's inputs into the workspace."""
     inputs, room = context.inputs, context.derived.room
-    work, sample = room.numbers, inputs.joints
-    work.now_ns, work.dt_s, work.stop = inputs.now_ns, context.dt_s, inputs.stop
-    work.joints_given = sample is not None
-    if sample is not None:
-        work.joints_ns, work.joints_seq = _within_bounds(sample.t_ns), _within_bounds(sample.seq)
-        work.tells_efforts, work.tells_following = (
-            sample.efforts is not None,
-            sample.following_errors is not None,
-        )
-        work.joints_whole = fill_sample(sample, room.sample)
-    work.has_sent = False
-    if inputs.sent is not None and inputs.sent.shape == room.sent.shape and np.isfinite(inputs.sent).all():
-        room.sent[:], work.has_sent = inputs.sent, True
-    work.frames = 0
-    if inputs.observations:
-        _put_frames(context)
+    has_sent = (
+        inputs.sent is not None and inputs.sent.shape == room.sent.shape and np.isfinite(inputs.sent).all()
+    )
+    if has_sent:
+        room.sent[:] = inputs.sent
+    frames = newest_frames(inputs) if inputs.observations else ()
+    for k, frame in enumerate(frames):
+        camera = context.derived.cameras.get(frame.camera, -1)
+        stamp = _within_bounds(frame.seq), _within_bounds(frame.t_shutter_ns)
+        room.put_frame(k, camera, stamp, (frame.ids, frame.pixels, frame.covariances))
+    sample, now_ns, count = inputs.joints, inputs.now_ns, len(frames)
+    if sample is None:
+        room.put_numbers(now_ns, context.dt_s, inputs.stop, count, has_sent, False, 0, 0, False, False, False)
+        return
+    whole, t_ns, seq = fill_sample(sample, room.sample), sample.t_ns, sample.seq
+    if not -FARTHEST_INTEGER < t_ns < FARTHEST_INTEGER or not -FARTHEST_INTEGER < seq < FARTHEST_INTEGER:
+        t_ns, seq = _within_bounds(t_ns), _within_bounds(seq)
+    room.put_numbers(
+        now_ns, context.dt_s, inputs.stop, count, has_sent, True, t_ns, seq, whole, sample.efforts is not None,
+        sample.following_errors is not None,
+    )  # fmt: skip
 
 
 def _within_bounds(number: int) -> int:
     """A number that a record can hold: a stamp that is beyond all bounds stays too far to be right."""
     return max(-FARTHEST_INTEGER, min(number, FARTHEST_INTEGER))
-
-
-def _put_frames(context: StepContext) -> None:
-    """The step's frames into the workspace, the last `MAX_FRAMES` of them."""
-    room, cameras = context.derived.room, context.derived.cameras
-    for k, frame in enumerate(newest_frames(context.inputs)):
-        stamp = _within_bounds(frame.seq), _within_bounds(frame.t_shutter_ns)
-        room.put_frame(k, cameras.get(frame.camera, -1), stamp, (frame.ids, frame.pixels, frame.covariances))
-        room.numbers.frames = k + 1
 
 
 def newest_frames(inputs: StepInputs) -> tuple[CameraObservation, ...]:

@@ -35,17 +35,13 @@ from stereoservo.ports.devices import Prior
 LEVELS: tuple[Level, ...] = ("info", "slow", "hold", "fault")
 
 
-LOOK_EVERY_S = 0.2
-"""Between two examinations of why a law is slow or stuck."""
-
-
 def finish_step(context: StepContext, limits: SafetyLimits) -> None:
     """Stage 7, in every step: a motion that has finished ends, and a few times a second a law's run is examined."""
     state, output = context.state, context.output
     if output is not None and output.finished:
         finish(output, context)
     state.step += 1
-    if not context.derived.room.numbers.runs or state.step % max(1, round(LOOK_EVERY_S / context.dt_s)):
+    if state.step % context.derived.look_every or not context.derived.room.numbers.runs:
         return
     source = state.source
     examine = MOTION_SOURCES[type(source)].examine

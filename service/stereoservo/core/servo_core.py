@@ -46,6 +46,8 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Prior
 
 PRIOR_RATE_HZ = 125.0
+LOOK_EVERY_S = 0.2
+"""Between two examinations of why a law is slow or stuck."""
 NO_INPUTS = StepInputs(0, 0, None)
 
 
@@ -130,6 +132,7 @@ class ServoCore:
             cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
             room=workspace(settings, model),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
+            look_every=max(1, round(settings.rate_hz * LOOK_EVERY_S)),
             load_limits=load_limits(settings, model),
         )
         if model is not None:

@@ -6,6 +6,7 @@ remembered: it follows from inputs, settings, model and state.
 from __future__ import annotations
 
 import ctypes
+import struct
 from typing import Any
 
 import numpy as np
@@ -61,23 +62,23 @@ class Numbers(ctypes.Structure):
     hold_frames: int
     now_ns: int
     dt_s: float
+    stop: int
+    frames: int
+    has_sent: int
+    joints_given: int
+    joints_ns: int
+    joints_seq: int
+    joints_whole: int
+    tells_efforts: int
+    tells_following: int
     elapsed_s: float
     nominal_s: float
     longest_gap_s: float
     joint_timeout_s: float
     frame_timeout_s: float
-    stop: int
     active_before: int
     active: int
     faulty: int
-    joints_given: int
-    joints_whole: int
-    joints_ns: int
-    joints_seq: int
-    tells_efforts: int
-    tells_following: int
-    has_sent: int
-    frames: int
     modelled: int
     frames_apart: int
     erring: int
@@ -160,6 +161,9 @@ INTEGERS = (
 )  # fmt: skip
 OTHER_TYPES = {"kinds": np.uint8, "frame_seen": np.uint8, **dict.fromkeys(INTEGERS, np.int64)}
 WORKSPACE = packed_type(Numbers, ARRAYS, OTHER_TYPES, {})
+_INPUTS = struct.Struct("=qd9q")
+"""The numbers of a step's inputs, ``now_ns`` to ``tells_following``, as they lie in the record."""
+_INPUTS_AT = Numbers.now_ns.offset  # type: ignore[attr-defined]
 NOISE_CHI2 = np.array([improbable(2.0 * count) for count in range(MAX_MARKERS + 1)])
 """Of so many markers: what `improbable` says of a frame that is nothing but noise."""
 Limits = tuple[FloatArray, FloatArray]
@@ -219,7 +223,8 @@ class Workspace:
         }
         self.arrays: dict[str, Any] = {}
         self._view()
-        self.numbers = Numbers.from_buffer(self.record.view(np.uint8).data)
+        self._bytes = self.record.view(np.uint8).data
+        self.numbers = Numbers.from_buffer(self._bytes)
         self.numbers.joints, self.numbers.cameras = self._counts["joints"], self._counts["cameras"]
         self.numbers.period_s = 1.0 / settings.rate_hz
         self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
@@ -282,6 +287,12 @@ class Workspace:
         )  # fmt: skip
         self.aim: tuple[Any, ...] = ()
         self.faced: FaceChoice | None = None
+
+    def put_numbers(self, *numbers: float) -> None:
+        """The numbers of a step's inputs, in their order in `Numbers`. Raises struct.error for integers of more than 64
+        bits.
+        """
+        _INPUTS.pack_into(self._bytes, _INPUTS_AT, *numbers)
 
     def put_frame(
         self, k: int, camera: int, stamp: tuple[int, int], sights: tuple[IntArray, FloatArray, FloatArray]

@@ -580,7 +580,6 @@ def _planned_set_points(source: ServoGoal, scene: Scene) -> tuple[FloatArray, fl
     return pixels + share * np.where(given, source.set_points - goal_pixels, 0.0), share
 
 
-LOOK_EVERY_S = 0.2
 Progress = tuple[float | None, float | None]
 
 
