@@ -73,8 +73,11 @@ def slopes_of(model: CellModel, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     slopes = pixel_slopes(
         (found.directions, found.part, found.index, found.covariance),
         (model.generators, kinds, model.zero, model.tip_first), q, model.marker_points,
-        np.array([camera.matrix for camera in model.cameras]), np.array([camera.lens for camera in model.cameras]),
-        *all_sights(model),
+        (
+            np.array([camera.matrix for camera in model.cameras]),
+            np.array([camera.lens for camera in model.cameras]),
+        ),
+        all_sights(model),
     )  # fmt: skip
     return slopes, found.covariance
 
@@ -140,7 +143,7 @@ def compared(
     d: FloatArray, C: FloatArray, displaced: FloatArray, jacobian: FloatArray, begins: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     gains, effects = np.zeros(len(begins)), np.zeros(len(begins) - 1)
-    assert compare_causes(d, C.copy(), displaced, jacobian, begins, gains, effects)
+    assert compare_causes(d, C.copy(), displaced, jacobian, begins, (gains, effects))
     return gains, effects
 
 

@@ -285,7 +285,7 @@ def test_markers_that_two_cameras_do_not_show_at_first_are_no_part_of_the_target
     """The frame that finds it is compared with the markers that are left: kernels look at no bounds."""
 
     def checked(*given: Any) -> Any:
-        assert len({len(given[k]) for k in (1, 5, 6)}) == 1  # points, sights and which of them are seen
+        assert len({len(given[1]), len(given[3][2]), len(given[3][3])}) == 1  # points, sights, which are seen
         return compare(*given)
 
     monkeypatch.setattr(track, "compare", checked)

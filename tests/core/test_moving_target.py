@@ -129,7 +129,7 @@ def test_it_is_carried_through_a_drop_out(benches: Any) -> None:
     body = bench.core.state.target
     state = [body.displacement.copy(), body.basis, body.drift, body.twist.copy(), body.rate.copy()]
     P = body.covariance.copy()
-    elapse(*state, P, 0.3)
+    elapse(*state[:3], (*state[3:], P), 0.3)
     sigma_px = np.sqrt(2.0 * np.trace(P[:6, :6]))  # of a marker, by the filter's own covariance
     largest = largest_px(bench, wanted, 0.3)
     print(f"{largest:.2f} px, {sigma_px:.2f} px stated")
@@ -316,7 +316,7 @@ def test_a_target_that_jumped_is_found_in_one_frame_of_one_camera() -> None:
     sights, _ = project_points(cameras[:1], transform_points(carrier, transform_points(there, points)))
     seen = np.ones(len(points))
     seen[2] = 0.0
-    pose, moved_px, rest_px = jumped(scaled, points, before, cameras[:1], carrier, sights[0], seen)
+    pose, moved_px, rest_px = jumped(scaled, points, before, (cameras[:1], carrier, sights[0], seen))
     np.testing.assert_allclose(transform_points(pose, points), transform_points(there, points), atol=1e-6)
     assert moved_px > 40.0
     assert rest_px < 1e-6
@@ -361,7 +361,7 @@ def test_a_frame_is_folded_as_a_kalman_filter_does() -> None:
     gain = P @ H.T @ np.linalg.inv(S)
     step = gain @ left[used > 0].reshape(-1)
     D, twist, rate, covariance = np.eye(4), np.zeros(6), np.zeros(6), P.copy()
-    fold_frame(D, basis, twist, rate, covariance, left, J, variances, used)
+    fold_frame(D, basis, (twist, rate, covariance), (left, J), variances, used)
     np.testing.assert_allclose(covariance, P - gain @ H @ P, atol=1e-8)
     np.testing.assert_allclose(np.concatenate([twist, rate]), step[6:], atol=1e-8)
     np.testing.assert_allclose(D, displaced(np.eye(4), basis, step[:6]), atol=1e-9)
@@ -374,9 +374,9 @@ def test_time_passes_in_two_steps_as_in_one_for_the_known_part() -> None:
     drift = np.eye(6)
     twist, rate = 0.01 * rng.standard_normal(6), 0.0 * rng.standard_normal(6)
     one, two = [np.eye(4), twist.copy(), rate.copy()], [np.eye(4), twist.copy(), rate.copy()]
-    elapse(one[0], basis, drift, one[1], one[2], P.copy(), 0.2)
+    elapse(one[0], basis, drift, (one[1], one[2], P.copy()), 0.2)
     for _ in range(2):
-        elapse(two[0], basis, drift, two[1], two[2], P.copy(), 0.1)
+        elapse(two[0], basis, drift, (two[1], two[2], P.copy()), 0.1)
     np.testing.assert_allclose(one[0], two[0], atol=1e-12)
     _, later = after(np.eye(4), basis, np.zeros(6), np.ones(6), 0.3)
     np.testing.assert_allclose(later, ACCELERATION_S * (1.0 - np.exp(-0.3 / ACCELERATION_S)), atol=1e-12)

@@ -286,7 +286,9 @@ def put_inputs(context: StepContext) -> None:
     """The step's inputs into the workspace."""
     inputs, room = context.inputs, context.derived.room
     has_sent = (
-        inputs.sent is not None and inputs.sent.shape == room.sent.shape and np.isfinite(inputs.sent).all()
+        inputs.sent is not None
+        and inputs.sent.shape == room.sent.shape
+        and bool(np.isfinite(inputs.sent).all())
     )
     if has_sent:
         room.sent[:] = inputs.sent

@@ -201,9 +201,9 @@ def displacement_by_law(
     if len(few) > MOST_TRIED:  # a start for least squares: it takes no more of a large body
         few = np.union1d(face, spread_in_images(few, set_points, wanted))
         face, some = np.searchsorted(few, face), np.ones(len(few), dtype=bool)
-        D, near = _displacement_by_law(basis, points[few], targets[few], some, face, displacement, steps)
+        D, near = _displacement_by_law(basis, points[few], (targets[few], some), face, displacement, steps)
     else:
-        D, near = _displacement_by_law(basis, points, targets, known, face, displacement, steps)
+        D, near = _displacement_by_law(basis, points, (targets, known), face, displacement, steps)
     return D, bool(near)
 
 
@@ -215,7 +215,7 @@ def refined_pose(
     ``refinements``; ``basis`` (k, 4, 4) of displacements.
     """
     D, moved, pixels, converged = _refine(
-        basis, arrays.matrices, points, displacement, set_points, wanted, refinements
+        basis, arrays.matrices, points, displacement, (set_points, wanted), refinements
     )
     distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
     worst = int(distance.max(axis=0).argmax())
@@ -225,13 +225,15 @@ def refined_pose(
 
 @kernel
 def _displacement_by_law(
-    basis: FloatArray, points: FloatArray, targets: FloatArray, known: BoolArray, face: IntArray,
+    basis: FloatArray, points: FloatArray, there: tuple[FloatArray, BoolArray], face: IntArray,
     displacement: FloatArray, steps: int,
 ) -> tuple[FloatArray, bool]:  # fmt: skip
-    """Displacement (4, 4) that the Cartesian law comes to: the face of ``points`` (m, 4) onto that of ``targets``.
+    """Displacement (4, 4) that the Cartesian law comes to: the face of ``points`` (m, 4) onto that of the targets
+    (m, 4), ``there`` with those that are known (m,).
 
     From a ``displacement``, by so many ``steps``; and whether these have come near.
     """
+    targets, known = there
     nobody = np.zeros((0, 4))  # on paper no camera has to keep sight of the face
     gains = np.full(3, LAW_GAIN)
     D = displacement.copy()
@@ -255,7 +257,7 @@ def left_by_components(
     (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
     """
     known = np.ones(len(points), dtype=bool)
-    D, _ = _displacement_by_law(operators, points, targets, known, face, np.eye(4), LAW_STEPS)
+    D, _ = _displacement_by_law(operators, points, (targets, known), face, np.eye(4), LAW_STEPS)
     there, _ = project_points(arrays.matrices, transform_points(D, points))
     wanted, _ = project_points(arrays.matrices, targets)
     return float(np.sqrt(((there - wanted) ** 2).sum(axis=-1)).max())
@@ -280,13 +282,13 @@ def _refine(
     matrices: FloatArray,
     points: FloatArray,
     displacement: FloatArray,
-    set_points: FloatArray,
-    wanted: FloatArray,
+    goal: tuple[FloatArray, FloatArray],
     refinements: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Least squares of `refined_pose`: displacement (4, 4), displaced points (m, 4), their pixels (c, m, 2), whether it
-    has converged.
+    has converged. ``goal``: set-points (c, m, 2), and which are wanted (c, m).
     """
+    set_points, wanted = goal
     D = displacement
     moved = transform_points(D, points)
     converged = False

@@ -149,13 +149,15 @@ def model_parameters(model: CellModel, cameras: tuple[str, ...]) -> ModelParamet
 def pixel_slopes(
     parameters: tuple[FloatArray, IntArray, IntArray, FloatArray],
     chain: tuple[FloatArray, KindArray, FloatArray, bool], q: FloatArray, marker_points: FloatArray,
-    matrices: FloatArray, lenses: FloatArray, camera_of: IntArray, marker_of: IntArray,
+    cameras: tuple[FloatArray, FloatArray], sights_of: tuple[IntArray, IntArray],
 ) -> FloatArray:  # fmt: skip
     """Derivatives (2 k, p) of the innovations of k sights, in ideal pixels, by the ``parameters`` of a model, with the
     joints at ``q`` (n,).
 
-    ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first. ``camera_of``, ``marker_of`` (k,).
+    ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first. ``cameras``: matrices (c, 3, 4) and
+    lenses. ``sights_of``: the camera and the marker of each sight, (k,) each.
     """
+    (matrices, lenses), (camera_of, marker_of) = cameras, sights_of
     directions, part, index, covariance = parameters
     generators, kinds, zero, tip_first = chain
     n, sights = q.size, camera_of.size
@@ -284,16 +286,17 @@ def explained(
 
 @kernel
 def compare_causes(
-    d: FloatArray, C: FloatArray, displaced: FloatArray, jacobian: FloatArray, begins: IntArray, gains: FloatArray,
-    effects: FloatArray,
+    d: FloatArray, C: FloatArray, displaced: FloatArray, jacobian: FloatArray, begins: IntArray,
+    found: tuple[FloatArray, FloatArray],
 ) -> bool:  # fmt: skip
-    """Into ``gains`` (c + 1,) the fall of the chi-square of ``d`` (2 k,) where each camera was displaced, and where all
-    joints stand elsewhere; into ``effects`` (c,) the rms displacement of each camera's pixels then [px]. False where
-    the covariance ``C`` (2 k, 2 k), which is overwritten, is not positive.
+    """Into the gains (c + 1,) of ``found`` the fall of the chi-square of ``d`` (2 k,) where each camera was displaced,
+    and where all joints stand elsewhere; into its effects (c,) the rms displacement of each camera's pixels then [px].
+    False where the covariance ``C`` (2 k, 2 k), which is overwritten, is not positive.
 
     ``displaced`` (2 k, 6), ``jacobian`` (2 k, n): derivatives of the pixels, which lie in the order of the cameras, of
     which each ``begins`` (c + 1,) at a row.
     """
+    gains, effects = found
     x = np.zeros(d.size)
     if not cholesky_solve(C, d, x) > 0.0:
         return False
@@ -371,7 +374,7 @@ def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None
         return None
     moment = _moment(context, arrays, parameters, sights)
     gains, effects = np.zeros(len(arrays.matrices) + 1), np.zeros(len(arrays.matrices))
-    if not compare_causes(*moment, begins, gains, effects):
+    if not compare_causes(*moment, begins, (gains, effects)):
         return None
     judged = source.used if wanted is None else source.used * (wanted > 0.0).any(axis=1)
     limit_px = SHARE * source.tolerance_px
@@ -424,7 +427,7 @@ def _moment(
     C = np.diag(np.repeat(block.settled_variance[cameras, markers] / count**2 + BIAS_PX**2, 2))
     slopes = pixel_slopes(
         (directions, part, index, covariance), (arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first), q,
-        arrays.marker_points, arrays.matrices, arrays.lenses, cameras, markers,
+        arrays.marker_points, (arrays.matrices, arrays.lenses), (cameras, markers),
     )  # fmt: skip
     added_covariance(C, slopes, covariance)
     if arrays.joint_accuracy is not None:

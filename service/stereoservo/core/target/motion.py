@@ -291,12 +291,18 @@ def after(
     return displaced(D, basis, way), twist + ACCELERATION_S * (1.0 - fade) * rate
 
 
+Motion = tuple[FloatArray, FloatArray, FloatArray]
+"""Of a target: its twist and the rate of that (6,), and the covariance (18, 18) of pose, twist and rate."""
+View = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of a frame: the camera's matrix (1, 3, 4), what is between it and the target's frame (4, 4), ideal pixels (k, 2) of
+the target's markers, and which of them are seen (k,) 1 or 0. Plain tuples: numba looks up a named one at every call.
+"""
+
+
 @kernel
-def elapse(
-    D: FloatArray, basis: FloatArray, drift: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray,
-    dt_s: float,
-) -> None:  # fmt: skip
-    """The state ``dt_s`` later, in place: pose ``D`` (4, 4), ``twist`` and ``rate`` (6,), ``covariance`` (18, 18)."""
+def elapse(D: FloatArray, basis: FloatArray, drift: FloatArray, motion: Motion, dt_s: float) -> None:
+    """The pose ``D`` (4, 4) and its ``motion`` ``dt_s`` later, in place."""
+    twist, rate, covariance = motion
     n = FREEDOMS
     fade = math.exp(-dt_s / ACCELERATION_S)
     F = np.eye(3)
@@ -324,12 +330,12 @@ def elapse(
 
 @kernel
 def compare(
-    basis: FloatArray, points: FloatArray, D: FloatArray, matrix: FloatArray, carrier: FloatArray, sights: FloatArray,
-    seen: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """A frame against a pose ``D``: what it shows of the markers less the prediction (k, 2) [px], zeros where not
-    ``seen`` (k,), and the Jacobian (k, 2, 6) by the basis. ``matrix`` (1, 3, 4); ``sights`` (k, 2) ideal pixels.
+    basis: FloatArray, points: FloatArray, D: FloatArray, view: View
+) -> tuple[FloatArray, FloatArray]:
+    """A frame against a pose ``D``: what it shows of the markers less the prediction (k, 2) [px], zeros where they are
+    not seen, and the Jacobian (k, 2, 6) by the basis.
     """
+    matrix, carrier, sights, seen = view
     there = transform_points(carrier, transform_points(D, points))
     pixels, _ = project_points(matrix, there)
     J = image_jacobian(seen_through(basis, carrier), matrix, there)[0]
@@ -373,12 +379,13 @@ def gate_sights(
 
 @kernel
 def fold_frame(
-    D: FloatArray, basis: FloatArray, twist: FloatArray, rate: FloatArray, covariance: FloatArray, left: FloatArray,
-    J: FloatArray, variances: FloatArray, used: FloatArray,
+    D: FloatArray, basis: FloatArray, motion: Motion, compared: tuple[FloatArray, FloatArray], variances: FloatArray,
+    used: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Correct the state by a frame, in place: what is ``left`` (k, 2) of the markers ``used`` (k,), as of `compare`;
-    returns the twist (6,) by which the pose was corrected.
+    """Correct the pose ``D`` and its ``motion`` by a frame, in place: by what is left (k, 2) of the markers ``used``
+    (k,), and its Jacobian, as `compare` gives them; returns the twist (6,) by which the pose was corrected.
     """
+    (twist, rate, covariance), (left, J) = motion, compared
     n = FREEDOMS
     N, b = np.zeros((n, n)), np.zeros(n)
     for i in range(used.size):
@@ -478,12 +485,12 @@ def find_pose(
 
 @kernel
 def jumped(
-    basis: FloatArray, points: FloatArray, D: FloatArray, matrix: FloatArray, carrier: FloatArray, sights: FloatArray,
-    seen: FloatArray,
-) -> tuple[FloatArray, float, float]:  # fmt: skip
+    basis: FloatArray, points: FloatArray, D: FloatArray, view: View
+) -> tuple[FloatArray, float, float]:
     """The pose (4, 4) that explains a frame best, from ``D`` on; by how much [px] rms it moves the markers, and what
     rms [px] it leaves. Arguments as of `compare`.
     """
+    matrix, carrier, sights, seen = view
     before = transform_points(carrier, transform_points(D, points))
     shown = seen.reshape((1, -1))
     moved, rest_px = find_pose(

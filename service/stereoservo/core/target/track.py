@@ -27,6 +27,7 @@ from stereoservo.core.target.motion import (
     SIGHT_PX,
     SPEED_PX,
     TargetBody,
+    View,
     after,
     begin,
     compare,
@@ -290,11 +291,11 @@ def _follow(
     stood = pose_at(body, int(body.seen_ns.max()))[0]
     dt_s = min((t_ns - body.t_ns) * 1e-9, LONGEST_S)
     if dt_s > 0.0:
-        elapse(body.displacement, body.basis, body.drift, body.twist, body.rate, body.covariance, dt_s)
+        elapse(body.displacement, body.basis, body.drift, (body.twist, body.rate, body.covariance), dt_s)
         body.t_ns = t_ns
     pose = pose_at(body, t_ns)[0]
     view = arrays.matrices[camera : camera + 1], carrier, sights, seen
-    left, J = compare(body.basis, body.points, pose, *view)
+    left, J = compare(body.basis, body.points, pose, view)
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
     lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
@@ -305,7 +306,7 @@ def _follow(
     used = None if lost else _explained(body, left, J, variances, seen, gate)
     sudden = used is None or float((left * left)[used > 0.0].sum(axis=-1).mean()) > RIGID_PX**2
     if used is None:
-        found, moved_px, rest_px = jumped(body.basis, body.points, pose, *view)
+        found, moved_px, rest_px = jumped(body.basis, body.points, pose, view)
         stops = _apart_px(body, stood, found, *view[:2]) < min(moved_px, SPEED_PX * since_s + SMALL_PX)
         if lost and rest_px <= RIGID_PX:
             widen(body, FOUND_PX)
@@ -315,7 +316,7 @@ def _follow(
         if stops:  # as it never went as fast as it seemed to
             body.twist[:], body.rate[:] = 0.0, 0.0
         body.displacement[:] = found
-        left, J = compare(body.basis, body.points, found, *view)
+        left, J = compare(body.basis, body.points, found, view)
         used = _explained(body, left, J, variances, seen, gate)
         if used is None:
             return
@@ -330,19 +331,18 @@ def _follow(
 
 def _fold(
     body: TargetBody, left: FloatArray, J: FloatArray,
-    view: tuple[FloatArray, FloatArray, FloatArray, FloatArray], variances: FloatArray, used: FloatArray, rounds: int,
+    view: View, variances: FloatArray, used: FloatArray, rounds: int,
 ) -> None:  # fmt: skip
     """Correct the state by a frame, as of `fold_frame`, linearised anew about what comes of it (Bell and Cathey 1993):
     one large step from far off leaves pixels that nothing explains, and a joint would be blamed for them.
     """
     for _ in range(rounds - 1):
-        D, twist, rate = body.displacement.copy(), body.twist.copy(), body.rate.copy()
-        step = fold_frame(D, body.basis, twist, rate, body.covariance.copy(), left, J, variances, used)
-        left, J = compare(body.basis, body.points, D, *view)
+        D, motion = body.displacement.copy(), (body.twist.copy(), body.rate.copy(), body.covariance.copy())
+        step = fold_frame(D, body.basis, motion, (left, J), variances, used)
+        left, J = compare(body.basis, body.points, D, view)
         left = left + J @ step
-    fold_frame(
-        body.displacement, body.basis, body.twist, body.rate, body.covariance, left, J, variances, used
-    )
+    motion = body.twist, body.rate, body.covariance
+    fold_frame(body.displacement, body.basis, motion, (left, J), variances, used)
 
 
 def _explained(
