@@ -301,7 +301,7 @@ class Block:
     def begin_sights(self, markers: int, rows: int) -> None:
         """Cameras that have seen nothing yet of so many markers, ``rows`` with the static points."""
         self._count({**self.counts(), "markers": markers, "rows": rows})
-        for name in SIGHTS + SETTLED_FRAMES:
+        for name in SIGHTS:
             getattr(self, name)[:] = 0
         self.sigma[:] = 1.0
         for camera, frame in zip(self.estimates, self.sightings, strict=True):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.core.block import HISTORY
+from stereoservo.core.block import HISTORY, SETTLED_FRAMES
 from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import ModelUpdate
@@ -191,6 +191,8 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     ]
     share_sights(state)
     state.block.numbers.round_due = 0
+    for name in SETTLED_FRAMES:
+        getattr(state.block, name)[:] = 0
 
 
 def fitted_readiness(model: CellModel) -> ModelReadiness:
