@@ -158,7 +158,7 @@ def test_a_length_that_lies_in_a_recording_of_format_1_is_refused(
 def test_a_cut_recording_is_replayed_up_to_the_cut(
     benches: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flight_recorder, "CHUNK_BYTES", 16 * 1024)
+    monkeypatch.setattr(flight_recorder, "CHUNK_BYTES", 8 * 1024)
     path = tmp_path / "flight.mcap"
     recorder = record(benches(3, noise_px=0.1), path, 300)
     whole = path.read_bytes()

@@ -1,5 +1,5 @@
-"""What the core's Python state says of the steps to come, written where kernels read it: only after a step in which Python
-has changed anything.
+"""What the core's Python state says of the steps to come, written where kernels read it: only after a step in which
+Python has changed anything.
 """
 
 from __future__ import annotations

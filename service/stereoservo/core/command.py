@@ -1,5 +1,5 @@
-"""What becomes of the motion source's velocity, in one kernel: friction is added, late drives are looked ahead of, and the
-safety stage, the last one, makes a command of it.
+"""What becomes of the motion source's velocity, in one kernel: friction is added, late drives are looked ahead of, and
+the safety stage, the last one, makes a command of it.
 """
 
 from __future__ import annotations

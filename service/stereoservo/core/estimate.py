@@ -316,7 +316,9 @@ KNOWN, TOLD = 1, 2
 
 @kernel
 def take_frame(block: Record, room: Record, k: int) -> None:
-    """Compare frame ``k`` in the ``room`` with the prediction at its shutter, and fold it into its camera's estimate."""
+    """Compare frame ``k`` in the ``room`` with the prediction at its shutter, and fold it into its camera's
+    estimate.
+    """
     fold_frame(block, room, k, see_frame(block, room, k))
 
 
@@ -424,8 +426,8 @@ MOVING_PX_S = 20.0
 
 
 class Moved(NamedTuple):
-    """Of the rows of a frame: ``innovations`` (k, 2) [px], ``velocities`` (k, 2) [px/s], and the variance ``noise`` (k,)
-    [px²] of a coordinate.
+    """Of the rows of a frame: ``innovations`` (k, 2) [px], ``velocities`` (k, 2) [px/s], and the variance ``noise``
+    (k,) [px²] of a coordinate.
     """
 
     innovations: FloatArray
@@ -586,7 +588,8 @@ def _compare(
     jacobian: FloatArray,
     speed: FloatArray,
 ) -> None:
-    """Into the ``room``, the fields of `FrameResiduals`: observed less ``predicted`` (m, 2) or ``standing`` (s, 2) [px].
+    """Into the ``room``, the fields of `FrameResiduals`: observed less ``predicted`` (m, 2) or ``standing`` (s, 2)
+    [px].
 
     ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter stamp that is off by `TIMING_SIGMA_S` moves.
     """

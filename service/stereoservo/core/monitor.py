@@ -2,9 +2,9 @@
 ends its goal.
 
 What is detected in every step is one kernel, `detect`, which writes what it has found into the workspace. Where that is
-anything, or the state asks to be looked after (`attends`), each monitor of `MONITORS` is called with the context, in the
-order of the table, and gives its findings, on which the stage acts at once: what one monitor stops, the next ones see
-stopped. To add one: a function, and a line in the table.
+anything, or the state asks to be looked after (`attends`), each monitor of `MONITORS` is called with the context, in
+the order of the table, and gives its findings, on which the stage acts at once: what one monitor stops, the next ones
+see stopped. To add one: a function, and a line in the table.
 
 Requests are answered here, after the stop and before all other monitors: hold, resume, enable, teach and jog change
 what is monitored in this very step, and a goal that is accepted in a step in which something is found ends in that step
@@ -152,8 +152,8 @@ GAP_S = 0.5  # without a sample for so long, means are of another time
 
 
 CONTACT, NOT_FOLLOWING, ROUND, CONTRADICTED = 2, 4, 8, 16
-"""Of what the stages find, as bits of a number: a joint beyond a limit of its load; one that does not follow; a round of
-frames that is to be explained; a camera that contradicts the model.
+"""Of what the stages find, as bits of a number: a joint beyond a limit of its load; one that does not follow; a round
+of frames that is to be explained; a camera that contradicts the model.
 """
 
 
@@ -240,8 +240,8 @@ class Loads(NamedTuple):
 
 
 class LoadHistory(NamedTuple):
-    """Of the block: the moving ``mean`` (n,) of efforts; how far samples of late lay beyond what is expected, ``effort``
-    and ``following`` (samples, n); what a contact has brought, ``low`` and ``high`` (2, n).
+    """Of the block: the moving ``mean`` (n,) of efforts; how far samples of late lay beyond what is expected,
+    ``effort`` and ``following`` (samples, n); what a contact has brought, ``low`` and ``high`` (2, n).
     """
 
     mean: FloatArray

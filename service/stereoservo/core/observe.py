@@ -1,5 +1,5 @@
-"""What a step observes, before anything is decided: the kernels of the stages 1 to 3 and of the active goal's progress, in
-their order.
+"""What a step observes, before anything is decided: the kernels of the stages 1 to 3 and of the active goal's progress,
+in their order.
 """
 
 from __future__ import annotations

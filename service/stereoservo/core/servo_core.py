@@ -5,11 +5,12 @@ A step observes, moves and commands, by kernels on one flat record:
 
 1. `observe`: `ingest` checks stamps before anything is used; `estimate` compares frames at their own stamps, then
    predicts the present; `detect` looks for what must stop the arm; the progress of the active goal is measured.
-2. `decide`, only where something is asked, found, or to be looked after: the stop, then requests, then what the monitors
-   make of what was found, before a goal is advanced or anything moves; then plans, queued goals and leases.
+2. `decide`, only where something is asked, found, or to be looked after: the stop, then requests, then what the
+   monitors make of what was found, before a goal is advanced or anything moves; then plans, queued goals and leases.
 3. `move`: the active motion source's velocity.
 4. `command`: friction, late drives and the safety stage; nothing changes a command after it.
-5. `finish_step`: what has ended, ends. Status, reasons and detector priors are made of the step when they are asked for.
+5. `finish_step`: what has ended, ends. Status, reasons and detector priors are made of the step when they are asked
+   for.
 """
 
 from __future__ import annotations

@@ -170,10 +170,10 @@ class Workspace:
 
     Inputs of the step, put there by `core.ingest`: the time ``now_ns`` and the period ``dt_s``, at most the nominal one
     ``nominal_s``; whether the ``stop`` was raised; the joint ``sample`` (4, n) (positions, velocities, efforts,
-    following errors; ``joints_given``, ``joints_whole``: of every joint) with ``joints_ns`` and ``joints_seq``; what the
-    driver ``sent`` (n,) in place of the last command, where ``has_sent``; and ``frames`` that have ``arrived_…``, each
-    with its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes), ``ids``,
-    ``pixels``, ``covariances``.
+    following errors; ``joints_given``, ``joints_whole``: of every joint) with ``joints_ns`` and ``joints_seq``; what
+    the driver ``sent`` (n,) in place of the last command, where ``has_sent``; and ``frames`` that have ``arrived_…``,
+    each with its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes),
+    ``ids``, ``pixels``, ``covariances``.
 
     Of the settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad
     or m] of a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for
@@ -190,18 +190,18 @@ class Workspace:
     of each camera whether its place is ``unknown`` and what becomes of the offset of its stamps (``offset_rule``).
 
     Of a step: the joints ``q`` (n,), what `ingest` has found of ``joints``, ``frames`` and the ``gap`` of the loop; the
-    fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); what the monitors have found: ``contact``,
-    ``following``, of which joint ``worst`` with what it is ``missing``; of a round the cameras that were ``looked_at``
-    and are ``odd``, as bits. Of the frame that was looked at last: joints ``frame_q`` (n,), what `residuals` gives, and
-    until the present is there the prediction of its camera alone, ``of_frame``.
+    fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); what the monitors have found:
+    ``contact``, ``following``, of which joint ``worst`` with what it is ``missing``; of a round the cameras that were
+    ``looked_at`` and are ``odd``, as bits. Of the frame that was looked at last: joints ``frame_q`` (n,), what
+    `residuals` gives, and until the present is there the prediction of its camera alone, ``of_frame``.
 
     Of the goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are
     ``wanted`` (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres
     ``eyes`` of the ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and
     ``centre`` now, and whether an ``error_px`` was ``measured``; whether it was ``followed`` in this step, how many of
-    its markers were ``seen`` and what `account_run` has ``run_found``. Its ``gain`` now, and the goal's gains, tolerance
-    and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those that laws
-    take; ``aim`` and ``faced``: of which goal and face they are.
+    its markers were ``seen`` and what `account_run` has ``run_found``. Its ``gain`` now, and the goal's gains,
+    tolerance and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those
+    that laws take; ``aim`` and ``faced``: of which goal and face they are.
 
     Of the motion: the source's ``velocity`` (n,), by a law's kernel (``by_law``, which is damped and, of an arm that is
     ``redundant``, led away from limits), what else `core.context.SourceOutput` says of it, and ``raw`` (n,), with what

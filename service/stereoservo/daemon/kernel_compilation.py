@@ -183,9 +183,11 @@ def _warm_up_agreement() -> None:
     pixels = _example_pixels(plain)
     matrices, lenses = [c.matrix for c in plain.cameras], [np.ones_like(c.lens) for c in plain.cameras]
     parts = (plain.generators, np.array(matrices), np.array(lenses), plain.marker_points)
+    generators, cameras_free, lenses_free, points = (tuple(part[:, None]) for part in parts)
+    free = sum(map(len, parts))
     model = msgspec.structs.replace(
         plain,
-        covariance=ModelCovariance(*(tuple(part[:, None]) for part in parts), 1e-12 * np.eye(sum(map(len, parts)))),
+        covariance=ModelCovariance(generators, cameras_free, lenses_free, points, 1e-12 * np.eye(free)),
         joint_accuracy=JointAccuracy(*np.full((4, 6), 1e-6)),
     )  # fmt: skip
     cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)

@@ -275,7 +275,9 @@ class ServoProcess:
     # -- one cycle ------------------------------------------------------------------------------------------
 
     def cycle(self, pacing: Pacing, *, stop: bool = False) -> StepInputs:
-        """Run one cycle: wait, read, step, write, publish; the inputs of its step. ``stop`` requests the core to brake (shutdown)."""
+        """Run one cycle: wait, read, step, write, publish; the inputs of its step. ``stop`` requests the core to brake
+        (shutdown).
+        """
         pacing.wait()
         now_ns = self._clock.now_ns()
         joints = self._read(now_ns)

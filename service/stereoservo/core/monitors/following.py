@@ -1,7 +1,7 @@
 """Joints that do not follow: bounds, sums and reasons of the watch in `core.monitor`.
 
-What a joint was sent is compared with its reading as of now and as of its drive's delay (`core.late_drives.measure_delays`),
-and what lies between the two is not missing.
+What a joint was sent is compared with its reading as of now and as of its drive's delay
+(`core.late_drives.measure_delays`), and what lies between the two is not missing.
 """
 
 from __future__ import annotations
