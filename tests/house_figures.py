@@ -7,17 +7,18 @@ It uses nothing of the product but what it measures.
 from __future__ import annotations
 
 import ast
+import functools
 import importlib.util
 import re
 import sys
 import tempfile
+import tomllib
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, NamedTuple
-
-import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 PRODUCT = tuple(
@@ -25,9 +26,21 @@ PRODUCT = tuple(
 )
 SERVICE = PRODUCT[0]
 
-STEADY_FILES, STEADY_HOPS, ACCEPTING_FILES, IMAGE_FILES = 12, 40, 20, 18
-FOLDER_MODULES, MODULE_LINES, FUNCTION_LINES = 20, 600, 80
-KERNEL_ARGUMENTS, CORE_KERNELS = 6, 33
+STEP_FILES, STEP_HOPS, ACCEPTING_FILES, IMAGE_FILES = 14, 40, 20, 24
+"""Asked of paths: of a core step and from image to velocity as they are read, of the goal-accepting step as it runs."""
+TODAY = {
+    "files in a core step as read, stereo": 21,
+    "files in the goal-accepting step, stereo": 26,
+    "files in a core step as run, cartesian3": 16,
+    "files in a core step as read, cartesian3": 27,
+    "hops in a core step, cartesian3": 42,
+    "files in the goal-accepting step, cartesian3": 26,
+    "files from image to velocity as run": 30,
+    "files from image to velocity as read": 45,
+}
+"""Figures that are beyond what is asked: they may only fall, and whoever makes one smaller lowers it here."""
+MODULE_LINES, FUNCTION_LINES = 900, 80
+KERNEL_ARGUMENTS, CORE_KERNELS = 6, 8
 """Arguments of a kernel; and kernels of the core that have more, as long as there are any."""
 LAWS = ("stereo", "cartesian3")
 LAW_NAMES = re.compile(r"""["'](stereo|cartesian3|cartesian2)["']""")
@@ -35,10 +48,18 @@ LAW_NAMES = re.compile(r"""["'](stereo|cartesian3|cartesian2)["']""")
 
 
 class CallPath(NamedTuple):
-    """The ``files`` entered by a call, and its ``hops``: consecutive function calls that are in different files."""
+    """The ``files`` that a call enters; its ``hops``: consecutive function calls that are in different files; and the
+    ``kernels`` among the functions, by file and name.
+    """
 
     files: frozenset[str]
     hops: int
+    kernels: frozenset[tuple[str, str]] = frozenset()
+
+    @property
+    def read(self) -> frozenset[str]:
+        """The files that hold all that runs: with those of the kernels that kernels call, which nobody sees enter."""
+        return self.files | {file for file, _ in called_kernels(self.kernels)}
 
 
 class Figure(NamedTuple):
@@ -57,30 +78,77 @@ class Figure(NamedTuple):
 # -- paths through the code -------------------------------------------------------------------------------------
 
 
-def traced(call: Callable[[], Any]) -> CallPath:
-    """The product's files that ``call`` enters. Compiled kernels that Python calls count as functions."""
-    files: set[str] = set()
-    last, hops = "", 0
-    installed = {f"{_installed(folder.name)}/": folder.relative_to(ROOT) for folder in PRODUCT}
-    inside = tuple(installed)
+STANDS_FOR_THE_WORLD = "sim/stereoservo_sim/world/"
+"""What a driver of a simulated cell calls there happens outside of the computer in life."""
+STANDS_FOR_PROCESSES = "service/stereoservo/daemon/lockstep.py"
+"""Runs the loops of the processes in turn; what it calls is theirs."""
 
-    def enter(frame: FrameType, event: str, argument: Any) -> None:
-        nonlocal last, hops
-        name = frame.f_code.co_filename
-        if event != "call" or not name.startswith(inside) or name.endswith(LOADING):
+
+class Trace:
+    """The product's files that calls enter from `start` to `stop`. Compiled kernels that Python calls count as
+    functions; nothing may be compiled or loaded meanwhile: see `nothing_loaded`.
+    """
+
+    def __init__(self) -> None:
+        self._installed = {f"{_installed(folder.name)}/": folder.relative_to(ROOT) for folder in PRODUCT}
+        self._before: Any = None
+
+    def start(self) -> None:
+        """Begin anew."""
+        self._files: set[str] = set()
+        self._kernels: set[tuple[str, str]] = set()
+        self._last, self._hops = "", 0
+        self._outside: FrameType | None = None
+        self._before = sys.getprofile()
+        sys.setprofile(self._see)
+
+    def stop(self) -> CallPath:
+        """End; what was entered."""
+        sys.setprofile(self._before)
+        return CallPath(frozenset(self._files), self._hops, frozenset(self._kernels))
+
+    def _see(self, frame: FrameType, event: str, argument: Any) -> None:
+        if self._outside is not None:
+            if event == "return" and frame is self._outside:
+                self._outside = None
             return
-        root = next(root for root in inside if name.startswith(root))
-        files.add(str(installed[root] / name.removeprefix(root)))
-        hops += bool(last) and name != last
-        last = name
+        name = frame.f_code.co_filename
+        root = next((root for root in self._installed if name.startswith(root)), None)
+        if event != "call" or root is None:
+            return
+        file = str(self._installed[root] / name.removeprefix(root))
+        if file.startswith(STANDS_FOR_THE_WORLD):
+            self._outside = frame
+        elif file != STANDS_FOR_PROCESSES:
+            self._files.add(file)
+            self._kernels.add((file, frame.f_code.co_name))
+            self._hops += bool(self._last) and file != self._last
+            self._last = file
 
-    before = sys.getprofile()
-    sys.setprofile(enter)
+
+def traced(call: Callable[[], Any]) -> CallPath:
+    """What ``call`` enters."""
+    trace = Trace()
+    trace.start()
     try:
         call()
     finally:
-        sys.setprofile(before)
-    return CallPath(frozenset(files), hops)
+        path = trace.stop()
+    return path
+
+
+@contextmanager
+def nothing_loaded() -> Iterator[None]:
+    """Raises RuntimeError where a kernel is compiled, or loaded from its cache, meanwhile: numba types what kernels
+    call by Python functions, which a path would count, with a cold cache more than with a warm one.
+    """
+    from stereoservo.numerics import compilation
+
+    before = set(compilation.overloads())
+    yield
+    loaded = {f"{one.module}.{one.name}" for one in set(compilation.overloads()) - before}
+    if loaded:
+        raise RuntimeError(f"kernels were loaded on the way: {', '.join(sorted(loaded))}")
 
 
 def _installed(package: str) -> Path:
@@ -101,17 +169,18 @@ def _load(name: str, path: Path) -> ModuleType:
     return module
 
 
-LOADING = ("numerics/kernel_cache.py", "numerics/compilation.py")
-"""Run where a kernel is compiled or loaded, which the service does before its loop."""
-
-
 def servo_paths(law: str, steps: int = 40) -> tuple[CallPath, CallPath]:
     """Of a core that drives to a goal by ``law``: the longest path of a steady step, and the goal-accepting one.
 
     A steady step is one in which frames arrive and the core emits no event; the goal is accepted from its request to
     the event ``goal_started``, and the step of these that enters the most files counts.
     """
-    from stereoservo.control import law_registry
+    _drive(law, steps)  # all that is compiled, loaded or imported once is so before the loop begins
+    with nothing_loaded():
+        return _drive(law, steps)
+
+
+def _drive(law: str, steps: int) -> tuple[CallPath, CallPath]:
     from stereoservo.messages.goals import FeatureTarget
 
     bench_module = _load("house_bench", ROOT / "tests/core/conftest.py")
@@ -119,7 +188,6 @@ def servo_paths(law: str, steps: int = 40) -> tuple[CallPath, CallPath]:
     step = bench.core.step
     steady, accepting = [], []
     started = False
-    len(law_registry.LAWS)  # the laws are imported once, before the loop begins
 
     def measured(inputs: Any) -> Any:
         nonlocal started
@@ -146,62 +214,166 @@ def servo_paths(law: str, steps: int = 40) -> tuple[CallPath, CallPath]:
 def _longest(paths: list[CallPath]) -> CallPath:
     """Of several paths, the most files and the most hops."""
     most = max(paths, key=lambda path: len(path.files))
-    return CallPath(most.files, max(path.hops for path in paths))
+    return most._replace(hops=max(path.hops for path in paths))
 
 
-def vision_path() -> CallPath:
-    """From a camera's image to its observation: the vision process's pipeline, with detector `dots` and a prior."""
-    sys.path.insert(0, str(ROOT / "tests/drivers/detectors"))
-    try:
-        parent = ModuleType("house_detectors")
-        parent.__path__ = [str(ROOT / "tests/drivers/detectors")]
-        sys.modules["house_detectors"] = parent
-        scenes = importlib.import_module("house_detectors.scenes")
-    finally:
-        sys.path.pop(0)
-    from stereoservo.daemon.ipc_messages import PRIOR_CAPACITY, PRIOR_LAYOUT, encode_prior
-    from stereoservo.daemon.seqlock import SlotWriter
-    from stereoservo.daemon.vision import CameraPipeline, VisionSlots
-    from stereoservo.messages.directories import CellDirectories
+def image_path(law: str = LAWS[0], steps: int = 40) -> CallPath:
+    """From a camera driver's `poll` to the joint driver's `write_velocity`, the longest of so many steps on the way to
+    a goal: drivers and detector of the demonstration's cell, and the loops of vision and servo on the slots and sockets
+    of their processes.
+    """
+    from stereoservo.core.cycle import ModelUpdate
+    from stereoservo.daemon.lockstep import LockstepCell
+    from stereoservo.messages.cell_file import check_cell
+    from stereoservo.messages.goals import Enable, FeatureTarget, Goal, RunGoal
+    from stereoservo_sim.cells import shipped_cell_path
+    from stereoservo_sim.world.exact_model import exact_simulated_model
+    from stereoservo_sim.world.simulated_cell import demo_cell
 
-    shot = scenes.random_shot(np.random.default_rng(5))
-
-    class Driver:
-        def poll(self) -> tuple[Any, ...]:
-            return (shot.frame,)
+    links = _load("house_links", ROOT / "tests/sim/lockstep/test_lockstep_faults.py").SocketLinks
+    told = tomllib.loads(shipped_cell_path("demo").read_text())
+    for camera in told["camera"]:
+        camera["options"]["background"] = "plain"  # nothing but the world is lighter
+    world, paths, trace = demo_cell(), [], Trace()
+    under_way = False
 
     with tempfile.TemporaryDirectory() as folder:
-        directories = CellDirectories("house", Path(folder), Path(folder))
-        priors = SlotWriter(directories.prior_slot("left"), PRIOR_CAPACITY, PRIOR_LAYOUT)
-        links = VisionSlots(directories, "left")
-        pipeline = CameraPipeline(Driver(), scenes.make_detector(), links, scenes.Still())  # type: ignore[arg-type]
-        pipeline.poll()
-        priors.write(encode_prior(shot.prior()))
-        pipeline.poll()
-        priors.write(encode_prior(shot.prior()))
-        path = traced(pipeline.poll)
-        links.close()
-        priors.close()
-        return path
+        place = Path(folder)
+        with LockstepCell(check_cell(told), cell_dir=place, runtime_dir=place, links=links(place)) as cell:
+            joints = cell.joints
+            write = joints.write_velocity
+
+            def polled(poll: Callable[[], Any]) -> Callable[[], Any]:
+                def run() -> Any:
+                    if under_way and sys.getprofile() is None:
+                        trace.start()
+                    return poll()
+
+                return run
+
+            def written(velocities: Any) -> Any:
+                try:
+                    return write(velocities)
+                finally:
+                    if sys.getprofile() is not None:
+                        paths.append(trace.stop())
+
+            for camera in cell.cameras:
+                camera.poll = polled(camera.poll)  # type: ignore[method-assign]
+            joints.write_velocity = written  # type: ignore[method-assign]
+            cell.run_for(0.3)
+            cell.submit(Enable())
+            cell.update_model(ModelUpdate(exact_simulated_model(world, 1)))
+            cell.run_for(0.3)
+            q = world.base + 0.1
+            pixels = {
+                name: world.camera(name, 0.0).image_of(world.marker_positions(q))[0]
+                for name in ("left", "right")
+            }
+            target = FeatureTarget(
+                {
+                    name: {
+                        int(i): (float(u), float(v)) for i, (u, v) in zip(world.body.ids, seen, strict=True)
+                    }
+                    for name, seen in pixels.items()
+                }
+            )
+            goal = Goal("00000000-0000-0000-0000-000000000001", target, law=law, gain=0.3)
+            reply = cell.submit(RunGoal(goal))
+            cell.run_for(0.5)
+            with nothing_loaded():
+                under_way = True
+                while len(paths) < steps:
+                    cell.step()
+                under_way = False
+            if not reply.accepted or cell.status is None or cell.status.goal != goal.id:
+                raise RuntimeError(f"no goal is under way: {reply.message}, {cell.status}")
+    return _longest(paths)
 
 
 def path_figures() -> list[Figure]:
-    """Files and hops of the servo step, and from image to joint velocity."""
+    """Files and hops of the servo step, and from image to joint velocity, as they run and as they are read."""
     found = []
     for law in LAWS:
         steady, accepting = servo_paths(law)
         found += [
-            Figure(f"files in a steady step, {law}", len(steady.files), STEADY_FILES, tuple(sorted(steady.files))),
-            Figure(f"hops in a steady step, {law}", steady.hops, STEADY_HOPS),
-            Figure(f"files in the goal-accepting step, {law}", len(accepting.files), ACCEPTING_FILES,
-                   tuple(sorted(accepting.files))),
-        ]  # fmt: skip
-        if law == LAWS[0]:
-            files = steady.files | vision_path().files
-            found.append(
-                Figure("files from image to velocity", len(files), IMAGE_FILES, tuple(sorted(files)))
-            )
+            _asked(f"files in a core step as run, {law}", steady.files, STEP_FILES),
+            _asked(f"files in a core step as read, {law}", steady.read, STEP_FILES),
+            _asked(f"hops in a core step, {law}", steady.hops, STEP_HOPS),
+            _asked(f"files in the goal-accepting step, {law}", accepting.files, ACCEPTING_FILES),
+        ]
+    path = image_path()
+    found.append(_asked("files from image to velocity as run", path.files, IMAGE_FILES))
+    found.append(_asked("files from image to velocity as read", path.read, IMAGE_FILES))
     return found
+
+
+def _asked(name: str, found: frozenset[str] | int, asked: int) -> Figure:
+    """Files or a number: at most what is ``asked``, or, where today's is beyond, that."""
+    told = f"{name} (asked {asked})" if name in TODAY else name
+    limit = TODAY.get(name, asked)
+    if isinstance(found, int):
+        return Figure(told, found, limit)
+    return Figure(told, len(found), limit, tuple(sorted(found)))
+
+
+# -- kernels that kernels call ------------------------------------------------------------------------------------
+
+
+class KernelNames(NamedTuple):
+    """Of a module, its ``kernels`` by name, and by the names that it imports module and name (empty: the module)."""
+
+    kernels: dict[str, ast.FunctionDef]
+    imports: dict[str, tuple[str, str]]
+
+
+def called_kernels(functions: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
+    """Of functions (file, name) those that are kernels, with all kernels that these call, and so on: by the names in
+    their source.
+    """
+    files = {_dotted(path): _name(path) for path in modules()}
+    dotted = {file: module for module, file in files.items()}
+    found: set[tuple[str, str]] = set()
+    waiting = [(dotted[file], name) for file, name in functions]
+    while waiting:
+        module, name = waiting.pop()
+        kernel = _kernel_names(module).kernels.get(name)
+        if kernel is None or (files[module], name) in found:
+            continue
+        found.add((files[module], name))
+        waiting += _named(kernel, module, set(files))
+    return found
+
+
+def _named(kernel: ast.FunctionDef, module: str, known: set[str]) -> Iterator[tuple[str, str]]:
+    """Module and name of all that a ``kernel`` names and that may be one of the modules that are ``known``."""
+    for node in ast.walk(kernel):
+        at, name = module, ""
+        if isinstance(node, ast.Name):
+            name = node.id
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            at, inside = _kernel_names(module).imports.get(node.value.id, ("", ""))
+            name = "" if inside else node.attr
+        while at in known and name and name not in _kernel_names(at).kernels:  # it may be imported on
+            at, name = _kernel_names(at).imports.get(name, ("", ""))
+        if at in known and name:
+            yield at, name
+
+
+@functools.cache
+def _kernel_names(module: str) -> KernelNames:
+    paths = {_dotted(path): path for path in modules()}
+    tree = ast.parse(paths[module].read_text())
+    imports: dict[str, tuple[str, str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imports |= {alias.asname: (alias.name, "") for alias in node.names if alias.asname}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                origin = (inner, "") if inner in paths else (node.module, alias.name)
+                imports[alias.asname or alias.name] = origin
+    return KernelNames({kernel.name: kernel for kernel in _kernels(tree)}, imports)
 
 
 # -- sizes and names ------------------------------------------------------------------------------------------
@@ -215,15 +387,6 @@ def modules() -> Iterator[Path]:
 
 def _name(path: Path) -> str:
     return str(path.relative_to(ROOT))
-
-
-def folder_figure() -> Figure:
-    """Folders with too many modules, `cli` aside."""
-    count: dict[Path, int] = defaultdict(int)
-    for path in modules():
-        count[path.parent] += path.name != "__init__.py"
-    beyond = [f"{_name(f)}: {n}" for f, n in count.items() if n > FOLDER_MODULES and f.name != "cli"]
-    return Figure(f"folders above {FOLDER_MODULES} modules", len(beyond), 0, tuple(beyond))
 
 
 def module_figure() -> Figure:
@@ -249,14 +412,16 @@ def kernel_arguments() -> dict[str, list[str]]:
     """Of each module, the kernels that have too many arguments, and how many."""
     found: dict[str, list[str]] = defaultdict(list)
     for path in modules():
-        for name, count in _kernels(ast.parse(path.read_text())):
+        for kernel in _kernels(ast.parse(path.read_text())):
+            a = kernel.args
+            count = len(a.posonlyargs + a.args + a.kwonlyargs)
             if count > KERNEL_ARGUMENTS:
-                found[_name(path)].append(f"{name} {count}")
+                found[_name(path)].append(f"{kernel.name} {count}")
     return found
 
 
-def _kernels(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """Functions with a decorator of `numerics.compilation`, each with the number of its arguments."""
+def _kernels(tree: ast.AST) -> Iterator[ast.FunctionDef]:
+    """Functions with a decorator of `numerics.compilation`."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef):
             continue
@@ -264,8 +429,7 @@ def _kernels(tree: ast.AST) -> Iterator[tuple[str, int]]:
             inner.id for one in node.decorator_list for inner in ast.walk(one) if isinstance(inner, ast.Name)
         }
         if any(name.endswith("kernel") for name in decorators):
-            a = node.args
-            yield node.name, len(a.posonlyargs + a.args + a.kwonlyargs)
+            yield node
 
 
 def argument_figures() -> list[Figure]:
@@ -372,7 +536,7 @@ def modules_with_law_names() -> list[str]:
 
 def main() -> int:
     """Print all figures; 1 where one is beyond its limit."""
-    sizes = [folder_figure(), module_figure(), function_figure(), *argument_figures()]
+    sizes = [module_figure(), function_figure(), *argument_figures()]
     figures = [*sizes, circle_figure(), *path_figures()]
     for figure in figures:
         print(f"{'ok  ' if figure.within else 'OVER'} {figure.name}: {figure.value} (limit {figure.limit})")

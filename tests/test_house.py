@@ -20,10 +20,6 @@ def test_modules_are_not_longer_than_the_limit():
     assert house.module_figure().items == ()
 
 
-def test_no_folder_is_beyond_its_limit():
-    assert house.folder_figure().items == ()
-
-
 def test_no_function_is_beyond_its_limit():
     assert house.function_figure().items == ()
 
@@ -48,12 +44,38 @@ def test_arguments_of_every_kind_of_kernel_are_counted(tmp_path, monkeypatch):
     assert house.kernel_arguments() == {"service/stereoservo/module.py": ["many 7", "by_name 7"]}
 
 
-@pytest.mark.parametrize("law", house.LAWS)
-def test_a_servo_step_enters_few_files(law):
-    steady, accepting = house.servo_paths(law)
-    assert len(steady.files) <= house.STEADY_FILES, sorted(steady.files)
-    assert steady.hops <= house.STEADY_HOPS
-    assert len(accepting.files) <= house.ACCEPTING_FILES, sorted(accepting.files)
+@pytest.fixture(scope="module")
+def paths():
+    return house.path_figures()
+
+
+def test_paths_enter_few_files(paths):
+    """What is beyond what is asked only becomes less: whoever makes it so lowers it in `TODAY`, or takes it out."""
+    for figure in paths:
+        asked = figure.name.partition(" (asked ")[0]
+        if asked in house.TODAY:
+            assert figure.value == figure.limit, (figure.name, figure.items)
+        else:
+            assert figure.within, (figure.name, figure.items)
+    names = {figure.name.partition(" (asked ")[0] for figure in paths}
+    assert set(house.TODAY) <= names
+
+
+def test_a_path_goes_from_the_camera_driver_to_the_joint_driver(paths):
+    image = {figure.name.partition(" (asked ")[0]: set(figure.items) for figure in paths}
+    run, read = (image[f"files from image to velocity as {how}"] for how in ("run", "read"))
+    assert run < read
+    assert {
+        "drivers/stereoservo_drivers/simulated_camera.py",
+        "drivers/stereoservo_drivers/detectors/dots.py",
+        "service/stereoservo/daemon/vision.py",
+        "service/stereoservo/daemon/seqlock.py",
+        "service/stereoservo/daemon/servo.py",
+        "service/stereoservo/core/servo_core.py",
+        "service/stereoservo/control/laws/stereo.py",
+        "drivers/stereoservo_drivers/simulated_arm.py",
+    } <= run
+    assert not [file for file in read if file.startswith("sim/")]
 
 
 def test_a_path_counts_files_and_hops():
@@ -61,10 +83,46 @@ def test_a_path_counts_files_and_hops():
     from stereoservo.messages.reasons import Reason
 
     path = house.traced(lambda: Reason("A", "info"))
-    assert path == (frozenset(), 0)
+    assert path == (frozenset(), 0, frozenset())
 
     class Settings:
         rate_hz = 250.0
 
+    file = "service/stereoservo/core/ingest.py"
     path = house.traced(lambda: nominal_period_ns(Settings()))
-    assert path == (frozenset({"service/stereoservo/core/ingest.py"}), 0)
+    assert path == (frozenset({file}), 0, frozenset({(file, "nominal_period_ns")}))
+    assert path.read == path.files
+
+
+def test_a_path_on_which_a_kernel_is_loaded_is_no_figure():
+    from stereoservo.numerics.compilation import kernel
+
+    @kernel
+    def twice(x):
+        return 2 * x
+
+    assert twice(1) == 2
+    with house.nothing_loaded():
+        assert twice(2) == 4
+    with pytest.raises(RuntimeError, match="twice"), house.nothing_loaded():
+        twice(1.0)
+
+
+def test_kernels_of_kernels_are_those_that_numba_reaches():
+    """By the values of names, as the cache of kernels has them, not by the source."""
+    from stereoservo.control.laws import cartesian3
+    from stereoservo.core import command
+    from stereoservo.numerics import compilation, kernel_cache
+
+    roots = [command.command, cartesian3.LAW.kernel]
+    seen, waiting = set(), [root.py_func for root in roots]
+    while waiting:
+        function = waiting.pop()
+        if function not in seen:
+            seen.add(function)
+            waiting.extend(kernel_cache._named_by(function)[1])
+    names = {(f.__module__, f.__qualname__) for f in seen} & set(compilation.KERNELS)
+    files = {house._dotted(path): house._name(path) for path in house.modules()}
+    asked = {(files[root.py_func.__module__], root.py_func.__qualname__) for root in roots}
+    assert len(names) > 20
+    assert house.called_kernels(asked) == {(files[module], name) for module, name in names}

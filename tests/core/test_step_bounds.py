@@ -20,7 +20,13 @@ from stereoservo.core.state import ServoGoal
 from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.kinematics.model import save_model
 from stereoservo.messages.goals import Goal, Request, RunGoal
-from stereoservo_sim.benchmarks.core_loop import PARTS, CoreLoop, rx90_with_facets
+from stereoservo_sim.benchmarks.core_loop import (
+    CORE_STAGES,
+    PARTS,
+    CoreLoop,
+    rx90_with_facets,
+    timed_stages,
+)
 from stereoservo_sim.world.exact_model import exact_model
 
 from .operation_counts import recorded
@@ -168,3 +174,13 @@ def test_a_way_that_is_planned_anew_at_rest_goes_on_from_every_state_bit_for_bit
     assert anew > 0
     assert isinstance(source, ServoGoal)
     assert source.plan is not None
+
+
+def test_every_stage_of_a_step_is_timed() -> None:
+    cell = rx90_with_facets(8, 2)
+    loop = CoreLoop(cell, 0, with_groups(exact_model(cell)))
+    loop.start_goal("stereo")
+    with timed_stages(loop) as stages:
+        for _ in range(3):
+            loop.step()
+    assert {stage: len(times) for stage, times in stages.items()} == dict.fromkeys(CORE_STAGES, 3)

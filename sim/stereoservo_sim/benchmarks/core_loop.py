@@ -140,7 +140,7 @@ class CoreLoop:
         )
 
 
-CORE_STAGES = ("put_inputs", "observe", "move", "command", "finish_step", "outputs_of")
+CORE_STAGES = ("put_inputs", "observe", "move", "command", "finish_step", "status_of", "priors_of")
 
 
 @contextmanager
@@ -154,9 +154,9 @@ def timed_stages(loop: CoreLoop) -> Iterator[dict[str, list[tuple[str, float]]]]
     def timed(name: str) -> Callable[..., Any]:
         stage, times = stages[name], found[name]
 
-        def run(*arguments: Any) -> Any:
+        def run(*arguments: Any, **options: Any) -> Any:
             at = time.thread_time()
-            result = stage(*arguments)
+            result = stage(*arguments, **options)
             times.append((loop.kind, time.thread_time() - at))
             return result
 
