@@ -68,15 +68,20 @@ class CoreLoop:
         cycle = StepInputs(self.now_ns, period_ns, joints, observations, driver_active=self.active, **given)
         self.kind = kind_of_step(cycle, self.core.state)
         self.before(self.kind, cycle)
-        at = time.thread_time()
-        outputs = self.core.step(cycle)
-        self.times.append((self.kind, time.thread_time() - at))
+        outputs = self.timed_step(cycle)
         if outputs.driver_request:
             self.active = outputs.driver_request == "activate"
         if self.seq % FRAME_EVERY == 0:
             self.pending = self._images()
         if outputs.command is not None:
             self.q = self.q + outputs.command / RATE_HZ
+        return outputs
+
+    def timed_step(self, inputs: StepInputs) -> StepOutputs:
+        """A step with all its outputs, timed."""
+        at = time.thread_time()
+        outputs = self.core.step(inputs)
+        self.times.append((self.kind, time.thread_time() - at))
         return outputs
 
     def before(self, kind: str, inputs: StepInputs) -> None:

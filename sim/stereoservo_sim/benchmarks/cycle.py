@@ -13,6 +13,7 @@ from stereoservo.control.law import Law, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
+from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.core.state import ServoGoal
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.kinematics.chain import ProjectiveChain
@@ -21,6 +22,7 @@ from stereoservo.kinematics.kernels import chain_forward, image_jacobian, projec
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import LawName
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.recording.step_layout import result_crc
 from stereoservo_sim.benchmarks.core_loop import (
     FRAME_EVERY,
     RATE_HZ,
@@ -159,12 +161,26 @@ PACED_S = 0.003
 KINDS = {"moving, between": "between frames", "moving, frames": "with frames"}
 
 
+class ServoLoop(CoreLoop):
+    """A loop that times what the servo process does in every cycle: the step, its command, and what a recording keeps;
+    status and priors are made when they are due.
+    """
+
+    def timed_step(self, inputs: StepInputs) -> StepOutputs:
+        at = time.thread_time()
+        self.core.advance(inputs)
+        newest = self.core.newest
+        newest.command, newest.moves, result_crc(newest)
+        self.times.append((self.kind, time.thread_time() - at))
+        return self.core.outputs()
+
+
 def core_steps(law: LawName, count: int, seed: int) -> dict[str, Any]:
     """Microseconds of ``count`` steps between frames, and of those with frames of all cameras, of a core that drives
     the simulated arm to a goal by ``law``: one after the other (``tight``), with a sleep before each (``paced``), and
     by stage (``stages``, medians, tight).
     """
-    loop = CoreLoop(rx90(), seed)
+    loop = ServoLoop(rx90(), seed)
     drive(loop, law, WARM_UP)
     found: dict[str, Any] = {}
     for name, pause_s in (("tight", 0.0), ("paced", PACED_S)):
