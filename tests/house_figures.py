@@ -92,6 +92,7 @@ class Trace:
     def __init__(self) -> None:
         self._installed = {f"{_installed(folder.name)}/": folder.relative_to(ROOT) for folder in PRODUCT}
         self._before: Any = None
+        self.running = False
 
     def start(self) -> None:
         """Begin anew."""
@@ -99,12 +100,13 @@ class Trace:
         self._kernels: set[tuple[str, str]] = set()
         self._last, self._hops = "", 0
         self._outside: FrameType | None = None
-        self._before = sys.getprofile()
+        self.running, self._before = True, sys.getprofile()
         sys.setprofile(self._see)
 
     def stop(self) -> CallPath:
         """End; what was entered."""
         sys.setprofile(self._before)
+        self.running = False
         return CallPath(frozenset(self._files), self._hops, frozenset(self._kernels))
 
     def _see(self, frame: FrameType, event: str, argument: Any) -> None:
@@ -212,8 +214,8 @@ def _drive(law: str, steps: int) -> tuple[CallPath, CallPath]:
 
 
 def _longest(paths: list[CallPath]) -> CallPath:
-    """Of several paths, the most files and the most hops."""
-    most = max(paths, key=lambda path: len(path.files))
+    """Of several paths that with the most files, as they run and then as they are read, and the most hops of any."""
+    most = max(paths, key=lambda path: (len(path.files), len(path.read)))
     return most._replace(hops=max(path.hops for path in paths))
 
 
@@ -225,7 +227,7 @@ def image_path(law: str = LAWS[0], steps: int = 40) -> CallPath:
     from stereoservo.core.cycle import ModelUpdate
     from stereoservo.daemon.lockstep import LockstepCell
     from stereoservo.messages.cell_file import check_cell
-    from stereoservo.messages.goals import Enable, FeatureTarget, Goal, RunGoal
+    from stereoservo.messages.goals import Enable, RunGoal
     from stereoservo_sim.cells import shipped_cell_path
     from stereoservo_sim.world.exact_model import exact_simulated_model
     from stereoservo_sim.world.simulated_cell import demo_cell
@@ -245,7 +247,7 @@ def image_path(law: str = LAWS[0], steps: int = 40) -> CallPath:
 
             def polled(poll: Callable[[], Any]) -> Callable[[], Any]:
                 def run() -> Any:
-                    if under_way and sys.getprofile() is None:
+                    if under_way and not trace.running:
                         trace.start()
                     return poll()
 
@@ -255,7 +257,7 @@ def image_path(law: str = LAWS[0], steps: int = 40) -> CallPath:
                 try:
                     return write(velocities)
                 finally:
-                    if sys.getprofile() is not None:
+                    if trace.running:
                         paths.append(trace.stop())
 
             for camera in cell.cameras:
@@ -265,30 +267,34 @@ def image_path(law: str = LAWS[0], steps: int = 40) -> CallPath:
             cell.submit(Enable())
             cell.update_model(ModelUpdate(exact_simulated_model(world, 1)))
             cell.run_for(0.3)
-            q = world.base + 0.1
-            pixels = {
-                name: world.camera(name, 0.0).image_of(world.marker_positions(q))[0]
-                for name in ("left", "right")
-            }
-            target = FeatureTarget(
-                {
-                    name: {
-                        int(i): (float(u), float(v)) for i, (u, v) in zip(world.body.ids, seen, strict=True)
-                    }
-                    for name, seen in pixels.items()
-                }
-            )
-            goal = Goal("00000000-0000-0000-0000-000000000001", target, law=law, gain=0.3)
+            goal = _goal_in_pictures(world, law)
             reply = cell.submit(RunGoal(goal))
             cell.run_for(0.5)
-            with nothing_loaded():
-                under_way = True
-                while len(paths) < steps:
-                    cell.step()
+            under_way = True
+            try:
+                with nothing_loaded():
+                    while len(paths) < steps:
+                        cell.step()
+            finally:
                 under_way = False
+                if trace.running:
+                    trace.stop()
             if not reply.accepted or cell.status is None or cell.status.goal != goal.id:
                 raise RuntimeError(f"no goal is under way: {reply.message}, {cell.status}")
     return _longest(paths)
+
+
+def _goal_in_pictures(world: Any, law: str) -> Any:
+    """A goal by ``law`` at the pictures of the ``world`` with its arm a little off its base: slow, so that it lasts."""
+    from stereoservo.messages.goals import FeatureTarget, Goal
+
+    at = world.marker_positions(world.base + 0.1)
+    pixels = {name: world.camera(name, 0.0).image_of(at)[0].tolist() for name in ("left", "right")}
+    ids = world.body.ids.tolist()
+    target = FeatureTarget(
+        {name: dict(zip(ids, map(tuple, seen), strict=True)) for name, seen in pixels.items()}
+    )
+    return Goal("00000000-0000-0000-0000-000000000001", target, law=law, gain=0.3)  # type: ignore[arg-type]
 
 
 def path_figures() -> list[Figure]:
@@ -331,7 +337,7 @@ def called_kernels(functions: Iterable[tuple[str, str]]) -> set[tuple[str, str]]
     """Of functions (file, name) those that are kernels, with all kernels that these call, and so on: by the names in
     their source.
     """
-    files = {_dotted(path): _name(path) for path in modules()}
+    files = {module: _name(path) for module, path in _sources().items()}
     dotted = {file: module for module, file in files.items()}
     found: set[tuple[str, str]] = set()
     waiting = [(dotted[file], name) for file, name in functions]
@@ -361,8 +367,14 @@ def _named(kernel: ast.FunctionDef, module: str, known: set[str]) -> Iterator[tu
 
 
 @functools.cache
+def _sources() -> dict[str, Path]:
+    """All modules of the product, by name."""
+    return {_dotted(path): path for path in modules()}
+
+
+@functools.cache
 def _kernel_names(module: str) -> KernelNames:
-    paths = {_dotted(path): path for path in modules()}
+    paths = _sources()
     tree = ast.parse(paths[module].read_text())
     imports: dict[str, tuple[str, str]] = {}
     for node in ast.walk(tree):
