@@ -105,12 +105,17 @@ class Control:
         create_stop_slot(self.directories.stop_slot)
         create_slot(self.directories.heartbeat_slot("servo"), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT)
         self.servo = ProcessLinks(self.directories, ())
-        self.gateway: ServoConnection
+        self.gateways: list[ServoConnection] = []
+        """All lives of it: what a dead one has mapped goes with its process, here with the test."""
         self.told: list[list[int]] = []
         self.start_gateway()
 
+    @property
+    def gateway(self) -> ServoConnection:
+        return self.gateways[-1]
+
     def start_gateway(self) -> None:
-        self.gateway = ServoConnection(self.directories)
+        self.gateways.append(ServoConnection(self.directories))
 
     def kill_gateway(self) -> None:
         if self.gateway._control is not None:
@@ -125,7 +130,8 @@ class Control:
         return [number for life in self.told for number in life]
 
     def close(self) -> None:
-        self.gateway.close()
+        for gateway in self.gateways:
+            gateway.close()
         self.servo.close()
 
 
@@ -136,7 +142,8 @@ class Events(Control):
         self.journal: list[int] = []
         self.dies_before = -1
         super().__init__(directory, size)
-        self.start_receiver()
+        self.told.append([])
+        self.handle_events()
 
     @property
     def kept(self) -> list[int]:
@@ -152,11 +159,18 @@ class Events(Control):
     def start_receiver(self) -> None:
         self.told.append([])
         self.start_gateway()
+        self.handle_events()
+
+    def handle_events(self) -> None:
         self.handled = HandledEvents(self.directories.runtime / "handled.slot", lambda *note: None)
 
     def kill_receiver(self) -> None:
         self.kill_gateway()
         self.handled.close()
+
+    def close(self) -> None:
+        self.handled.close()
+        super().close()
 
     def poll_receiver(self) -> None:
         self.poll_gateway()

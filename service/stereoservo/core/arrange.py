@@ -6,10 +6,11 @@ from __future__ import annotations
 
 import sys
 
+from stereoservo.core import monitor
 from stereoservo.core.context import StepContext
 from stereoservo.core.estimate import offset_rules, place_unknown
 from stereoservo.core.friction import friction_bounds
-from stereoservo.core.monitor import MONITORS, NOISE, QUIET, looks_apart
+from stereoservo.core.monitor import NOISE, QUIET, looks_apart
 from stereoservo.core.move import MOTION_SOURCES, paused
 from stereoservo.core.sources.law import aim_at, by_kernel
 from stereoservo.core.state import CalibrationMotion, Holding, Leased, ServoGoal, Source
@@ -58,7 +59,7 @@ def attends(context: StepContext) -> bool:
     """
     state, source = context.state, context.state.source
     return (
-        any(monitor.attends(state) for monitor in MONITORS)
+        any(entry.attends(state) for entry in monitor.MONITORS)
         or any(state.mobile)
         or bool(state.queue or state.waiting or state.queued_until_ns)
         or state.planning is not None
