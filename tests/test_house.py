@@ -54,7 +54,7 @@ def test_paths_enter_few_files(paths):
     for figure in paths:
         asked = figure.name.partition(" (asked ")[0]
         if asked in house.TODAY:
-            assert figure.value == figure.limit, (figure.name, figure.items)
+            assert figure.value <= figure.limit, (figure.name, figure.items)
         else:
             assert figure.within, (figure.name, figure.items)
     names = {figure.name.partition(" (asked ")[0] for figure in paths}
