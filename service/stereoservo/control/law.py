@@ -138,10 +138,10 @@ class Law:
     ``follows_streams``: the target may move while the law runs. ``options``: fields of a goal that belong to this
     law, of ``centre``, ``jacobian`` and ``profile``.
 
-    ``kernel``: the same step in one compiled call, bit for bit, at the gain, the time ``dt_s`` and the choice of the
-    Jacobian of `Options`, whose rest is as by default. It takes an array (1,) of a record, `core.workspace.WORKSPACE`,
-    which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as ``body``; of the cameras
-    that keep sight of the face the centres as ``eyes``), and fills in ``velocity``, ``components`` (errors, then what
+    ``kernel``: the same step in one compiled call, bit for bit. It takes an array (1,) of a record,
+    `core.workspace.WORKSPACE`, which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as
+    ``body``; of the cameras that keep sight of the face the centres as ``eyes``) and of Options ``gain``, ``dt_s`` and
+    ``jacobian_choice``, whose rest is as by default; it fills in ``velocity``, ``components`` (errors, then what
     is allowed), ``component_status`` and ``conditioning``. None: the step is called.
     For the kernel of a law without components no face is chosen.
 
@@ -158,7 +158,7 @@ class Law:
     components: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     reasons: Callable[[LawStep], tuple[Reason, ...]] = lambda step: ()
-    kernel: Callable[[Record, float, float, int], None] | None = None
+    kernel: Callable[[Record], None] | None = None
     properties: LawProperties | None = None
     colour: str = "#7f7f7f"
     rank: int = 1000

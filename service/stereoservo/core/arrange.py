@@ -11,7 +11,7 @@ from stereoservo.core.context import StepContext
 from stereoservo.core.estimate import offset_rules, place_unknown
 from stereoservo.core.friction import friction_bounds
 from stereoservo.core.monitor import NOISE, QUIET, looks_apart
-from stereoservo.core.move import MOTION_SOURCES, paused
+from stereoservo.core.move import MOTION_SOURCES, arrange_motion, paused
 from stereoservo.core.sources.law import aim_at, by_kernel
 from stereoservo.core.state import CalibrationMotion, Holding, Leased, ServoGoal, Source
 from stereoservo.messages.status import Lifecycle
@@ -51,6 +51,7 @@ def arrange(context: StepContext) -> None:
     )
     if work.aims and isinstance(source, ServoGoal):
         aim_at(room, source)
+    arrange_motion(context)
 
 
 def attends(context: StepContext) -> bool:

@@ -4,6 +4,7 @@ the safety stage, the last one, makes a command of it.
 
 from __future__ import annotations
 
+from stereoservo.core.cycle import NOT_MEASURED
 from stereoservo.core.friction import add_friction
 from stereoservo.core.ingest import TAKEN
 from stereoservo.core.limit import FRESH, Bounds, Wanted, limit_velocity
@@ -15,7 +16,8 @@ from stereoservo.numerics.compilation import kernel
 @kernel
 def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
     """Stage 6: the ``command`` (n,) of the block by the ``velocity`` (n,) of the motion in the ``room``; zero where the
-    drives are not active. ``limited`` of the room: whether there is anything to tell of it.
+    drives are not active. ``limited`` of the room: whether there is anything to tell of it;
+    ``result``: the values that recordings keep, whose error is that of a law's kernel here.
     """
     memory, work = block[0], room[0]
     n = memory.joints
@@ -48,6 +50,9 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
     work.scaled_by, work.shared_by = found.scaled_by, found.shared_by
     if work.active == 0:
         sent[:] = 0.0
+    work.result[0] = work.error_px if work.rests == 0 and work.measured != 0 else NOT_MEASURED
+    work.result[1 : 1 + n], work.result[1 + n : 1 + 2 * n] = raw, memory.velocities[:n]
+    work.result[1 + 2 * n : 1 + 3 * n] = sent
     if work.runs != 0:
         follow_error(block, work.tolerance_px, work.dt_s)
 

@@ -26,6 +26,8 @@ from stereoservo.messages.status import Health
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
 
+Motion = tuple[Callable[[Any, "StepContext"], "SourceOutput | None"], str]
+"""The step of a motion source, and the id of the goal that it works on, '' where there is none."""
 Emit = Callable[..., None]
 """Appends an event to the step's outputs: its kind, and the event's other fields by keyword."""
 
@@ -56,6 +58,8 @@ class Derived:
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
     """What the status last said of the model's health, and of what."""
+    motion: Motion = (lambda source, context: None, "")
+    """Of the active source, as `core.move` arranges it."""
     parameters: tuple[CellModel, Any] | None = None
     """The model whose parameters `core.monitors.agreement` has, and these."""
 
@@ -92,7 +96,7 @@ class StepContext:
 
     `core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) of the
     markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at most, for it
-    is work. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing
+    is work. ``goes_on``: the goal of a law's kernel does, as observed. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing
     did. ``moved_arrays``: the model with a body that is a target where it is now.
     """
 
@@ -117,6 +121,7 @@ class StepContext:
         self.weights: FloatArray | None = None
         self.pixels: FloatArray | None = None
         self.output: SourceOutput | None = None
+        self.goes_on = False
         if self.goals_read:
             self.goals_read = []
         if self.events:

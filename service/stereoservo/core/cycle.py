@@ -214,18 +214,23 @@ class StepOutputs(msgspec.Struct, frozen=True, eq=False):
         return self.status.command_raw
 
     @property
-    def velocities(self) -> FloatArray:
-        """Filtered velocities (n,) of the joints."""
-        return self.status.velocities
+    def values(self) -> FloatArray:
+        """As in `StepResult`."""
+        status, command = self.status, self.command
+        error_px = NOT_MEASURED if status.error_px is None else status.error_px
+        given = np.zeros_like(status.command_raw) if command is None else command
+        return np.concatenate([[error_px], status.command_raw, status.velocities, given])
 
-    @property
-    def error_px(self) -> float | None:
-        """Error of the active goal; None where none is measured."""
-        return self.status.error_px
+
+NOT_MEASURED = -1e300
+"""Stands for an error that is not measured."""
 
 
 class StepResult(Protocol):
-    """What a recording keeps of a step's outputs, as in `StepOutputs`."""
+    """What a recording keeps of a step's outputs, as in `StepOutputs`. ``values`` (1 + 3n,): the error [px] of the
+    active goal, the velocity before the safety stage, the filtered velocities of the joints, and the command, zero
+    where there is none.
+    """
 
     @property
     def command(self) -> FloatArray | None: ...
@@ -238,9 +243,7 @@ class StepResult(Protocol):
     @property
     def raw(self) -> FloatArray: ...
     @property
-    def velocities(self) -> FloatArray: ...
-    @property
-    def error_px(self) -> float | None: ...
+    def values(self) -> FloatArray: ...
 
 
 _DTYPES = {dtype.str: dtype for dtype in map(np.dtype, "?bBhHiIqQfd")}

@@ -59,6 +59,7 @@ def ingest(block: Record, room: Record) -> int:
     refuse all that is new: they are forgotten.
     """
     memory, work = block[0], room[0]
+    work.followed = 0
     if work.now_ns < memory.last_step_ns:
         _forget_stamps(block)
     last_ns = memory.last_step_ns

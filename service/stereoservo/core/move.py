@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.context import Motion, SourceOutput, StepContext
 from stereoservo.core.friction import begin_friction
 from stereoservo.core.goals.servoing import unplanned_report
 from stereoservo.core.sources.calibration import trials_step
@@ -25,6 +25,7 @@ from stereoservo.core.sources.law import (
     Progress,
     activate_run,
     awaits_plan,
+    drive,
     examine_run,
     examine_servo,
     run_progress,
@@ -146,6 +147,9 @@ MOTION_SOURCES: dict[type[Any], MotionSource] = {
 }  # fmt: skip
 
 
+NO_MOTION: Motion = (_rest, "")
+
+
 def goal_of(source: Source) -> str:
     """Id of the goal that a source works on, or ''."""
     return MOTION_SOURCES[type(source)].goal(source)
@@ -160,32 +164,42 @@ def paused(state: CoreState) -> bool:
     )
 
 
-def move(context: StepContext) -> None:
-    """Stage 5: the active source's velocity, into the workspace; no motion while it is paused, and outside ACTIVE,
-    where `execute_goals` ends it.
+def arrange_motion(context: StepContext) -> None:
+    """What stands of the motion, into the workspace: whether the active source moves the arm, no matter by which
+    velocity. It does not while it is paused, and outside ACTIVE, where `execute_goals` ends it.
     """
-    state, room = context.state, context.derived.room
-    work, kind = room.numbers, MOTION_SOURCES[type(state.source)]
-    work.rests = work.runs = work.compensates = work.needs_features = False
-    work.speed_scale = context.settings.limits.speed_scale
-    if work.paused or not work.active:
-        work.rests, state.friction_of = True, ""
-        return
-    source = state.source
-    goal = kind.goal(source)
-    output = context.output = kind.step(source, context)
-    if output is None:
-        work.rests = not kind.runs_law
-        if kind.runs_law:
-            work.needs_features, work.speed_scale = True, source.goal.speed_scale * work.speed_scale  # type: ignore[union-attr]
-    else:
-        room.velocity[:] = output.velocity
-        work.needs_features = output.needs_features
-        work.speed_scale = output.speed_scale * work.speed_scale
-    if kind.examine is not None and not (output is not None and output.finished):
-        work.runs, work.tolerance_px = True, source.tolerance_px  # type: ignore[union-attr]
-    work.compensates = goal != ""
+    state, derived = context.state, context.derived
+    work, source, scale = derived.room.numbers, state.source, context.settings.limits.speed_scale
+    kind = MOTION_SOURCES[type(source)]
+    moves = bool(work.active) and not work.paused
+    by_law = moves and kind.runs_law
+    derived.motion = (kind.step, kind.goal(source)) if moves else NO_MOTION
+    work.rests, work.needs_features = not by_law, by_law
+    work.speed_scale = source.goal.speed_scale * scale if by_law else scale  # type: ignore[union-attr]
+    work.runs = moves and kind.examine is not None
+    if work.runs:
+        work.tolerance_px = source.tolerance_px  # type: ignore[union-attr]
+    work.compensates = derived.motion[1] != ""
+
+
+def move(context: StepContext) -> None:
+    """Stage 5: the active source's velocity, into the workspace."""
+    state, derived = context.state, context.derived
+    step, goal = derived.motion
+    output = drive(state.source, context) if context.goes_on else step(state.source, context)
+    if output is not None:
+        _take(output, context)
     if state.friction_of != goal:
         state.friction_of = goal
         if goal:
-            begin_friction(state.block.record, room.record)
+            begin_friction(state.block.record, derived.room.record)
+
+
+def _take(output: SourceOutput, context: StepContext) -> None:
+    """What a motion source in Python has given, into the workspace."""
+    context.output, room = output, context.derived.room
+    work = room.numbers
+    room.velocity[:] = output.velocity
+    work.rests, work.needs_features = False, output.needs_features
+    work.speed_scale = output.speed_scale * context.settings.limits.speed_scale
+    work.runs = work.runs and not output.finished

@@ -31,7 +31,5 @@ def observe(context: StepContext, *, decides: bool) -> int:
             context.arrays = context.moved_arrays or derived.arrays
             context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
     found |= detect(record, space)
-    work.followed = False
-    if work.aims and not found and not decides:
-        follow_goal(record, space)
+    context.goes_on = bool(work.aims) and not found and not decides and follow_goal(record, space)
     return found

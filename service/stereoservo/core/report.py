@@ -11,7 +11,7 @@ import numpy as np
 
 from stereoservo.core.camera_state import CameraTiming
 from stereoservo.core.context import COMPILING, SourceOutput, StepContext
-from stereoservo.core.cycle import Status
+from stereoservo.core.cycle import NOT_MEASURED, Status
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
@@ -22,7 +22,7 @@ from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import TIMING_SIGMA_S, Prediction, propagate_covariance
-from stereoservo.core.sources.law import error_now, found_by_kernel
+from stereoservo.core.sources.law import found_by_kernel
 from stereoservo.core.state import CoreState, LawRun, ServoGoal
 from stereoservo.core.workspace import LENS_SIZE
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
@@ -38,8 +38,10 @@ LEVELS: tuple[Level, ...] = ("info", "slow", "hold", "fault")
 def finish_step(context: StepContext, limits: SafetyLimits) -> None:
     """Stage 7, in every step: a motion that has finished ends, and a few times a second a law's run is examined."""
     state, output = context.state, context.output
-    if output is not None and output.finished:
-        finish(output, context)
+    if output is not None:
+        context.derived.room.result[0] = NOT_MEASURED if output.error_px is None else output.error_px
+        if output.finished:
+            finish(output, context)
     state.step += 1
     if state.step % context.derived.look_every or not context.derived.room.numbers.runs:
         return
@@ -72,15 +74,6 @@ def status_of(context: StepContext, limits: SafetyLimits) -> Status:
         block.following_errors.copy() if numbers.tells_following else None, effort_limits, following_limits,
         _health(context, diagnosis, masked),
     )  # fmt: skip
-
-
-def error_of_step(context: StepContext) -> float | None:
-    """The error [px] of the active goal in the step; None where none is measured."""
-    if context.output is not None:
-        return context.output.error_px
-    room = context.derived.room
-    by_law = isinstance(context.state.source, ServoGoal) and not room.numbers.rests
-    return error_now(room) if by_law else None
 
 
 NO_MOTION = SourceOutput(np.zeros(0))

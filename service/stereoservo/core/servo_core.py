@@ -38,7 +38,7 @@ from stereoservo.core.monitor import monitor
 from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import move
 from stereoservo.core.observe import observe
-from stereoservo.core.report import error_of_step, finish_step, priors_of, status_of
+from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, Holding, ServoGoal, initial_state
 from stereoservo.messages.status import Lifecycle
@@ -48,6 +48,8 @@ from stereoservo.ports.devices import Prior
 PRIOR_RATE_HZ = 125.0
 LOOK_EVERY_S = 0.2
 """Between two examinations of why a law is slow or stuck."""
+BY_KERNELS = (ServoGoal, Holding)
+"""Motion sources that do not look at the inputs of a step."""
 NO_INPUTS = StepInputs(0, 0, None)
 
 
@@ -92,14 +94,9 @@ class NewestStep:
         return self._context.derived.room.raw
 
     @property
-    def velocities(self) -> FloatArray:
-        """Filtered velocities (n,) of the joints."""
-        return self._context.state.block.velocities
-
-    @property
-    def error_px(self) -> float | None:
-        """Error of the active goal; None where none is measured."""
-        return error_of_step(self._context)
+    def values(self) -> FloatArray:
+        """As in `core.cycle.StepResult`."""
+        return self._context.derived.room.result
 
     @property
     def priors(self) -> tuple[Prior, ...]:
@@ -175,8 +172,7 @@ class ServoCore:
         )
         if observe(context, decides=decides) or decides:
             self._decide(context)
-        source = state.source
-        if not isinstance(source, ServoGoal | Holding) and context.ingested is NOTHING:
+        if context.ingested is NOTHING and not isinstance(state.source, BY_KERNELS):
             context.ingested = account_inputs(context)
         move(context)
         room = self._derived.room

@@ -24,7 +24,7 @@ from stereoservo.core.prediction import (
     improbable,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_MARKERS
+from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 LENS_SIZE = 7
@@ -107,7 +107,7 @@ class Numbers(ctypes.Structure):
     seen: int
     run_found: int
     rests: int
-    by_law: int
+    jacobian_choice: int
     compensates: int
     needs_features: int
     damping: float
@@ -150,7 +150,7 @@ ARRAYS: Shapes = {
     "q": JOINTS, "sent": JOINTS, "masked": ("markers",), "unknown": ("cameras",), "offset_rule": ("cameras",),
     "stated_offset_ns": ("cameras",), "image_sizes": ("cameras", 2), "joint_deviations": JOINTS,
     "limits": (4, "joints"), "bounds": (4,), "friction_most": JOINTS, "friction_travel": JOINTS, "raw": JOINTS,
-    "outermost": JOINTS, "previous": JOINTS, "acted": JOINTS,
+    "outermost": JOINTS, "previous": JOINTS, "acted": JOINTS, "result": (1 + 3 * MAX_JOINTS,),
     "arrived_camera": (MAX_FRAMES,), "arrived_seq": (MAX_FRAMES,), "arrived_ns": (MAX_FRAMES,),
     "arrived_count": (MAX_FRAMES,), "arrived_found": (MAX_FRAMES,), "arrived_ids": (MAX_FRAMES, MAX_MARKERS),
     "arrived_pixels": (MAX_FRAMES, MAX_MARKERS, 2), "arrived_covariances": (MAX_FRAMES, MAX_MARKERS, 2, 2),
@@ -207,10 +207,9 @@ class Workspace:
     tolerance and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those
     that laws take; ``aim`` and ``faced``: of which goal and face they are.
 
-    Of the motion: the source's ``velocity`` (n,), by a law's kernel (``by_law``, which is damped and, of an arm that is
-    ``redundant``, led away from limits), what else `core.context.SourceOutput` says of it, and ``raw`` (n,), with what
+    Of the motion: the source's ``velocity`` (n,), what else `core.context.SourceOutput` says of it, and ``raw`` (n,), with what
     friction takes. What `core.limit` has found: ``finite`` to ``shared_by``, ``acted`` (n,), ``previous`` (n,) the
-    command before. ``arrays``: all arrays by name.
+    command before. ``result`` (1 + 3n,): what recordings keep of a step, see `core.cycle.StepResult`. ``arrays``: all arrays by name.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
@@ -319,6 +318,7 @@ class Workspace:
         self.stated_load_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
         self.weights: FloatArray = given["weights"]
         self.velocity: FloatArray = given["velocity"]
+        self.result: FloatArray = given["result"][: 1 + 3 * self._counts["joints"]]
         self.pixels: FloatArray = given["pixels"]
         self.prediction = Prediction(
             given["operators"], given["points"], given["predicted"], given["jacobian"]

@@ -218,6 +218,7 @@ def _compare(record: StepRecord, outputs: StepOutputs) -> tuple[bool, float]:
     scale = float(np.abs(record.raw).max(initial=0.0))
     error = difference / scale if scale > 0.0 else difference
     same = outputs_crc(outputs, record.layout) == record.outputs_crc and status.step == record.step
+    same = same and (outputs.command is None) == (record.command is None)
     return same, error
 
 

@@ -17,7 +17,15 @@ from typing import Any, get_type_hints
 import msgspec
 import numpy as np
 
-from stereoservo.core.cycle import Status, StepInputs, StepOutputs, StepResult, decode_array, encode
+from stereoservo.core.cycle import (
+    NOT_MEASURED,
+    Status,
+    StepInputs,
+    StepOutputs,
+    StepResult,
+    decode_array,
+    encode,
+)
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
 
@@ -34,8 +42,6 @@ SIGHT = struct.Struct("<IIqqq")
 STOP, CONFIGURED, ACTIVE, COMPILING, COMMAND, JOINTS, EFFORTS, FOLLOWING = (1 << k for k in range(8))
 LARGEST_COUNT = 255
 _NONE = b"\0"
-ABSENT = -1e300
-"""Stands for a number that is not there."""
 
 
 class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
@@ -65,18 +71,14 @@ _ARRAYS, _NUMBERS = _fields(FloatArray, FloatArray | None), _fields(float | None
 _APART = (*_ARRAYS, *_NUMBERS, "t_ns", "step", "reasons", "innovation_px", "health")
 _WORDS = tuple(name for name in Status.__struct_fields__ if name not in _APART)
 _arrays, _numbers, _words = attrgetter(*_ARRAYS), attrgetter(*_NUMBERS), attrgetter(*_WORDS)
-_error = struct.Struct("<d").pack
 
 
 def result_crc(result: StepResult) -> int:
     """CRC-32 of what a step has come to, bit for bit: velocities before and after the safety stage and of the joints,
     the goal's error, events, what the driver is asked for. What else there is in outputs follows from the state, which
-    checkpoints hold.
+    checkpoints hold; whether there is a command, from the record's flags.
     """
-    command, error_px = result.command, result.error_px
-    crc = zlib.crc32(_error(ABSENT if error_px is None else error_px))
-    for array in (result.raw, result.velocities, _NONE if command is None else command):
-        crc = zlib.crc32(array, crc)  # type: ignore[arg-type]
+    crc = zlib.crc32(result.values)  # type: ignore[arg-type]
     events, request = result.events, result.driver_request
     return zlib.crc32(encode((events, request)), crc) if events or request else crc
 
@@ -94,7 +96,7 @@ def _all_outputs_crc(outputs: StepOutputs) -> int:
     """CRC-32 of all outputs of a step but their time and number, bit for bit."""
     status = outputs.status
     numbers = [*_numbers(status), *status.innovation_px.values()]
-    numbers = [ABSENT if value is None else value for value in numbers]
+    numbers = [NOT_MEASURED if value is None else value for value in numbers]
     parts: list[Any] = [outputs.command, *_arrays(status), struct.pack(f"<{len(numbers)}d", *numbers)]
     parts = [_NONE if part is None else part for part in parts]
     for prior in outputs.priors:

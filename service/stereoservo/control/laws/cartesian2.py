@@ -20,9 +20,9 @@ COMPONENTS, UNITS = (TRANSLATION, ROTATION), ("", "rad")
 
 
 @kernel
-def cartesian2_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+def cartesian2_kernel(room: Record) -> None:
     """The law's ``kernel``."""
-    fill_step(room, gain, dt_s, 2)
+    fill_step(room, 2)
 
 
 def cartesian2(scene: Scene, task: Task, options: Options) -> LawStep:

@@ -446,7 +446,7 @@ def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields,
 
 
 @kernel
-def fill_step(room: Record, gain: float, dt_s: float, count: int) -> None:
+def fill_step(room: Record, count: int) -> None:
     """The step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
     work = room[0]
     n, m, c = work.joints, work.markers, work.eye_count
@@ -459,14 +459,14 @@ def fill_step(room: Record, gain: float, dt_s: float, count: int) -> None:
         work.velocity[:n], work.components[: 2 * count].reshape((2, count)), work.component_status[:count]
     )
     eyes = work.eyes[: 4 * c].reshape((c, 4))
-    _normalised_step_into(arm, task, eyes, Rates(gain, dt_s, math.inf, math.inf), stepped)
+    _normalised_step_into(arm, task, eyes, Rates(work.gain, work.dt_s, math.inf, math.inf), stepped)
     work.conditioning = 1.0
 
 
 @kernel
-def cartesian3_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+def cartesian3_kernel(room: Record) -> None:
     """The law's ``kernel``."""
-    fill_step(room, gain, dt_s, 3)
+    fill_step(room, 3)
 
 
 def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:

@@ -112,7 +112,7 @@ def step_by_points(operators: FloatArray, task: Fields, gains: Fields) -> tuple[
 
 
 @kernel
-def points_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+def points_kernel(room: Record) -> None:
     """The law's ``kernel``."""
     work = room[0]
     n, c, m = work.joints, work.cameras, work.markers
@@ -127,8 +127,9 @@ def points_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None
         pixel_metrics(work.matrices[: 12 * c].reshape((c, 3, 4)), body),
     )  # fmt: skip
     velocity, work.conditioning = points_step(
-        work.operators[: 16 * n].reshape((n, 4, 4)), task, Gains(gain_held(gain, dt_s), jacobian, DAMPING)
-    )
+        work.operators[: 16 * n].reshape((n, 4, 4)), task,
+        Gains(gain_held(work.gain, work.dt_s), work.jacobian_choice, DAMPING),
+    )  # fmt: skip
     work.velocity[:n] = velocity
 
 

@@ -199,7 +199,7 @@ def _image_step(
 
 
 @kernel
-def image_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
+def image_kernel(room: Record) -> None:
     """`image_step` of set-points that stand, as the ``kernel`` of a law."""
     work = room[0]
     n, c, m = work.joints, work.cameras, work.markers
@@ -213,9 +213,8 @@ def image_kernel(room: Record, gain: float, dt_s: float, jacobian: int) -> None:
         work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.target_known[:m]
     )
     operators = work.operators[: 16 * n].reshape((n, 4, 4))
-    work.conditioning = _image_step_into(
-        operators, view, body, Gains(gain_held(gain, dt_s), jacobian, DAMPING), work.velocity[:n]
-    )
+    gains = Gains(gain_held(work.gain, work.dt_s), work.jacobian_choice, DAMPING)
+    work.conditioning = _image_step_into(operators, view, body, gains, work.velocity[:n])
 
 
 @kernel

@@ -75,7 +75,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     """
     law = context.derived.laws[source.law]
     if by_kernel(source, law) and context.weights is context.derived.room.weights:
-        return _kernel_step(source, context, law)  # the present is another where a camera's place is found
+        return _kernel_step(source, context)  # the present is another where a camera's place is found
     waiting = wait_for_target(source, context)
     if waiting is not None:
         return waiting
@@ -130,23 +130,26 @@ def may_end(source: Follower, context: StepContext) -> bool:
     return source.followed is None or stands(context.state.target)
 
 
-def _kernel_step(source: ServoGoal, context: StepContext, law: Law) -> SourceOutput | None:
-    """`servo_step` by the kernel of a ``law``; where the goal goes on its velocity is in the workspace, and None."""
-    room, record = context.derived.room, context.state.block.record
+def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
+    """`servo_step` by the kernel of a law; where the goal goes on its velocity is in the workspace, and None."""
+    room = context.derived.room
     work = room.numbers
     if not work.followed:  # it has just begun, or the state was looked after before
         aim_at(room, source)
-        follow_goal(record, room.record)
-    if work.run_found != GOES_ON or work.seen < work.markers_needed:
-        found = Found(work.run_found, error_now(room), work.seen, work.markers_needed)
-        ended = _ended(source, context, found, source.wanted)
-        if ended is not None:
-            return ended
+        follow_goal(context.state.block.record, room.record)
+    found = Found(work.run_found, error_now(room), work.seen, work.markers_needed)
+    ended = _ended(source, context, found, source.wanted)
+    return drive(source, context) if ended is None else ended
+
+
+def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
+    """The velocity of a goal that goes on, into the workspace, by the kernel of its law; None unless that fails."""
+    room, law = context.derived.room, context.derived.laws[source.law]
     if law.components:
         show_face(source, context)
     assert law.kernel is not None
     try:
-        law.kernel(room.record, work.gain, context.dt_s, source.jacobian)
+        law.kernel(room.record)
     except Exception as error:  # as any law: it ends its goal, never the loop
         return _law_failed(source, context, error_now(room), error)
     if source.damping != 0.0:
@@ -191,7 +194,7 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
     aim = (
         goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
         goal.centre_target, goal.pose_known, goal.gain_near, goal.gain_far, goal.gain_slope, goal.tolerance_px,
-        goal.hold_frames, goal.time_limit_s,
+        goal.hold_frames, goal.time_limit_s, goal.jacobian,
     )  # fmt: skip
     if len(room.aim) == len(aim) and all(map(is_, aim, room.aim)):
         return
@@ -203,6 +206,7 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
     numbers.gain_near, numbers.gain_far, numbers.gain_slope = goal.gain_near, goal.gain_far, goal.gain_slope
     numbers.tolerance_px, numbers.time_limit_s = goal.tolerance_px, goal.time_limit_s
     numbers.hold_frames, numbers.markers_needed = goal.hold_frames, markers_needed(goal.wanted)
+    numbers.jacobian_choice = int(goal.jacobian)
 
 
 def show_face(goal: ServoGoal, context: StepContext) -> None:
@@ -293,9 +297,9 @@ def _measure(
 
 
 @kernel
-def follow_goal(block: Record, room: Record) -> None:
-    """The error and the body of the goal in the ``room``, as in `GoalError`, the gain there, and what `account_run` has
-    found; at the end of what is observed in a step.
+def follow_goal(block: Record, room: Record) -> bool:
+    """Whether the goal in the ``room`` goes on; its error and body, as in `GoalError`, the gain there, and what
+    `account_run` has found; at the end of what is observed in a step.
     """
     memory, work = block[0], room[0]
     n, c, m = work.joints, work.cameras, work.markers
@@ -318,6 +322,7 @@ def follow_goal(block: Record, room: Record) -> None:
     )
     work.gain = adaptive_gain(work.gain_near, work.gain_far, work.gain_slope, known_px)
     work.followed = 1
+    return bool(work.run_found == GOES_ON and work.seen >= work.markers_needed)
 
 
 def activate_run(source: LawRun, context: StepContext) -> None:
