@@ -1,8 +1,10 @@
-"""What the documents tell their readers to type: commands with their markers, and programs that are clients."""
+"""The commands of the documents, each with its directive from `documents.toml`, and their client programs."""
 
 from __future__ import annotations
 
 import re
+import tomllib
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,11 +17,12 @@ PROGRAMS = re.compile(
     r"mkdocs|cosmic-ray|\.ci/run|\S+/bin/pip|\.) "
 )
 """Beginning of a command in a block that is indented."""
-MARKER = re.compile(r"<!-- (not executed|slow): (.+?): (.+?) -->")
+DIRECTIVES = Path(__file__).with_name("documents.toml")
+"""Which commands are not executed, or in the slow suite alone, by page."""
 
 
-class Marker(NamedTuple):
-    """That commands which begin so are ``not executed`` by the tests, or ``slow``, and why."""
+class Directive(NamedTuple):
+    """How commands of a page with this beginning are treated (``skip`` or ``slow``), and the reason."""
 
     kind: str
     beginning: str
@@ -27,22 +30,33 @@ class Marker(NamedTuple):
 
 
 class Documented(NamedTuple):
-    """A command of a block, and its line on the page."""
+    """A command of a block, its line on the page, and the directive that applies to it."""
 
     line: int
     command: str
-    marker: Marker | None
+    directive: Directive | None
 
 
-def markers(text: str) -> list[Marker]:
-    """The markers of a page."""
-    return [Marker(*found) for found in MARKER.findall(text)]
+@cache
+def directives() -> dict[str, list[Directive]]:
+    """The directives of all pages, by the page's path in the repository."""
+    tables = tomllib.loads(DIRECTIVES.read_text(encoding="utf-8"))
+    return {
+        page: [Directive(kind, *one) for kind, rows in kinds.items() for one in rows.items()]
+        for page, kinds in tables.items()
+    }
 
 
-def documented(text: str) -> list[Documented]:
+def documented(page: Path) -> list[Documented]:
     """Commands of a page's blocks, in order; the parts of `a && b` one by one."""
+    return commands_of(
+        page.read_text(encoding="utf-8"), directives().get(page.relative_to(ROOT).as_posix(), [])
+    )
+
+
+def commands_of(text: str, stated: list[Directive]) -> list[Documented]:
+    """Commands in a page's text, each with the longest of the ``stated`` directives that fits it."""
     found, fence = [], ""
-    marked = markers(text)
     for number, line in enumerate(text.splitlines(), 1):
         if line.lstrip().startswith("```"):
             fence = "" if fence else line.strip("` ") or "text"
@@ -51,9 +65,29 @@ def documented(text: str) -> list[Documented]:
         if not shell or not PROGRAMS.match(line.strip() + " "):
             continue
         for part in re.sub(r"\s+# .*", "", line.strip()).split(" && "):
-            known = [one for one in marked if part.startswith(one.beginning)]
-            found.append(Documented(number, part, known[0] if known else None))
+            fitting = [one for one in stated if part.startswith(one.beginning)]
+            best = max(fitting, key=lambda one: len(one.beginning), default=None)
+            found.append(Documented(number, part, best))
     return found
+
+
+def mistakes(page: str, stated: list[Directive]) -> list[str]:
+    """What is wrong with the directives of a page: no such page, kind, command or file, or no reason."""
+    if ROOT / page not in PAGES:
+        return [f"{page}: no such page"]
+    found = documented(ROOT / page)
+    wrong = []
+    for one in stated:
+        where = f"{page}: {one.kind} {one.beginning!r}"
+        if one.kind not in ("skip", "slow"):
+            wrong.append(f"{where}: neither skip nor slow")
+        if not any(command.command.startswith(one.beginning) for command in found):
+            wrong.append(f"{where}: no such command on the page")
+        if len(one.why.split()) < 2:
+            wrong.append(f"{where}: no reason")
+        named = re.findall(r"\b(?:tests|\.ci)/[\w/.]*\w", one.why)
+        wrong += [f"{where}: no {path}" for path in named if not (ROOT / path).exists()]
+    return wrong
 
 
 def snippets(page: Path) -> list[tuple[int, str]]:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
-from documented import PAGES, ROOT, documented, markers
+from documented import PAGES, ROOT, Directive, commands_of, directives, mistakes
 from stereoservo.cli.dispatch import app
 
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_]*\d*")
@@ -82,17 +82,41 @@ def test_commands_that_are_none_are_found() -> None:
     assert sum(bool(examined(command, whole)) for command, whole in commands(text)) == 3
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_commands_that_are_not_executed_say_why(page: Path) -> None:
-    """tests/hil/test_documented_commands.py executes all others."""
-    text = page.read_text(encoding="utf-8")
-    found = documented(text)
-    for marker in markers(text):
-        assert any(one.command.startswith(marker.beginning) for one in found), marker
-        assert len(marker.why.split()) > 1, marker
-        for named in re.findall(r"\b(?:tests|\.ci)/[\w/.]*\w", marker.why):
-            assert (ROOT / named).exists(), f"{marker}: no {named}"
-    assert text.count("<!-- not executed") + text.count("<!-- slow") == len(markers(text))
+@pytest.mark.parametrize("page", directives())
+def test_directives_name_commands_of_their_page_and_a_reason(page: str) -> None:
+    """tests/hil/test_documented_commands.py executes all other commands."""
+    assert mistakes(page, directives()[page]) == []
+
+
+def test_directives_of_missing_pages_and_commands_are_found() -> None:
+    right = Directive("skip", "stereoservo demo", "takes minutes")
+    assert mistakes("README.md", [right]) == []
+    assert mistakes("docs/missing.md", [right]) == ["docs/missing.md: no such page"]
+    for wrong in (
+        right._replace(kind="never"),
+        right._replace(beginning="stereoservo dance"),
+        right._replace(why=""),
+        right._replace(why="takes minutes; tests/test_missing.py runs it"),
+    ):
+        assert len(mistakes("README.md", [wrong])) == 1, wrong
+
+
+def test_the_longest_directive_that_fits_a_command_applies() -> None:
+    stated = [
+        Directive("skip", "stereoservo demo", "a b"),
+        Directive("slow", "stereoservo demo --cell", "a b"),
+    ]
+    text = "    stereoservo demo --cell wide\n    stereoservo demo && stereoservo status mycell\n"
+    kinds = [one.directive and one.directive.kind for one in commands_of(text, stated)]
+    assert kinds == ["slow", "skip", None]
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.parent in (ROOT, ROOT / "docs")], ids=lambda page: page.name
+)
+def test_pages_hold_no_comments(page: Path) -> None:
+    """Directives for the tests are in tests/documents.toml, not on the pages of the root and of docs."""
+    assert "<!--" not in page.read_text(encoding="utf-8")
 
 
 def anchors(page: Path) -> set[str]:

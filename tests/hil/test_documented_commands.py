@@ -1,9 +1,6 @@
 """Every command of the documents is executed, page by page and in order, on fake cells of the names that it uses.
 
-A command that cannot run here has a marker on its page, which the page's readers do not see:
-
-    <!-- not executed: BEGINNING OF THE COMMAND: why -->
-    <!-- slow: BEGINNING OF THE COMMAND: why -->
+A command that cannot run here, or takes minutes, has a directive with its reason in `tests/documents.toml`.
 """
 
 from __future__ import annotations
@@ -111,7 +108,9 @@ class Desk:
         words = shlex.split(self.filled(command))
         if words[0] in SHELL:
             return self.program(["bash", "-c", command])
-        assert words[0] == "stereoservo", f"{command}: no such program here: it needs a marker"
+        assert words[0] == "stereoservo", (
+            f"{command}: no such program here: it needs a line in tests/documents.toml"
+        )
         words = words[1:]
         if words[0] == "run":
             name = Path(words[1]).stem  # a shipped cell, by its name alone, is played by a fake as well
@@ -192,8 +191,9 @@ def desk(cell_file: Path, roots: Path) -> Iterator[Desk]:
 
 def runs(page: Path, slow: bool) -> list[Documented]:
     """Commands of a page that are to be executed, with those that are ``slow`` or without."""
-    text = page.read_text(encoding="utf-8")
-    return [one for one in documented(text) if one.marker is None or (slow and one.marker.kind == "slow")]
+    return [
+        one for one in documented(page) if one.directive is None or (slow and one.directive.kind == "slow")
+    ]
 
 
 def pages(with_something: Callable[[Path], bool]) -> list[object]:
