@@ -156,7 +156,9 @@ class BusThread(Subscriptions):
             self._pump(now)
             self._receive(PUMP_WAIT_S)
         elif now >= self._next_ns:
-            self._tick(now)
+            if self._master.awaits_answers:  # what came while this thread was off its processor is in time
+                self._receive(0.0)
+            self._tick(time.monotonic_ns())
         else:
             self._sleep_and_read(now)
 

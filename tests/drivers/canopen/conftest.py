@@ -117,7 +117,7 @@ class ScriptedBus:
                 self.master.port_called(self.t_ns)
             frames = self.master.tick(self.t_ns)
             assert frames[0].id == SYNC
-            answers = self._answer()
+            answers = self.answers_now()
             self._obey(frames)
             end_ns = self.t_ns + self.period_ns
             if self.answers is not None:
@@ -131,7 +131,7 @@ class ScriptedBus:
             self.t_ns = end_ns
             self.cycles += 1
 
-    def _answer(self) -> list[tuple[int, CanFrame]]:
+    def answers_now(self) -> list[tuple[int, CanFrame]]:
         answers = []
         for k in range(self.codec.n):
             state = struct.pack("<Bf", self.on[k], self.positions[k])
