@@ -157,6 +157,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     give_way(not in_real_time(item))
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """A test that leaves its worker with a real-time priority starves everything that runs after it: it fails."""
+    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+    if policy != SCHEDULING:
+        os.sched_setscheduler(0, SCHEDULING, os.sched_param(0))
+        raise RuntimeError(f"{item.nodeid} or its fixtures left scheduling policy {policy} behind")
+
+
+SCHEDULING = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
 NICENESS = os.getpriority(os.PRIO_PROCESS, 0)
 MAY_RETURN = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_NICE)[0] >= 20 - NICENESS
 """Whether this account may take back a priority that it has given away."""

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,15 @@ def write_video(path: Path, pictures: np.ndarray, fps: float = FPS) -> None:
 
 
 def write_in_av1(folder: Path, episodes: list[Episode]) -> None:
-    """Videos of a data set of format 3.0 in lerobot's own codec, in place of those that are there."""
+    """Videos of a data set of format 3.0 in lerobot's own codec, in place of those that are there.
+
+    In a thread of its own: SVT-AV1 sets SCHED_FIFO 99 for the thread that calls it, where it may, and leaves it so.
+    """
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(_encode_in_av1, folder, episodes).result()
+
+
+def _encode_in_av1(folder: Path, episodes: list[Episode]) -> None:
     import av
 
     for c, camera in enumerate(CAMERAS):

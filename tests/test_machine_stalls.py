@@ -2,6 +2,7 @@
 files with tests of real processes run one after another.
 """
 
+import os
 import shutil
 import time
 from pathlib import Path
@@ -55,6 +56,29 @@ def test_a_failed_test_of_a_driver_in_real_time_runs_again(pytester: pytest.Pyte
     settings_of_the_suite(pytester)
     pytester.makepyfile(IN_REAL_TIME)
     pytester.runpytest_subprocess("-p", "no:xdist").assert_outcomes(passed=1)
+
+
+REAL_TIME_LEFT = """
+import os
+
+def test_leaves_it():
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+
+def test_next():
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+"""
+
+
+def test_a_test_that_leaves_a_real_time_priority_behind_fails_and_the_next_has_none(
+    pytester: pytest.Pytester,
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("SCHED_FIFO is not allowed here")
+    settings_of_the_suite(pytester)
+    pytester.makepyfile(REAL_TIME_LEFT)
+    result = pytester.runpytest_subprocess("-p", "no:xdist")
+    result.assert_outcomes(passed=2, errors=1)
+    assert "left scheduling policy 1 behind" in result.stdout.str()
 
 
 LIVE = """
