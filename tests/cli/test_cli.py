@@ -290,7 +290,7 @@ def test_a_stop_is_raised_before_any_library_is_imported(written: str, tmp_path:
     arguments = ["stop", "demo" if written == "demo" else str(path), "--json"]
     ended = subprocess.run(
         [sys.executable, "-c", ONLY_THE_STANDARD_LIBRARY, *arguments],
-        check=False, capture_output=True, text=True, timeout=60,
+        check=False, capture_output=True, text=True, timeout=240,
     )  # fmt: skip
     assert "is imported" in ended.stderr  # afterwards, for the answer
     assert slot.count == 1

@@ -44,7 +44,7 @@ def answers(lines: list[list[str]], tmp_path: Path, *extras: str) -> list[tuple[
     modules = {module for extra in extras for module in plugins.EXTRAS[extra]}
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT.format(modules=modules)],
-        input=json.dumps(lines), capture_output=True, text=True, check=True, timeout=60, cwd=tmp_path,
+        input=json.dumps(lines), capture_output=True, text=True, check=True, timeout=240, cwd=tmp_path,
     )  # fmt: skip
     return [tuple(answer) for answer in json.loads(done.stdout)]
 

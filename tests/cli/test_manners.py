@@ -23,7 +23,7 @@ from stereoservo_sim.progress import LINE_EVERY_S, progress_lines
 def completed(words: str, shell: str = "bash", **environment: str) -> list[str]:
     """What the program offers a shell whose line ends with the last of these words."""
     done = subprocess.run(
-        [sys.executable, "-m", "stereoservo.cli.main"], capture_output=True, text=True, check=True, timeout=60,
+        [sys.executable, "-m", "stereoservo.cli.main"], capture_output=True, text=True, check=True, timeout=240,
         env={**os.environ, "_STEREOSERVO_COMPLETE": f"complete_{shell}", "COMP_WORDS": f"stereoservo {words}",
              "COMP_CWORD": str(len(words.split(" "))), **environment},
     )  # fmt: skip
@@ -34,7 +34,7 @@ def completed(words: str, shell: str = "bash", **environment: str) -> list[str]:
 def test_a_completion_script_is_produced(shell):
     done = subprocess.run(
         [sys.executable, "-m", "stereoservo.cli.main", "--show-completion", shell],
-        capture_output=True, text=True, check=True, timeout=60,
+        capture_output=True, text=True, check=True, timeout=240,
         env={**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
     )  # fmt: skip
     assert "_STEREOSERVO_COMPLETE" in done.stdout

@@ -57,7 +57,7 @@ def test_systemd_takes_the_units(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
     found = subprocess.run(
         ["systemd-analyze", "verify", *(str(tmp_path / name.replace("@.", "@cell.")) for name in names)],
-        env={**os.environ, "SYSTEMD_UNIT_PATH": f"{tmp_path}:"}, capture_output=True, text=True, timeout=60,
+        env={**os.environ, "SYSTEMD_UNIT_PATH": f"{tmp_path}:"}, capture_output=True, text=True, timeout=240,
         check=False,
     )  # fmt: skip
     mine = [line for line in found.stderr.splitlines() if "stereoservo" in line]

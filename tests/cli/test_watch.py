@@ -28,7 +28,7 @@ def test_rerun_is_given_every_value_with_its_time_and_the_names_of_joints(tmp_pa
         viewer.show(EventMessage(1, "boot", 0, 1002.0, "stopped", "by hand"))
     told = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "print", "-vvv", str(file)], check=True, capture_output=True, text=True,
-        timeout=60,
+        timeout=240,
     ).stdout  # fmt: skip
     for found in (
         "shoulder",

@@ -20,7 +20,7 @@ def modules_after(program: str) -> set[str]:
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=240,
     )
     return set(done.stdout.split())
 

@@ -79,7 +79,7 @@ def test_literals_of_a_caller_make_no_signature_of_their_own() -> None:
 
 
 def test_a_core_without_a_model_needs_the_first_kernels_only() -> None:
-    subprocess.run([sys.executable, "-c", WITHOUT_A_MODEL], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", WITHOUT_A_MODEL], check=True, timeout=240)
 
 
 def signatures() -> set[Overload]:
@@ -163,7 +163,7 @@ def test_a_target_that_is_followed_needs_no_kernels_that_the_example_did_not() -
 
 @pytest.mark.slow
 def test_a_large_body_needs_no_kernels_that_the_example_did_not() -> None:
-    subprocess.run([sys.executable, "-c", LARGE_BODY], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", LARGE_BODY], check=True, timeout=240)
 
 
 def test_kernels_are_loaded_one_at_a_time_once_a_new_record_is_there(
@@ -244,7 +244,7 @@ def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pyte
 
     def told(now: float) -> str:
         assert compilation._process is not None
-        compilation._process.wait(30.0)
+        compilation._process.wait(240.0)
         return compilation.look(now)
 
     assert told(1.0) == "ended with exit code 3; starting again in 10 s"

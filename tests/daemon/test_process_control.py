@@ -30,7 +30,7 @@ def ended_by(*numbers: int, arguments: tuple[str, ...] = ()) -> str:
         for number in numbers:
             child.send_signal(number)
         try:
-            output, _ = child.communicate(timeout=60.0)
+            output, _ = child.communicate(timeout=240)
         finally:
             child.kill()
     return output.strip()

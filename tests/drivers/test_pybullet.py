@@ -56,7 +56,7 @@ def test_two_runs_are_the_same_bit_for_bit(tmp_path):
 
 def run_python(code):
     return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
     )
 
 

@@ -177,7 +177,7 @@ def test_a_peer_that_takes_all_sessions_of_the_network_locks_out_nobody_on_this_
         except SessionError:
             return False
         sessions.append(client)
-        return any(reply.ok is not None for reply in client.get("it", timeout=2.0))
+        return any(reply.ok is not None for reply in client.get("it", timeout=30.0))
 
     try:
         while not answered(endpoint):  # through both routers, once they know each other

@@ -33,15 +33,20 @@ AUXILIARY = (
 CELL = "hil"
 ROOM = 1 << 29
 """Of a file system in memory, to be used [bytes]."""
-QUICK_CALIBRATION = """
+WAIT_S = 20.0
+"""For pictures at a stop of a calibration: cameras of a busy machine may be late."""
+QUICK_CALIBRATION = f"""
 [calibration]
 stops = 5
 frames = 2
 settle_s = 0.05
+wait_s = {WAIT_S}
 """
+PATIENCE_S = 60.0
+"""For what a busy machine does late; how long it takes is not judged."""
 
 
-def eventually(what: str, wanted: Callable[[], object], timeout_s: float = 20.0) -> None:
+def eventually(what: str, wanted: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
     """Wait until ``wanted`` is true; how long it takes is not judged, only that it happens."""
     until = time.monotonic() + timeout_s
     while not wanted():
@@ -120,8 +125,8 @@ def calibrated(cell_file: Path, roots: Path) -> Path:
     with DaemonProcess(cell_file, log=roots / "calibrate.log") as daemon:
         daemon.wait_ready()
         with Client(CELL) as client:
-            client.enable()
-            result = client.calibrate(timeout_s=120.0)
+            client.enable(timeout_s=PATIENCE_S)
+            result = client.calibrate(timeout_s=300.0)
             assert result.covariance_ok
             client.teach("park", frames=5)
     return cell_file
@@ -198,10 +203,10 @@ def own(live: DaemonProcess) -> Iterator[Client]:
 def recover(client: Client) -> None:
     """Reset where there is a fault, enable, resume where the arm is held: acts of an operator, one by one."""
     if client.status().lifecycle == "fault":
-        client.reset()
+        client.reset(timeout_s=PATIENCE_S)
         eventually("the reset", lambda: client.status().lifecycle == "inactive")
     if client.status().lifecycle != "active":
-        client.enable()
+        client.enable(timeout_s=PATIENCE_S)
     if {reason.code for reason in client.status().reasons} & {"HELD", "STOPPED"}:
         client.resume()
 

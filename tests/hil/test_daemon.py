@@ -222,7 +222,7 @@ def test_a_displacement_is_checked_driven_streamed_and_acknowledged(client: Clie
 
 def test_looking_around_with_a_wildcard_reads_everything_and_stops_nothing(client: Client) -> None:
     found = {}
-    for reply in client.session.get(f"{client.keys.prefix}/**", timeout=2.0):
+    for reply in client.session.get(f"{client.keys.prefix}/**", timeout=30.0):
         if reply.ok is not None:
             found[str(reply.ok.key_expr)] = reply.ok.payload.to_bytes()
     keys = client.keys
@@ -295,7 +295,7 @@ def test_goals_that_cannot_be_are_refused_with_what_would_be_valid(client: Clien
     with pytest.raises(ValueError, match=r"target\.positions\.j1 is nan"):
         client.goal({"j1": float("nan")})
     raw = b'{"id":"12345678","target":{"kind":"joints","positions":{"j1":NaN}}}'
-    for reply in client.session.get(client.keys.goal("raw"), payload=raw, timeout=2.0):
+    for reply in client.session.get(client.keys.goal("raw"), payload=raw, timeout=30.0):
         answer = decode(reply.ok.payload.to_bytes(), Reply)
         assert not answer.accepted
         assert "NaN is not a JSON number" in answer.problems[0]

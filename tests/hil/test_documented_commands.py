@@ -234,7 +234,7 @@ def test_a_shell_completes_live_cells_and_taught_goals(desk: Desk) -> None:
     desk.prepared("mycell")
     for words, offered in (("status my", "mycell"), ("goal mycell do", "dock")):
         done = subprocess.run(
-            [sys.executable, "-m", "stereoservo.cli.main"], check=True, text=True, capture_output=True, timeout=60,
+            [sys.executable, "-m", "stereoservo.cli.main"], check=True, text=True, capture_output=True, timeout=240,
             env={**os.environ, "_STEREOSERVO_COMPLETE": "complete_bash", "COMP_WORDS": f"stereoservo {words}",
                  "COMP_CWORD": str(len(words.split()))},
         )  # fmt: skip

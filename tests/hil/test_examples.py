@@ -28,7 +28,7 @@ def run(style: str, name: str, *arguments: str) -> str:
     """What an example prints. It is to succeed."""
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / style / f"{name}.py"), CELL, *arguments],
-        capture_output=True, text=True, timeout=120, check=False,
+        capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -57,7 +57,7 @@ def test_a_goal_is_taught_and_reached(client: Client, style: str) -> None:
 def test_a_goal_that_is_not_there_is_refused_in_words(client: Client, style: str) -> None:
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / style / "goal.py"), CELL, "nowhere"],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     assert done.stderr.startswith("refused: ")
@@ -97,7 +97,7 @@ def run_node(name: str, *arguments: str, code: int = 0) -> str:
     """What an example in JavaScript prints, on stderr where it is to fail."""
     done = subprocess.run(
         [*node(), str(EXAMPLES / "javascript" / f"{name}.mjs"), *arguments],
-        capture_output=True, text=True, timeout=120, check=False,
+        capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert done.returncode == code, (done.stdout, done.stderr)
     return done.stderr if code else done.stdout
@@ -153,7 +153,7 @@ def test_a_wrong_key_is_answered_with_the_right_ones(client: Client, wrong: str)
 def test_watch_writes_a_live_cell_for_rerun(client: Client, tmp_path: Path) -> None:
     file = tmp_path / "live.rrd"
     program = [sys.executable, "-m", "stereoservo.cli.main", "watch", CELL, "--rerun", "--save", str(file)]
-    subprocess.run([*program, "--seconds", "3"], check=True, capture_output=True, timeout=60)
+    subprocess.run([*program, "--seconds", "3"], check=True, capture_output=True, timeout=240)
     listed = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "print", str(file)], check=True, capture_output=True, text=True
     ).stdout
@@ -179,7 +179,7 @@ def test_watch_serves_a_live_cell_to_foxglove(client: Client) -> None:
         wanted = {"/joints", "/command", "/status", "/camera/left/annotations", "/camera/right/annotations"}
         with connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as foxglove:
             while not wanted <= set(found):
-                data = foxglove.recv(timeout=30)
+                data = foxglove.recv(timeout=60)
                 if isinstance(data, str):
                     message = json.loads(data)
                     new = {channel["id"]: channel for channel in message.get("channels", ())}
@@ -202,4 +202,4 @@ def test_watch_serves_a_live_cell_to_foxglove(client: Client) -> None:
         assert len(found["/camera/left/annotations"].points[0].points) >= 4
     finally:
         process.terminate()
-        process.communicate(timeout=60)
+        process.communicate(timeout=240)

@@ -2,9 +2,9 @@
 
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -12,7 +12,7 @@ import pytest
 from stereoservo.cli.status import with_progress
 from stereoservo.daemon import kernel_compilation
 from stereoservo.daemon.supervisor import ProgressLines
-from stereoservo.messages import discovery
+from stereoservo.messages import compilation_progress, discovery
 from stereoservo.messages.compilation_progress import (
     CompilationProgress,
     PatientWait,
@@ -80,18 +80,21 @@ def test_a_daemon_is_waited_for_while_it_compiles(tmp_path: Path, monkeypatch: p
     runtime = tmp_path / "cell"
     runtime.mkdir()
     told: list[str] = []
-    compiled = 60
+    compiled, done, now = 60, 0, 0.0
 
-    def compile_slowly() -> None:
-        for done in range(1, compiled + 1):
+    def sleep(seconds: float) -> None:
+        nonlocal done, now
+        now += seconds
+        if done < compiled:
+            done += 1
             _tell(runtime, done, daemon=daemon.process.pid)
-            time.sleep(0.05)
 
-    compiling = threading.Thread(target=compile_slowly)
-    compiling.start()
+    clock = SimpleNamespace(monotonic=lambda: now, sleep=sleep)
+    monkeypatch.setattr(discovery, "time", clock)
+    monkeypatch.setattr(compilation_progress, "time", clock)
     with daemon, pytest.raises(discovery.DaemonError, match="compiled no kernel either"):
-        daemon.wait_ready(1.5, told.append)  # of three seconds and more that the compilation takes
-    assert not compiling.is_alive()
+        daemon.wait_ready(1.5, told.append)  # of three seconds that the compilation takes
+    assert now == pytest.approx(compiled * 0.05 + 1.5, abs=0.11)
     assert told[-1] == f"compiling kernels: rest {compiled} of about 380 kernels"
 
 

@@ -83,7 +83,7 @@ def run(acme: Path, cache: Path, first: str = "", **environment: str) -> tuple[f
         capture_output=True,
         check=True,
         text=True,
-        timeout=120,
+        timeout=240,
     )
     lines = [json.loads(line) for line in log.read_text().splitlines()]
     return float(done.stdout), {line["kernel"] for line in lines if line.get("module", "").startswith("acme")}

@@ -170,9 +170,9 @@ def test_a_file_that_exists_is_left_alone(exported: Exported) -> None:
 def test_rerun_decodes_at_least_eight_entities(exported: Exported, tmp_path: Path) -> None:
     rrd = tmp_path / "flight.rrd"
     program = [sys.executable, "-m", "rerun"]
-    subprocess.run([*program, "mcap", "convert", str(exported.file), "-o", str(rrd)], check=True, timeout=60)
+    subprocess.run([*program, "mcap", "convert", str(exported.file), "-o", str(rrd)], check=True, timeout=240)
     listed = subprocess.run(
-        [*program, "rrd", "print", "-v", str(rrd)], check=True, capture_output=True, text=True, timeout=60
+        [*program, "rrd", "print", "-v", str(rrd)], check=True, capture_output=True, text=True, timeout=240
     ).stdout
     entities = set()
     for entity, columns in re.findall(r" - (/\S+) - .*?columns: \[(.*?)\]", listed):

@@ -95,7 +95,7 @@ def test_where_the_link_is_down_the_arm_is_stopped_over_a_session_of_its_own(
     link, down, why = link_of(cell, monkeypatch)
     link.start()
     try:
-        assert down.wait(10)
+        assert down.wait(60)
         assert told in why[0]
         assert link.stop("ann").message == "stopped"
         with pytest.raises(LinkDownError):

@@ -40,7 +40,7 @@ def test_whatever_a_cell_sends_the_link_goes_on_and_says_so(monkeypatch: pytest.
     link = CellLink("far", None, "page", publish)
     link.start()
     try:
-        assert heard.wait(10)
+        assert heard.wait(60)
     finally:
         link.close()
     assert not told[0]["up"]

@@ -1,6 +1,7 @@
 """What the page's server lets through, over real sockets, to a link that notes it."""
 
 import http.client
+import itertools
 import json
 import random
 import socket
@@ -34,6 +35,8 @@ NEEDED: dict[str, dict[str, Any]] = {
     "seek": {"at": 1.0},
 }
 """What a request must hold beside its verb."""
+PATIENCE_S = 60.0
+"""[s] For what a busy machine does late; how long it takes is not judged."""
 
 
 def answer(page: ClientConnection, request: Any, n: int) -> dict[str, Any]:
@@ -42,7 +45,7 @@ def answer(page: ClientConnection, request: Any, n: int) -> dict[str, Any]:
         request if isinstance(request, str | bytes) else msgspec.json.encode({**request, "n": n}).decode()
     )
     while True:
-        message = msgspec.json.decode(page.recv(timeout=10))
+        message = msgspec.json.decode(page.recv(timeout=PATIENCE_S))
         if message.get("answer", {}).get("n") == n:
             return cast(dict[str, Any], message["answer"])
 
@@ -112,13 +115,15 @@ def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
             assert "another page holds" in answer(other, {"do": "take", "token": tokens[1]}, 1)["message"]
             assert answer(other, {"do": "stop"}, 2)["ok"]
             page.close()  # whoever holds the arm and goes lets it rest
-            for n in range(3, 200):
+            until = time.monotonic() + PATIENCE_S
+            for n in itertools.count(3):
                 if answer(other, {"do": "take", "token": tokens[1]}, n)["ok"]:
                     break
-            assert answer(other, {"do": "hold"}, 500)["ok"]
+                assert time.monotonic() < until
+            assert answer(other, {"do": "hold"}, n + 1)["ok"]
             assert link.ended >= 1
         with connect(f"ws://127.0.0.1:{port}/socket") as later:
-            while "held the arm was closed" not in (told := str(later.recv(timeout=10))):
+            while "held the arm was closed" not in (told := str(later.recv(timeout=PATIENCE_S))):
                 assert "answer" not in told, "it is told with what happened before"
 
 
@@ -134,11 +139,11 @@ def test_a_page_that_does_not_read_is_sent_no_more_pictures_until_it_has() -> No
             time.sleep(0.002)  # for the server's loop, which sends what fits
         link.publish("", b'{"last": true}', False)
         shown = []
-        while (message := page.recv(timeout=10)) != '{"last": true}':
+        while (message := page.recv(timeout=PATIENCE_S)) != '{"last": true}':
             if isinstance(message, bytes):
                 shown.append(int.from_bytes(message[:4], "little"))
         assert len(shown) <= 8, "the sockets' buffers would hold some sixty"
-        while not isinstance(message := page.recv(timeout=10), bytes):
+        while not isinstance(message := page.recv(timeout=PATIENCE_S), bytes):
             pass
         assert int.from_bytes(message[:4], "little") == count - 1, "the newest of all"
 
@@ -147,7 +152,7 @@ def test_pages_are_told_that_the_server_lives_and_for_how_long_the_cell_has_been
     with serving(None) as (port, _, _, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
 
         def tick() -> dict[str, Any]:
-            while "tick" not in (message := msgspec.json.decode(page.recv(timeout=10))):
+            while "tick" not in (message := msgspec.json.decode(page.recv(timeout=PATIENCE_S))):
                 pass
             return cast(dict[str, Any], message["tick"])
 
@@ -178,25 +183,28 @@ def frame(text: str) -> bytes:
 
 def test_a_page_that_answers_no_ping_lets_the_arm_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_server, "PING_S", 0.2)
-    monkeypatch.setattr(page_server, "SILENT_S", 0.2)
+    monkeypatch.setattr(page_server, "SILENT_S", 1.0)
     with serving("ann") as (port, _, tokens, link), socket.create_connection(("127.0.0.1", port)) as frozen:
         frozen.sendall(
             f"GET /socket HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
         )
         frozen.sendall(frame(json.dumps({"do": "take", "token": tokens[0]})))  # and nothing from here on
+        until = time.monotonic() + PATIENCE_S
+        while not link.ended:
+            assert time.monotonic() < until
+            time.sleep(0.01)
         with connect(f"ws://127.0.0.1:{port}/socket") as other:
-            while "held the arm lost its connection" not in str(other.recv(timeout=20)):
+            while "held the arm lost its connection" not in str(other.recv(timeout=PATIENCE_S)):
                 pass
             assert answer(other, {"do": "take", "token": tokens[1]}, 1)["ok"]
-        assert link.ended >= 1
 
 
 def test_a_stop_waits_for_nothing_that_a_page_has_asked_for() -> None:
     free = Event()
     with serving("ann") as (port, calls, tokens, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
         assert answer(page, {"do": "take", "token": tokens[0]}, 1)["ok"]
-        link.client.hold = lambda: free.wait(20) and Reply(True, "held")
+        link.client.hold = lambda: free.wait(2 * PATIENCE_S) and Reply(True, "held")
         try:
             for n in range(100, 130):
                 page.send(msgspec.json.encode({"do": "hold", "n": n}).decode())
@@ -212,7 +220,7 @@ def test_a_goal_is_not_sent_where_another_was_asked_for_while_it_was_checked() -
 
     def slow(goal: Goal) -> Reply:
         checking.set()
-        free.wait(20)
+        free.wait(2 * PATIENCE_S)
         return Reply(True, "a path")
 
     def refused(goal: Goal) -> Reply:
@@ -224,12 +232,12 @@ def test_a_goal_is_not_sent_where_another_was_asked_for_while_it_was_checked() -
         link.taught_goal = lambda name: EXAMPLE
         try:
             page.send(msgspec.json.encode({"do": "check", "name": "a", "n": 2}).decode())
-            assert checking.wait(10)
+            assert checking.wait(PATIENCE_S)
             link.client.check = refused
             assert not answer(page, {"do": "check", "name": "b"}, 3)["ok"]
         finally:
             free.set()
-        while msgspec.json.decode(page.recv(timeout=10)).get("answer", {}).get("n") != 2:
+        while msgspec.json.decode(page.recv(timeout=PATIENCE_S)).get("answer", {}).get("n") != 2:
             pass
         assert "check the goal first" in answer(page, {"do": "go"}, 4)["message"]
         assert "send" not in calls
@@ -276,7 +284,7 @@ def test_other_hosts_origins_and_paths_get_nothing() -> None:
             ({}, "/../server.py", 404),
             ({}, "/page/index.html", 404),
         ):
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
             connection.request("GET", path, headers=headers)
             response = connection.getresponse()
             assert response.status == status, path

@@ -42,7 +42,7 @@ class AdapterThread:
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
         """Give the thread time; fails where the condition does not come true."""
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 60.0
         while not condition():
             assert time.monotonic() < deadline, "the adapter's thread did not get there"
             time.sleep(0.002)

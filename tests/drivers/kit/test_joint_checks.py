@@ -13,9 +13,10 @@ import typer
 from typer.testing import CliRunner
 
 from stereoservo_drivers.commands.driver_check import driver_check
+from stereoservo_drivers.kit import joint_checks
 from stereoservo_drivers.kit.bench import RUNAWAY_REMEDY, CheckFailedError, JointBench
-from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, TRIES, JointCheck, run_check
-from stereoservo_drivers.kit.watchdog import CommandWatchdog
+from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, STALL_S, TRIES, JointCheck, run_check
+from stereoservo_drivers.kit.watchdog import CommandWatchdog, StallWatch
 
 from .faulty_drivers import (
     FAULTY,
@@ -324,6 +325,24 @@ def test_a_watchdog_stops_a_device_that_has_none(name, tmp_path):
 STALL_US = 60_000
 
 
+def test_a_stall_of_this_process_is_noted():
+    with StallWatch() as watch:
+        ctypes.PyDLL(None).usleep(STALL_US)  # with the interpreter's lock: no thread of this process runs
+    assert watch.longest_s >= STALL_S
+
+
+class GivenStalls:
+    """Stands for `StallWatch` where a test says itself when the computer stood still."""
+
+    longest_s = 0.0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.longest_s = GivenStalls.longest_s
+
+
 @pytest.mark.parametrize(
     ("real_time", "stalls", "fails", "remedy", "runs", "verdict"),
     [
@@ -335,15 +354,15 @@ STALL_US = 60_000
     ],
 )
 def test_a_check_that_fails_runs_again_where_the_computer_stood_still(
-    real_time, stalls, fails, remedy, runs, verdict, tmp_path
+    real_time, stalls, fails, remedy, runs, verdict, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr(joint_checks, "StallWatch", GivenStalls)
     done = 0
 
     def run(bench: JointBench) -> str:
         nonlocal done
         done += 1
-        if done <= stalls:
-            ctypes.PyDLL(None).usleep(STALL_US)  # with the interpreter's lock: no thread of this process runs
+        monkeypatch.setattr(GivenStalls, "longest_s", STALL_US * 1e-6 if done <= stalls else 0.0)
         if done <= fails:
             raise CheckFailedError("joint 1 goes on", remedy)
         return "stands"

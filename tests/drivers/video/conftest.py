@@ -157,11 +157,16 @@ def context(tmp_path: Any) -> DriverContext:
 
 @pytest.fixture
 def camera(context: DriverContext) -> Iterator[Callable[..., VideoCameraDriver]]:
-    """Makes a driver of ``WIDTH`` by ``HEIGHT`` with options, closed after the test."""
+    """Makes a driver of ``WIDTH`` by ``HEIGHT`` with options, closed after the test; patient unless the options say
+    else, since a server in a thread is as late as its machine is busy.
+    """
+    patient = {"open_timeout_s": 60.0, "read_timeout_s": 30.0}
     made: list[VideoCameraDriver] = []
 
     def make(source: str | int, **options: Any) -> VideoCameraDriver:
-        driver = VideoCameraDriver({"source": source, "width": WIDTH, "height": HEIGHT, **options}, context)
+        driver = VideoCameraDriver(
+            {"source": source, "width": WIDTH, "height": HEIGHT, **patient, **options}, context
+        )
         made.append(driver)
         return driver
 
@@ -170,7 +175,7 @@ def camera(context: DriverContext) -> Iterator[Callable[..., VideoCameraDriver]]
         driver.close()
 
 
-def connected(driver: VideoCameraDriver, limit_s: float = 20.0) -> VideoCameraDriver:
+def connected(driver: VideoCameraDriver, limit_s: float = 60.0) -> VideoCameraDriver:
     """The driver, active once its source answers."""
     end = time.monotonic() + limit_s
     while True:
@@ -185,7 +190,7 @@ def connected(driver: VideoCameraDriver, limit_s: float = 20.0) -> VideoCameraDr
             time.sleep(0.05)
 
 
-def poll_until(driver: VideoCameraDriver, count: int, limit_s: float = 20.0) -> list[Any]:
+def poll_until(driver: VideoCameraDriver, count: int, limit_s: float = 60.0) -> list[Any]:
     """``count`` frames. Fails the test when they do not come; what the driver raises goes through."""
     frames: list[Any] = []
     end = time.monotonic() + limit_s

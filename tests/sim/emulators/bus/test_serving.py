@@ -19,7 +19,7 @@ from stereoservo_sim.emulators.bus.plant import AxisPlant
 from stereoservo_sim.emulators.fault_engine import FaultCommandError
 from stereoservo_sim.world.velocity_drives import IdealPlant
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 @pytest.fixture
@@ -103,15 +103,15 @@ def test_an_axis_moves_in_real_time(serve, connect, scripted):
     wire.say(b"O\r")
     wire.wait_for(b"\r")
     frame = scripted.command(1, 0.5)
+    ordered = time.monotonic()
     wire.say(b"t2015" + frame.data.hex().encode() + b"\r")
     position = 0.0
-    until = time.monotonic() + PATIENCE_S
     while position < 0.05:
-        assert time.monotonic() < until
+        assert time.monotonic() < ordered + PATIENCE_S
         answer = last_answer(wire)
         at = answer.index(b"t1818") + 5
         position = int.from_bytes(bytes.fromhex(answer[at : at + 16].decode()), "little", signed=True) * 1e-6
-    assert position < 2.0
+    assert position <= 0.5 * (time.monotonic() - ordered)
 
 
 def test_a_closed_channel_passes_nothing(serve, connect):

@@ -23,7 +23,7 @@ from stereoservo_sim.emulators.cameras.stream_server import CameraServer
 from stereoservo_sim.emulators.cameras.stream_settings import CamerasSettings, StreamSettings
 from stereoservo_sim.emulators.fault_engine import EmulationError
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 class Served:
