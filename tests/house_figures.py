@@ -42,6 +42,8 @@ TODAY = {
 MODULE_LINES, FUNCTION_LINES = 900, 80
 KERNEL_ARGUMENTS, CORE_KERNELS = 6, 0
 """Arguments of a kernel; and kernels of the core that have more, as long as there are any."""
+PARAMETERS, VERBS = 10, 4
+"""Parameters of a function; and verbs of the command line that have more, one for each option."""
 LAWS = ("stereo", "cartesian3")
 LAW_NAMES = re.compile(r"""["'](stereo|cartesian3|cartesian2)["']""")
 """Names that are nothing but laws: `image`, `points` and `trajectory` are words of other things, too."""
@@ -420,6 +422,46 @@ def function_figure() -> Figure:
     return Figure(f"functions above {FUNCTION_LINES} lines", len(beyond), 0, tuple(beyond))
 
 
+def parameter_figures() -> list[Figure]:
+    """Functions with too many parameters: outside the command line, where there may be none, and the verbs, which have
+    a parameter for each option.
+    """
+    verbs, others = [], []
+    for path in modules():
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                count = len(_parameters(node))
+                if count > PARAMETERS:
+                    found = verbs if _is_verb(path, node) else others
+                    found.append(f"{_name(path)}:{node.lineno} {node.name}: {count}")
+    name = f"functions with more than {PARAMETERS} parameters"
+    return [
+        Figure(f"{name}, outside the command line", len(others), 0, tuple(others)),
+        Figure(f"{name}, verbs of the command line", len(verbs), VERBS, tuple(verbs)),
+    ]
+
+
+def _parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[ast.arg]:
+    """All named parameters but the instance or class that a method begins with."""
+    a = function.args
+    named = [*a.posonlyargs, *a.args, *a.kwonlyargs]
+    return named[1:] if named and named[0].arg in ("self", "cls") else named
+
+
+def _is_verb(path: Path, function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """Whether typer calls a function of the command line: its parameters are annotated as options or arguments."""
+    names = [
+        node.attr if isinstance(node, ast.Attribute) else node.id
+        for one in _parameters(function)
+        for node in ast.walk(one)
+        if isinstance(node, ast.Attribute | ast.Name)
+    ]
+    return bool({"cli", "commands"} & set(path.parts)) and any(
+        name.endswith(("Option", "Argument")) for name in names
+    )
+
+
 def kernel_arguments() -> dict[str, list[str]]:
     """Of each module, the kernels that have too many arguments, and how many."""
     found: dict[str, list[str]] = defaultdict(list)
@@ -548,7 +590,7 @@ def modules_with_law_names() -> list[str]:
 
 def main() -> int:
     """Print all figures; 1 where one is beyond its limit."""
-    sizes = [module_figure(), function_figure(), *argument_figures()]
+    sizes = [module_figure(), function_figure(), *parameter_figures(), *argument_figures()]
     figures = [*sizes, circle_figure(), *path_figures()]
     for figure in figures:
         print(f"{'ok  ' if figure.within else 'OVER'} {figure.name}: {figure.value} (limit {figure.limit})")

@@ -24,6 +24,31 @@ def test_no_function_is_beyond_its_limit():
     assert house.function_figure().items == ()
 
 
+def test_functions_have_few_parameters():
+    """Verbs of the command line that have more only become fewer: whoever takes one away lowers `VERBS`."""
+    others, verbs = house.parameter_figures()
+    assert others.items == ()
+    assert verbs.value == house.VERBS, verbs.items
+
+
+def test_every_function_but_a_verb_has_its_parameters_counted(tmp_path, monkeypatch):
+    module = tmp_path / "service/stereoservo/cli/module.py"
+    module.parent.mkdir(parents=True)
+    ten = ", ".join("abcdefghij")
+    module.write_text(
+        f"def few({ten}): ...\ndef many(z, /, {ten}): ...\ndef by_name(a, *, b, c, d, e, f, g, h, i, j, k): ...\n"
+        f"class One:\n    def few(self, {ten}): ...\n    async def many(self, z, {ten}): ...\n"
+        f"def verb(z: TextOption, {ten}): ...\n"
+    )
+    monkeypatch.setattr(house, "ROOT", tmp_path)
+    monkeypatch.setattr(house, "PRODUCT", (module.parents[1],))
+    others, verbs = (
+        [item.partition(" ")[2] for item in figure.items] for figure in house.parameter_figures()
+    )
+    assert sorted(others) == ["by_name: 11", "many: 11", "many: 11"]
+    assert verbs == ["verb: 11"]
+
+
 def test_kernels_have_few_arguments():
     """Those of the core that have more only become fewer: whoever takes one away lowers `CORE_KERNELS`."""
     core, elsewhere = house.argument_figures()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo.calibration.bundle_adjustment import jacobian, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, jacobian, solve
 from stereoservo.calibration.bundle_statistics import rank_of
 from stereoservo.calibration.normal_equations import (
     CHUNK,
@@ -202,6 +202,6 @@ def test_robust_loss_shrugs_off_outliers(arms):
     data.pixels[wrong] += rng.uniform(-30, 30, (int(wrong.sum()), 2))
     rig = euclidean_rig(cell)
     plain = solve(rig, data, "metric")
-    robust = solve(rig, data, "metric", loss="cauchy", loss_scale=2.0)
+    robust = solve(rig, data, "metric", loss=RobustLoss("cauchy", 2.0))
     errors = [np.sqrt(np.mean((predicted(fit.rig, data) - exact) ** 2)) for fit in (plain, robust)]
     assert errors[1] < 0.05 < errors[0]

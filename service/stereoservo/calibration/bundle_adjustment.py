@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,6 @@ from stereoservo.kinematics.model import Stratum
 from stereoservo.kinematics.parameterization import LensModel, conjugation
 from stereoservo.numerics.arrays import FloatArray
 
-Loss = Literal["linear", "soft_l1", "cauchy"]
-
 GRADIENT = 1e-6
 """Largest entry of the gradient on unit columns at which a bundle has converged: it moves no parameter by a notable
 part of its deviation."""
@@ -51,6 +49,13 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-14, 1e10
 """Levenberg-Marquardt: added to the diagonal of ones."""
 FREE_DAMPING = 1e-2
 """Damping up to which a step's predicted decrease estimates the distance to the minimum."""
+
+
+class RobustLoss(NamedTuple):
+    """Loss by iteratively re-weighted least squares, in which residuals beyond ``scale`` [sigmas] count less."""
+
+    kind: Literal["soft_l1", "cauchy"]
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -135,27 +140,26 @@ def solve(
     cameras: bool = True,
     points: bool = True,
     lenses: LensModel = "none",
-    loss: Loss = "linear",
-    loss_scale: float = 1.0,
+    loss: RobustLoss | None = None,
     max_evaluations: int = 100,
     tolerance: float = 1e-10,
 ) -> Solution:
     """Least-squares bundle over the minimal charts of ``stratum`` by Levenberg-Marquardt, re-linearised at every
     step.
 
-    Columns are scaled to unit length. ``loss_scale`` [sigmas] for the robust losses, which are re-weighted
-    iteratively. ``tolerance``: decrease, relative to the cost, below which nothing is left to gain. Raises
-    LinAlgError where the start has no finite residuals. Never raises on a bad fit: look at ``converged`` and
-    ``cost``. Where the joints have noise, their errors are estimated with the parameters, from ``data``'s on.
+    Columns are scaled to unit length. ``loss``: None for plain least squares. ``tolerance``: decrease, relative to the
+    cost, below which nothing is left to gain. Raises LinAlgError where the start has no finite residuals. Never raises
+    on a bad fit: look at ``converged`` and ``cost``. Where the joints have noise, their errors are estimated with the
+    parameters, from ``data``'s on.
     """
     ordered, _ = by_stop(data)
-    weights = _weights(loss, loss_scale)
+    weights = _weights(loss)
 
     def charts_at(rig: RigModel) -> Charts:
         return full_charts(rig, stratum, generators=generators, cameras=cameras, points=points, lenses=lenses)
 
     def cost_at(rig: RigModel, charts: Charts, here: Measurements) -> float:
-        pixels = _loss(residuals(rig, here), loss, loss_scale) + _cost_of_errors(here)
+        pixels = _loss(residuals(rig, here), loss) + _cost_of_errors(here)
         return pixels + float((prior_rows(rig, charts, data)[:, -1] ** 2).sum())
 
     charts = charts_at(rig)
@@ -223,20 +227,22 @@ def _cost_of_errors(data: Measurements) -> float:
     return 0.0 if data.joint_errors is None else data.joint_errors.cost
 
 
-def _loss(error: FloatArray, loss: Loss, scale: float) -> float:
+def _loss(error: FloatArray, loss: RobustLoss | None) -> float:
     """``Σ s² ρ(e²/s²)`` of residuals (2 k,)."""
-    if loss == "linear":
+    if loss is None:
         return float(error @ error)
+    kind, scale = loss
     square = (error / scale) ** 2
-    if loss == "soft_l1":
+    if kind == "soft_l1":
         return float(2.0 * scale**2 * (np.sqrt(1.0 + square) - 1.0).sum())
     return float(scale**2 * np.log1p(square).sum())
 
 
-def _weights(loss: Loss, scale: float) -> Weights | None:
+def _weights(loss: RobustLoss | None) -> Weights | None:
     """IRLS weights ``ρ'(e²/s²)`` of squared residuals; None for plain least squares."""
-    if loss == "linear":
+    if loss is None:
         return None
-    if loss == "soft_l1":
+    kind, scale = loss
+    if kind == "soft_l1":
         return lambda square: np.asarray(1.0 / np.sqrt(1.0 + square / scale**2))
     return lambda square: np.asarray(1.0 / (1.0 + square / scale**2))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
 from stereoservo.calibration.joint_errors.joint_noise import stop_rows
 from stereoservo.calibration.lens_estimation import straightened
 from stereoservo.calibration.lens_significance import FREE_LENS, lens_test, lens_wanted
@@ -33,7 +33,7 @@ def projective_bundle(
     decided: bool,
 ) -> tuple[Solution, BoolArray]:
     """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
-    robust = solve(rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
+    robust = solve(rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4)
     for _ in range(2 if options.lens == "auto" else 0):
         # Before anything is called an outlier: distortion makes many of them.
         here = every.corrected(robust.data.joint_errors)
@@ -43,7 +43,7 @@ def projective_bundle(
             break
         lenses = wanted
         robust = solve(
-            robust.rig, clean, "projective", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-4
+            robust.rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4
         )
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.

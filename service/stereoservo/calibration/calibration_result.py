@@ -5,6 +5,7 @@ report of the fit (cameras, lenses, outliers).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,6 +29,7 @@ from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
@@ -150,25 +152,38 @@ class CalibrationFit(msgspec.Struct, frozen=True, eq=False):
     report: CalibrationReport
 
 
+class ModelFrame(NamedTuple):
+    """Joint positions ``zero`` (n,) at which the generators stand, and ``plane`` (4,) at infinity in the projective
+    frame.
+    """
+
+    zero: FloatArray
+    plane: FloatArray
+
+
+class FitHistory(NamedTuple):
+    """What preceded a final bundle: cost and degrees of freedom of the ``projective`` one, notes, markers left out."""
+
+    projective: tuple[float, int]
+    notes: tuple[str, ...]
+    markers_left_out: tuple[int, ...] = ()
+
+
 def build_fit(
     trials: TrialData,
     solution: Solution,
     every: Measurements,
     inliers: BoolArray,
-    zero: FloatArray,
-    plane: FloatArray,
-    normaliser: FloatArray,
+    frame: ModelFrame,
+    history: FitHistory,
     *,
     epoch: int,
     created: str,
-    notes: tuple[str, ...],
-    projective: tuple[float, int],
-    markers_left_out: tuple[int, ...],
     components: VarianceComponents | None = None,
     exact_joints_chance: float = 0.0,
 ) -> CalibrationFit:
-    """Model and report of a solved bundle; ``plane`` (4,) at infinity in the projective frame; ``components``: of its
-    joint noise, or where readings are exact with some chance of the noise stated beside them. Raises CalibrationError.
+    """Model and report of a solved bundle; ``components``: of its joint noise, or where readings are exact with some
+    chance of the noise stated beside them. Raises CalibrationError.
     """
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
@@ -201,7 +216,7 @@ def build_fit(
         joints=tuple(_joint_statistics(trials, j, group, data) for j in range(len(trials.joint_names))),
         images=trials.images,
     )
-    model = build_model(trials, solution, zero, plane, normaliser, statistics, epoch, created)
+    model = build_model(trials, solution, frame, statistics, epoch, created)
     if components is not None:
         model = msgspec.structs.replace(model, joint_accuracy=_accuracy(components))
     shown = variances[np.isfinite(variances)] / 2 * noise_factor(solution)
@@ -213,8 +228,8 @@ def build_fit(
         degrees_of_freedom=freedom,
         chi2_ok=statistics.chi2_ok,
         sigma_factor=float(np.sqrt(variance_factor(solution))),
-        projective_chi2=projective[0],
-        projective_degrees_of_freedom=projective[1],
+        projective_chi2=history.projective[0],
+        projective_degrees_of_freedom=history.projective[1],
         prediction_rms_px=float(np.sqrt(shown.mean())),
         prediction_max_px=float(np.sqrt(shown.max())),
         cameras=tuple(
@@ -223,8 +238,8 @@ def build_fit(
         ),
         outliers=_outliers(trials, solution.rig, every.corrected(solution.data.joint_errors), inliers),
         left_intrinsics_std=_left_intrinsics_std(solution) if solution.stratum == "metric" else None,
-        markers_left_out=markers_left_out,
-        notes=notes,
+        markers_left_out=history.markers_left_out,
+        notes=history.notes,
         lens=LensReport(solution.lenses, tested.chi2, tested.freedom, tested.limit),
         joints=() if components is None else _joint_errors(trials, components, by_joint),
         exact_joints_chance=exact_joints_chance,
@@ -300,23 +315,22 @@ def completed(result: CalibrationFit, trials: TrialData) -> CalibrationFit:
 def build_model(
     trials: TrialData,
     solution: Solution,
-    zero: FloatArray,
-    plane: FloatArray,
-    normaliser: FloatArray,
+    frame: ModelFrame,
     statistics: FitStatistics,
     epoch: int,
     created: str,
 ) -> CellModel:
     """Model in the canonical projective frame: ``P_left = [N⁻¹ | 0]``, points scaled to 1 by the plane at infinity."""
-    rig, stratum = solution.rig, solution.stratum
+    rig, stratum, plane = solution.rig, solution.stratum, frame.plane
+    normaliser = pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height)
     if stratum == "projective":
-        frame: FloatArray = np.eye(4)
+        to_projective: FloatArray = np.eye(4)
     elif stratum == "affine":
-        frame = affine_to_projective(plane)
+        to_projective = affine_to_projective(plane)
     else:
-        frame = euclidean_to_projective(plane, normaliser @ rig.cameras[0][:, :3])
-    back: FloatArray = np.asarray(np.linalg.inv(frame), dtype=np.float64)
-    points = rig.points @ frame.T
+        to_projective = euclidean_to_projective(plane, normaliser @ rig.cameras[0][:, :3])
+    back: FloatArray = np.asarray(np.linalg.inv(to_projective), dtype=np.float64)
+    points = rig.points @ to_projective.T
     points = points / (points @ plane)[:, None]
     cameras = rig.cameras @ back
     cameras[0] = np.hstack([np.linalg.inv(normaliser), np.zeros((3, 1))])
@@ -327,8 +341,8 @@ def build_model(
         epoch=epoch,
         joint_names=trials.joint_names,
         joint_kinds=trials.joint_kinds,
-        zero=zero,
-        generators=frame @ rig.generators @ back,
+        zero=frame.zero,
+        generators=to_projective @ rig.generators @ back,
         cameras=tuple(
             CameraModel(camera.name, matrix, camera.width, camera.height, lens[: _lens_size(solution)])
             for camera, matrix, lens in zip(trials.cameras, cameras, rig.lenses, strict=True)
@@ -341,7 +355,7 @@ def build_model(
         statistics=statistics,
         created=created,
         source="trial motions",
-        covariance=_covariance(solution, frame, back, cameras, points),
+        covariance=_covariance(solution, to_projective, back, cameras, points),
     )
     try:
         check_model(model)

@@ -13,14 +13,20 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
 from stereoservo.calibration.bundle_inliers import (
     projective_bundle,
     refine_to_convergence,
     with_whole_stops,
 )
 from stereoservo.calibration.bundle_statistics import chi2_within, degrees_of_freedom
-from stereoservo.calibration.calibration_result import CalibrationFit, build_fit, completed
+from stereoservo.calibration.calibration_result import (
+    CalibrationFit,
+    FitHistory,
+    ModelFrame,
+    build_fit,
+    completed,
+)
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
 from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
 from stereoservo.calibration.diagnosis.input_corrections import Refit
@@ -68,7 +74,6 @@ from stereoservo.calibration.single_joint_fit import (
 )
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
-from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import LensModel
@@ -375,14 +380,14 @@ def _fit(
         bundles.final,
         start.every,
         bundles.inliers,
-        start.zero,
-        bundles.raised.plane,
-        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
+        ModelFrame(start.zero, bundles.raised.plane),
+        FitHistory(
+            (bundles.projective.cost, degrees_of_freedom(bundles.projective)),
+            bundles.raised.notes,
+            start.markers_left_out,
+        ),
         epoch=epoch,
         created=created,
-        notes=bundles.raised.notes,
-        projective=(bundles.projective.cost, degrees_of_freedom(bundles.projective)),
-        markers_left_out=start.markers_left_out,
         components=components,
         exact_joints_chance=chance,
     )
@@ -434,7 +439,7 @@ def _start(
         lens_priors=prior_of_lenses(trials, priors),
     )
     clean = every.select(usable[every.camera, every.stop, every.marker])
-    linked = solve(rig, clean, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, tolerance=1e-4)
+    linked = solve(rig, clean, "projective", cameras=False, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4)
     decided = options.lens != "auto" or bool(priors) or bend is not None
     return _Start(trials, zero, linked, every, clean, lens_model, decided, left_out)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, solve
 from stereoservo.calibration.generator_initialization import (
     common_points,
     linear_generator,
@@ -378,8 +378,7 @@ def _solve_from(
             data,
             "projective",
             cameras=False,
-            loss="soft_l1",
-            loss_scale=3.0,
+            loss=RobustLoss("soft_l1", 3.0),
             max_evaluations=evaluations,
         )
     except np.linalg.LinAlgError:

@@ -13,7 +13,7 @@ from scipy.stats import f as f_distribution
 
 from stereoservo.calibration import stratum_upgrade
 from stereoservo.calibration.alternative_axes import with_other_axes
-from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
 from stereoservo.calibration.bundle_statistics import (
     covariance_root,
     generator_noise,
@@ -300,7 +300,7 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
                 exact,
                 "metric",
                 cameras=False,
-                loss="soft_l1",
+                loss=RobustLoss("soft_l1"),
                 max_evaluations=20,
                 tolerance=1e-2,
             )

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
 from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
@@ -116,7 +116,7 @@ def _best_factor(
             noise * observations.sigmas[observations.usable].ravel(),
         )
         return solve(
-            rig, data, "projective", cameras=False, loss="soft_l1", loss_scale=2.0, max_evaluations=40
+            rig, data, "projective", cameras=False, loss=RobustLoss("soft_l1", 2.0), max_evaluations=40
         ).residuals
 
     def cost(log_factor: float, rig: RigModel) -> float:

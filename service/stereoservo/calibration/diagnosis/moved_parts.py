@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
 from stereoservo.calibration.bundle_statistics import degrees_of_freedom
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
@@ -123,8 +123,7 @@ def _solved_with_moved(start: Solution, moved: Sequence[int], stop: int) -> Solu
         replace(data, camera=camera),
         "projective",
         lenses=start.lenses,
-        loss="soft_l1",
-        loss_scale=LOSS_SIGMAS,
+        loss=RobustLoss("soft_l1", LOSS_SIGMAS),
         max_evaluations=EVALUATIONS,
         tolerance=1e-6,
     )

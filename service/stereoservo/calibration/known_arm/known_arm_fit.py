@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
 from stereoservo.calibration.bundle_inliers import refine_to_convergence, with_whole_stops
 from stereoservo.calibration.bundle_statistics import degrees_of_freedom, variance_factor
-from stereoservo.calibration.calibration_result import CalibrationFit, build_fit
+from stereoservo.calibration.calibration_result import CalibrationFit, FitHistory, ModelFrame, build_fit
 from stereoservo.calibration.diagnosis.fit_refusal import refuse_undetermined
 from stereoservo.calibration.joint_errors.joint_noise import StopFactor, orthogonal_factor
 from stereoservo.calibration.joint_errors.variance_components import (
@@ -110,14 +110,10 @@ def fit_with_known_arm(
         in_first_camera(found.solution),
         every,
         found.inliers,
-        np.zeros(len(trials.joint_names)),
-        NOMINAL_PLANE,
-        pixel_normaliser(trials.cameras[0].width, trials.cameras[0].height),
+        ModelFrame(np.zeros(len(trials.joint_names)), NOMINAL_PLANE),
+        FitHistory((found.solution.cost, degrees_of_freedom(found.solution)), _notes(factor)),
         epoch=epoch,
         created=created,
-        notes=_notes(factor),
-        projective=(found.solution.cost, degrees_of_freedom(found.solution)),
-        markers_left_out=(),
         components=found.components,
     )
     return CalibrationFit(result.model, msgspec.structs.replace(result.report, sigma_factor=factor))
@@ -149,7 +145,7 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
         bent, lenses = starting_lenses(trials, options.lens, priors)
         rig = replace(rig, lenses=np.pad(bent, ((0, 0), (0, 7 - bent.shape[1]))))
     try:
-        robust = solve(rig, every, "metric", lenses=lenses, loss="soft_l1", loss_scale=2.0, tolerance=1e-6)
+        robust = solve(rig, every, "metric", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
         solution, inliers = refine_to_convergence(robust.rig, every, "metric", options, lenses, ROUGHLY)
         found = _with_errors(_ErrorsSeen(solution, every, inliers, None), at, options)
     except np.linalg.LinAlgError as error:
@@ -345,7 +341,7 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
             points=to_homogeneous(points) @ np.linalg.inv(to_unit).T,
         )
         try:
-            solution = solve(there, every, "metric", loss="soft_l1", loss_scale=2.0, tolerance=1e-6)
+            solution = solve(there, every, "metric", loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
         except np.linalg.LinAlgError:
             continue  # a guess with points in a focal plane
         robust = float(np.sqrt(1.0 + residuals(solution.rig, every) ** 2).sum())
