@@ -262,7 +262,7 @@ def incidence_kernel(
     and a `SecondTask`.
     """
     held, rest = Constraints(*constraints), SecondTask(*second)
-    tolerance_px, gain, dt_s, damping, metric = regulation
+    tolerance_px, gain, dt_s, damping, metric = Regulation(*regulation)
     n, count = arm[0].shape[0], held.kinds.shape[0]
     velocity = np.zeros(n)
     status = np.zeros(count, dtype=np.int64)

@@ -187,9 +187,9 @@ def stereo_cycle(
     The fields of a `StereoArm`, with those of its chain, of a `Sighted` and of `CycleOptions`; ``target_points``
     (m, 4).
     """
-    chain, squares, matrices, marker_points = arm
-    pixels, set_points, weights = sighted
-    gain, damping, mean, triangulations = options
+    chain, squares, matrices, marker_points = StereoArm(*arm)
+    pixels, set_points, weights = Sighted(*sighted)
+    gain, damping, mean, triangulations = CycleOptions(*options)
     n, cameras, markers = q.shape[0], matrices.shape[0], marker_points.shape[0]
     generators, kinds, zero, tip_first = chain
     E, B = np.empty((n, 4, 4)), np.empty((n + 1, 4, 4))

@@ -160,41 +160,6 @@ class SafetyResult(msgspec.Struct, frozen=True, eq=False):
     braking: bool = False
 
 
-def safety_stage(inputs: SafetyInputs, limits: SafetyLimits) -> SafetyResult:
-    """Limit one command.
-
-    The output is finite and, for any ``raw``, within velocity and acceleration limits, the latter relative to
-    ``previous`` (which, where it was no output of this stage, counts as scaled to the velocity limits;
-    non-finite entries as rest). A joint that started inside its margins at a speed it can brake from never
-    leaves them; one outside moves only inward; keep-out boxes are never entered. The output is a non-negative
-    multiple of ``raw`` unless positions, acceleration or braking acted; then the joint that must brake does
-    so fully, at the cost of direction. Raises SafetyConfigurationError for a period that is not positive or
-    arrays of a wrong length.
-    """
-    raw, positions, previous = inputs.raw, inputs.positions, inputs.previous
-    n = len(limits.joint_names)
-    if not raw.shape == positions.shape == previous.shape == (n,):
-        raise SafetyConfigurationError(
-            f"raw {raw.shape}, positions {positions.shape}, previous {previous.shape}; each must be ({n},)"
-        )
-    if not 0.0 < inputs.dt_s < math.inf:
-        raise SafetyConfigurationError(
-            f"dt_s is {inputs.dt_s}; a positive finite period is needed", dt_s=inputs.dt_s
-        )
-    limited, acted = np.empty(n), np.empty(n)
-    told, found = limit_velocity(
-        Wanted(
-            np.ascontiguousarray(raw, dtype=np.float64), np.ascontiguousarray(positions, dtype=np.float64),
-            np.ascontiguousarray(previous, dtype=np.float64), inputs.brake, inputs.dt_s, inputs.joint_age_s,
-            inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
-        ),
-        Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted,
-    )  # fmt: skip
-    if not told:
-        return SafetyResult(raw, limited)
-    return explained(inputs, limits, limited, found, acted)
-
-
 def explained(
     inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: LimitsFound, acted: FloatArray
 ) -> SafetyResult:

@@ -186,7 +186,8 @@ def move(context: StepContext) -> None:
     """Stage 5: the active source's velocity, into the workspace."""
     state, derived = context.state, context.derived
     step, goal = derived.motion
-    output = drive(state.source, context) if context.goes_on else step(state.source, context)
+    source: Any = state.source
+    output = drive(source, context) if context.goes_on else step(source, context)
     if output is not None:
         _take(output, context)
     if state.friction_of != goal:

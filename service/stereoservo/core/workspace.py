@@ -207,9 +207,10 @@ class Workspace:
     tolerance and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those
     that laws take; ``aim`` and ``faced``: of which goal and face they are.
 
-    Of the motion: the source's ``velocity`` (n,), what else `core.context.SourceOutput` says of it, and ``raw`` (n,), with what
-    friction takes. What `core.limit` has found: ``finite`` to ``shared_by``, ``acted`` (n,), ``previous`` (n,) the
-    command before. ``result`` (1 + 3n,): what recordings keep of a step, see `core.cycle.StepResult`. ``arrays``: all arrays by name.
+    Of the motion: the source's ``velocity`` (n,), what else `core.context.SourceOutput` says of it, and ``raw``
+    (n,), with what friction takes. What `core.limit` has found: ``finite`` to ``shared_by``, ``acted`` (n,),
+    ``previous`` (n,) the command before. ``result`` (1 + 3n,): what recordings keep of a step, see
+    `core.cycle.StepResult`. ``arrays``: all arrays by name.
     """
 
     def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:

@@ -110,11 +110,11 @@ class Inputs:
         """By which the core's time is off."""
         self.stamps_ns = 0
         """By which the stamps of all that it is told are off."""
-        read, step = cell.joints.read_state, cell.core.step
+        read, advance = cell.joints.read_state, cell.core.advance
         cell.joints.read_state = lambda: self.joints.passed(read())  # type: ignore[method-assign]
         for camera, one in zip(cell.cameras, self.cameras, strict=True):
             camera.poll = _polled(camera.poll, one)  # type: ignore[method-assign,arg-type]
-        cell.core.step = lambda inputs: step(self._shifted(inputs))  # type: ignore[method-assign]
+        cell.core.advance = lambda inputs: advance(self._shifted(inputs))  # type: ignore[method-assign]
 
     def _shifted(self, inputs: StepInputs) -> StepInputs:
         joints, d = inputs.joints, UPTIME_NS + self.stamps_ns
