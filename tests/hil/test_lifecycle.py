@@ -175,7 +175,7 @@ def test_a_goal_outlives_gateways_that_die_and_what_dies_meanwhile_is_told_once(
     """
     moved_away(own)
     goal = own.goal("park", gain=0.05, time_limit_s=300.0, tolerance_px=0.01, lease_s=1.0)
-    deaths = []
+    deaths = [text.partition(" (")[0] for text in told(directories, "process_ended")]  # of tests before
     for victim in ("gateway", "gateway", "vision-left"):
         old = processes(directories)[victim]
         os.kill(old, signal.SIGKILL)

@@ -139,6 +139,7 @@ class ServoCore:
         self._context = StepContext(self.state, settings, self._derived, NO_INPUTS)
         self.newest = NewestStep(self._context, self._limits)
         self._arranged = self._attends = False
+        self._source = self.state.source
         self._lease_until_ns = 0
 
     def _put_limits(self) -> None:
@@ -184,7 +185,7 @@ class ServoCore:
     def _prepare(self, context: StepContext) -> None:
         """What comes before a step: the driver's lifecycle is followed, and a model that waits is taken."""
         state, inputs, work = context.state, context.inputs, self._derived.room.numbers
-        if not self._arranged:
+        if not self._arranged or state.source is not self._source:
             self._arrange(context)
         work.active_before = work.active
         lifecycle = Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE
@@ -210,4 +211,4 @@ class ServoCore:
     def _arrange(self, context: StepContext) -> None:
         arrange(context)
         self._attends, self._lease_until_ns = attends(context), lease_until_ns(context.state.source)
-        self._arranged = True
+        self._arranged, self._source = True, context.state.source

@@ -96,7 +96,7 @@ function watch() {
   link.age = Math.max(server, cell);
   const means = flight ? "" : ": what is shown is old. Stop the arm with the emergency stop, or `stereoservo stop`.";
   banner("link", link.why ? `The daemon does not answer: ${link.why}` : !link.lost ? ""
-    : server > LOST_S ? `No word from the page's server${means}` : `No word from the cell${means}`, true);
+    : server > LOST_S / 2 ? `No word from the page's server${means}` : `No word from the cell${means}`, true);
   document.body.classList.toggle("lost", link.lost);
   $("commands").disabled = !rights.holds || link.lost;
   showHead();
