@@ -147,7 +147,7 @@ MOTION_SOURCES: dict[type[Any], MotionSource] = {
 }  # fmt: skip
 
 
-NO_MOTION: Motion = (_rest, "")
+AT_REST: Motion = (_rest, "")
 
 
 def goal_of(source: Source) -> str:
@@ -173,7 +173,7 @@ def arrange_motion(context: StepContext) -> None:
     kind = MOTION_SOURCES[type(source)]
     moves = bool(work.active) and not work.paused
     by_law = moves and kind.runs_law
-    derived.motion = (kind.step, kind.goal(source)) if moves else NO_MOTION
+    derived.motion = (kind.step, kind.goal(source)) if moves else AT_REST
     work.rests, work.needs_features = not by_law, by_law
     work.speed_scale = source.goal.speed_scale * scale if by_law else scale  # type: ignore[union-attr]
     work.runs = moves and kind.examine is not None

@@ -40,7 +40,7 @@ from stereoservo.core.move import move
 from stereoservo.core.observe import observe
 from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CoreState, Holding, ServoGoal, initial_state
+from stereoservo.core.state import CoreState, Holding, ServoGoal, Source, initial_state
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Prior
@@ -138,8 +138,9 @@ class ServoCore:
         self._put_limits()
         self._context = StepContext(self.state, settings, self._derived, NO_INPUTS)
         self.newest = NewestStep(self._context, self._limits)
-        self._arranged = self._attends = False
-        self._source = self.state.source
+        self._arranged: Source | None = None
+        """The source for which the workspace is arranged; None: Python has changed what it likes since."""
+        self._attends = False
         self._lease_until_ns = 0
 
     def _put_limits(self) -> None:
@@ -180,12 +181,12 @@ class ServoCore:
         command(state.block.record, room.record, self._limits.keep_outs)
         finish_step(context, self._limits)
         if context.output is not None:  # Python has moved the arm, and may have changed what it likes
-            self._arranged = False
+            self._arranged = None
 
     def _prepare(self, context: StepContext) -> None:
         """What comes before a step: the driver's lifecycle is followed, and a model that waits is taken."""
         state, inputs, work = context.state, context.inputs, self._derived.room.numbers
-        if not self._arranged or state.source is not self._source:
+        if state.source is not self._arranged:
             self._arrange(context)
         work.active_before = work.active
         lifecycle = Lifecycle.ACTIVE if inputs.driver_active else Lifecycle.INACTIVE
@@ -206,9 +207,9 @@ class ServoCore:
         monitor(context)
         execute_goals(context)
         self._arrange(context)
-        self._arranged = False  # what is decided may bring something with the next step
+        self._arranged = None  # what is decided may bring something with the next step
 
     def _arrange(self, context: StepContext) -> None:
         arrange(context)
         self._attends, self._lease_until_ns = attends(context), lease_until_ns(context.state.source)
-        self._arranged, self._source = True, context.state.source
+        self._arranged = context.state.source

@@ -89,7 +89,6 @@ class Numbers(ctypes.Structure):
     learning: int
     rounds_apart: int
     quiet: int
-    attend_ns: int
     paused: int
     aims: int
     markers_needed: int
@@ -110,8 +109,6 @@ class Numbers(ctypes.Structure):
     jacobian_choice: int
     compensates: int
     needs_features: int
-    damping: float
-    redundant: int
     speed_scale: float
     runs: int
     features_ns: int
