@@ -17,13 +17,13 @@ from stereoservo_sim.benchmarks.cycle import drive
 from stereoservo_sim.world.synthetic import rx90
 
 PACKAGE = str(Path(stereoservo.__file__).parent)
-LINES = {"stereo": 130, "cartesian3": 135, "trajectory": 450}
-"""Of Python that a step between frames may run, kernels apart (117, 121, 406 when this was written; 242, 251, 513 by
+LINES = {"stereo": 105, "cartesian3": 110, "trajectory": 450}
+"""Of Python that a step between frames may run, kernels apart (92, 96, 417 when this was written; 242, 251, 513 by
 the fast path that was beside the stages, with the outputs that it made in every step; 388, 397, 508 by the stages).
 """
 
-FRAME_LINES = {"stereo": 160, "cartesian3": 190}
-"""Likewise of a step with frames of two cameras (142, 168 when this was written; 439, 484 by the fast path)."""
+FRAME_LINES = {"stereo": 130, "cartesian3": 160}
+"""Likewise of a step with frames of two cameras (117, 143 when this was written; 439, 484 by the fast path)."""
 
 
 def lines_of(loop: CoreLoop) -> int:

@@ -96,9 +96,9 @@ class StepContext:
 
     `core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) of
     the markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at most,
-    for it is work. ``goes_on``: the goal of a law's kernel does, as observed. ``output``: what a motion source in
-    Python has given; None where a kernel has moved the arm, or nothing did. ``moved_arrays``: the model with a body
-    that is a target where it is now.
+    for it is work. ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few
+    markers. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing
+    did. ``moved_arrays``: the model with a body that is a target where it is now.
     """
 
     def __init__(

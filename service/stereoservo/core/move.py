@@ -148,6 +148,7 @@ MOTION_SOURCES: dict[type[Any], MotionSource] = {
 
 
 AT_REST: Motion = (_rest, "")
+"""Of a source that does not move the arm."""
 
 
 def goal_of(source: Source) -> str:
@@ -165,8 +166,8 @@ def paused(state: CoreState) -> bool:
 
 
 def arrange_motion(context: StepContext) -> None:
-    """What stands of the motion, into the workspace: whether the active source moves the arm, no matter by which
-    velocity. It does not while it is paused, and outside ACTIVE, where `execute_goals` ends it.
+    """Write into the workspace what holds until the active source changes: whether and how it moves the arm, but not
+    its velocity. It does not move while it is paused, and outside ACTIVE, where `execute_goals` ends it.
     """
     state, derived = context.state, context.derived
     work, source, scale = derived.room.numbers, state.source, context.settings.limits.speed_scale
@@ -183,21 +184,21 @@ def arrange_motion(context: StepContext) -> None:
 
 
 def move(context: StepContext) -> None:
-    """Stage 5: the active source's velocity, into the workspace."""
+    """Stage 5: write the velocity of the active source into the workspace."""
     state, derived = context.state, context.derived
     step, goal = derived.motion
     source: Any = state.source
     output = drive(source, context) if context.goes_on else step(source, context)
     if output is not None:
-        _take(output, context)
+        _put_output(output, context)
     if state.friction_of != goal:
         state.friction_of = goal
         if goal:
             begin_friction(state.block.record, derived.room.record)
 
 
-def _take(output: SourceOutput, context: StepContext) -> None:
-    """What a motion source in Python has given, into the workspace."""
+def _put_output(output: SourceOutput, context: StepContext) -> None:
+    """Write the output of a motion source in Python into the workspace."""
     context.output, room = output, context.derived.room
     work = room.numbers
     room.velocity[:] = output.velocity

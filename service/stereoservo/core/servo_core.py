@@ -49,7 +49,7 @@ PRIOR_RATE_HZ = 125.0
 LOOK_EVERY_S = 0.2
 """Between two examinations of why a law is slow or stuck."""
 BY_KERNELS = (ServoGoal, Holding)
-"""Motion sources that do not look at the inputs of a step."""
+"""Motion sources whose steps do not read the inputs."""
 NO_INPUTS = StepInputs(0, 0, None)
 
 
@@ -139,7 +139,7 @@ class ServoCore:
         self._context = StepContext(self.state, settings, self._derived, NO_INPUTS)
         self.newest = NewestStep(self._context, self._limits)
         self._arranged: Source | None = None
-        """The source for which the workspace is arranged; None: Python has changed what it likes since."""
+        """The source for which the workspace is arranged; None: it may be out of date."""
         self._attends = False
         self._lease_until_ns = 0
 

@@ -143,7 +143,7 @@ def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None
 
 
 def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
-    """The velocity of a goal that goes on, into the workspace, by the kernel of its law; None unless that fails."""
+    """Write the velocity of an active goal into the workspace by the kernel of its law; returns None unless it fails."""
     room, law = context.derived.room, context.derived.laws[source.law]
     if law.components:
         show_face(source, context)
@@ -298,7 +298,7 @@ def _measure(
 
 @kernel
 def follow_goal(block: Record, room: Record) -> bool:
-    """Whether the goal in the ``room`` goes on; its error and body, as in `GoalError`, the gain there, and what
+    """Whether the goal in the ``room`` stays active; its error and body, as in `GoalError`, the gain there, and what
     `account_run` has found; at the end of what is observed in a step.
     """
     memory, work = block[0], room[0]
