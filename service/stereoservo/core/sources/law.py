@@ -143,7 +143,7 @@ def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None
 
 
 def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
-    """Write the velocity of an active goal into the workspace by the kernel of its law; returns None unless it fails."""
+    """Write the velocity of an active goal into the workspace by its law's kernel; returns None unless it fails."""
     room, law = context.derived.room, context.derived.laws[source.law]
     if law.components:
         show_face(source, context)
