@@ -40,6 +40,13 @@ COMMANDS = (
 COMPILED_S = 900.0
 
 
+def wait_compiled(client: Client) -> None:
+    """Wait until a cell has all kernels, which the first start on a computer compiles. Raises TimedOutError."""
+    client.wait_state(
+        lambda state: all(reason.code != "COMPILING" for reason in state.reasons), "all kernels", COMPILED_S
+    )
+
+
 def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``first``, ``second``: start of the demo's cell with an empty and with the full cache. ``kernels``: what the
     first compiled. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
@@ -114,10 +121,7 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
                 pids = {daemon.process.pid, *processes_of(cell_directories(info.cell).runtime).values()}
                 others = sum(_cpu_of(pid) for pid in pids)
                 client.disable()
-                state = client.wait_state(
-                    lambda state: all(reason.code != "COMPILING" for reason in state.reasons),
-                    "all kernels", COMPILED_S,
-                )  # fmt: skip
+                wait_compiled(client)
             compiled = time.monotonic()
             code = daemon.stop()
     except (ClientError, DaemonError) as error:

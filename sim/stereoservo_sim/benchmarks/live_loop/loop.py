@@ -30,7 +30,7 @@ from stereoservo.messages.directories import (
 from stereoservo.messages.discovery import DaemonError, DaemonProcess
 from stereoservo.numerics.arrays import IntArray
 from stereoservo_sim.benchmarks.service_bench import processes_of
-from stereoservo_sim.benchmarks.startup import environment
+from stereoservo_sim.benchmarks.startup import environment, wait_compiled
 from stereoservo_sim.benchmarks.timing import stolen_share, stolen_ticks
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.experiments.experiment import ExperimentError
@@ -109,7 +109,8 @@ def _of_daemon(
 
 @contextmanager
 def running_cell(folder: Path, text: str, seed: int, environ: dict[str, str]) -> Iterator[CellDirectories]:
-    """The daemon of a cell file like the demonstration's, with an exact model; ``environ``: for its processes.
+    """The daemon of a cell file like the demonstration's, with an exact model and all kernels; ``environ``: for its
+    processes.
 
     Raises ExperimentError where it does not come up.
     """
@@ -124,7 +125,9 @@ def running_cell(folder: Path, text: str, seed: int, environ: dict[str, str]) ->
             model = exact_simulated_model(demo_cell(), seed)
             (directories.models / f"model-{model.epoch:06d}.json").write_bytes(encode_model(model))
             with DaemonProcess(path, log=log, environment=environ) as daemon:
-                daemon.wait_ready()
+                info = daemon.wait_ready()
+                with Client(info.cell) as client:
+                    wait_compiled(client)
                 yield directories
     except (ClientError, DaemonError) as error:
         raise ExperimentError("daemon", f"{error}; {log.read_text()[-2000:]}") from error
