@@ -25,7 +25,7 @@ from stereoservo.client import Client, ClientError
 from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.messages.discovery import DaemonError, DaemonProcess
 from stereoservo.messages.goals import Calibrate
-from stereoservo.messages.wire import encode
+from stereoservo.messages.wire import StateMessage, encode
 from stereoservo.numerics.compilation import LOG_VARIABLE
 from stereoservo_sim.benchmarks.service_bench import processes_of
 from stereoservo_sim.benchmarks.timing import summary
@@ -40,9 +40,12 @@ COMMANDS = (
 COMPILED_S = 900.0
 
 
-def wait_compiled(client: Client) -> None:
-    """Wait until a cell has all kernels, which the first start on a computer compiles. Raises TimedOutError."""
-    client.wait_state(
+def wait_compiled(client: Client) -> StateMessage:
+    """The state of a cell once it has all kernels, which the first start on a computer compiles.
+
+    Raises TimedOutError.
+    """
+    return client.wait_state(
         lambda state: all(reason.code != "COMPILING" for reason in state.reasons), "all kernels", COMPILED_S
     )
 
@@ -121,7 +124,7 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
                 pids = {daemon.process.pid, *processes_of(cell_directories(info.cell).runtime).values()}
                 others = sum(_cpu_of(pid) for pid in pids)
                 client.disable()
-                wait_compiled(client)
+                state = wait_compiled(client)
             compiled = time.monotonic()
             code = daemon.stop()
     except (ClientError, DaemonError) as error:
