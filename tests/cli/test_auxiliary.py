@@ -42,8 +42,8 @@ class Gripper:
     def status(self) -> StateMessage:
         position = min(SPEED * self.now_s, self.ordered, STOPS_AT)
         return StateMessage(
-            cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1,
-            source="hold", goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={},
+            cell="demo", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="active", model="valid",
+            model_epoch=1, source="hold", goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={},
             error_px=None, task_error=(), innovation_px={}, visible={}, auxiliary={"gripper": position},
             loop=LoopInfo(250.0, 1, 0, 0, {}, {}),
         )  # fmt: skip

@@ -13,7 +13,7 @@ from stereoservo.messages.wire import EventMessage, FeaturesMessage, LoopInfo, S
 pytest.importorskip("foxglove", reason="foxglove-sdk is of the extra `cell`")
 
 STATE = StateMessage(
-    "c", "b", 0, 1e9, "active", "valid", 7, "law", "g", "stereo", "slow", (Reason("JOINT_LIMIT", "slow", "j1"),),
+    0, 0, "active", "valid", 7, "law", "g", "stereo", "slow", (Reason("JOINT_LIMIT", "slow", "j1"),), "c", "b", 1e9,
     {"j1": 0.5}, {"j1": 0.1}, {"j1": 0.2}, 3.5, (), {"left": 0.1}, {"left": 4}, LoopInfo(250.0, 1, 0, 0, {}, {}),
 )  # fmt: skip
 FEATURES = FeaturesMessage("left", 1, 0, 0, 1e9, (7,), ((1.0, 2.0),), (0.1,))

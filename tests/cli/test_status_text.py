@@ -11,7 +11,7 @@ from stereoservo.messages.status import CameraHealth, Halt, Health, RefinementSt
 from stereoservo.messages.wire import LoopInfo, StateMessage, decode, encode
 
 STATE = StateMessage(
-    cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
+    cell="demo", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
     goal="", law="", level="ok", reasons=(), joints={"j1": 0.1}, velocities={}, command={}, error_px=None,
     task_error=(), innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0, "max": 2.0}, {}),
 )  # fmt: skip

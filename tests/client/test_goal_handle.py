@@ -20,8 +20,9 @@ SLOW = Reason("JOINT_LIMIT", "slow", "j3", 1.9, 2.0, "rad", "joint j3 is near it
 
 def state(goal: str) -> StateMessage:
     return StateMessage(
-        cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="law",
-        goal=goal, law="stereo", level="slow", reasons=(SLOW,), joints={}, velocities={}, command={}, error_px=3.5,
+        cell="demo", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1,
+        source="law", goal=goal, law="stereo", level="slow", reasons=(SLOW,), joints={}, velocities={}, command={},
+        error_px=3.5,
         task_error=(), innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {}, {}), progress=0.25,
         seconds_left=4.0,
     )  # fmt: skip

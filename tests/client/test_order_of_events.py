@@ -31,8 +31,9 @@ from stereoservo.messages.wire import (
 
 REQUEST = 7
 STATE = StateMessage(
-    cell="demo", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
-    goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None, task_error=(),
+    cell="demo", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="active", model="valid", model_epoch=1,
+    source="hold", goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None,
+    task_error=(),
     innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {}, {}),
 )  # fmt: skip
 RESULT = CalibrationResult(0.1, {}, True, "m.json", 2, "metric", 1.0, 1, 2, 1, 0, 1, 2, 3.0)

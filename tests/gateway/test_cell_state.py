@@ -40,8 +40,8 @@ print("beats", flush=True)
 time.sleep(60)
 """
 STATE = StateMessage(
-    cell="c", boot="b", t_ns=1, t_wall=1.0, lifecycle="inactive", model="none", model_epoch=0, source="hold", goal="",
-    law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None, task_error=(),
+    cell="c", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="inactive", model="none", model_epoch=0, source="hold",
+    goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None, task_error=(),
     innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0, "max": 2.0}, {}),
 )  # fmt: skip
 

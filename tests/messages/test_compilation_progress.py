@@ -114,7 +114,8 @@ def test_status_and_log_say_how_far_it_is(
     reasons = Reason("COMPILING", "info", hint="ask again"), Reason("HELD", "hold")
     loop = LoopInfo(250.0, 0, 0, 0, {}, {})
     state = StateMessage(
-        "cell", "boot", 0, 0.0, "active", "none", 0, "hold", "", "", "info", reasons, {}, {}, {}, None, (), {}, {}, loop
+        0, 0, "active", "none", 0, "hold", "", "", "info", reasons, "cell", "boot", 0.0, {}, {}, {}, None, (), {},
+        {}, loop
     )  # fmt: skip
     found = with_progress(state, CellDirectories("cell", tmp_path, tmp_path)).reasons
     assert found[0].hint == "90 of about 380 kernels are compiled. ask again"

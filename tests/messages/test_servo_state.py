@@ -35,6 +35,7 @@ class StatusOfCore:
     """A core's status with an arm in motion, a goal, and both cameras in agreement with the model."""
 
     t_ns, model_epoch, error_px, progress, seconds_left = NOW_NS, 1, 0.5, 0.25, 2.0
+    step = 0
     lifecycle, model, source, goal, law, level = "active", "valid", "law", "g", "stereo", "ok"
     reasons: tuple[Any, ...] = ()
     positions = velocities = command = efforts = following_errors = Numbers((0.5,))

@@ -86,8 +86,9 @@ def test_how_far_the_refinement_is_comes_with_the_state(monkeypatch: pytest.Monk
         "far", None, "page", lambda slot, message, keep: told.append(msgspec.json.decode(message))
     )
     state = StateMessage(
-        cell="far", boot="b", t_ns=1, t_wall=1.0, lifecycle="active", model="none", model_epoch=0, source="hold",
-        goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None, task_error=(),
+        cell="far", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="active", model="none", model_epoch=0,
+        source="hold", goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None,
+        task_error=(),
         innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0}, {}),
     )  # fmt: skip
     for refinement in (None, RefinementState(5, 16)):

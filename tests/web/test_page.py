@@ -40,8 +40,9 @@ INFO = CellInfo(
     tuple(CameraInfo(name, 160, 120, 30.0, "eye_to_hand", (1, 2, 3)) for name in CAMERAS), ("stereo",), "stereo", 0.1,
 )  # fmt: skip
 STATE = StateMessage(
-    cell="noted", boot="boot", t_ns=0, t_wall=0.0, lifecycle="active", model="valid", model_epoch=1, source="hold",
-    goal="", law="", level="ok", reasons=(), joints={"j1": 0.1}, velocities={"j1": 0.0}, command={"j1": 0.0},
+    cell="noted", boot="boot", t_ns=0, step=0, t_wall=0.0, lifecycle="active", model="valid", model_epoch=1,
+    source="hold", goal="", law="", level="ok", reasons=(), joints={"j1": 0.1}, velocities={"j1": 0.0},
+    command={"j1": 0.0},
     error_px=None, task_error=(), innovation_px={}, visible=dict.fromkeys(CAMERAS, 3),
     loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0, "max": 2.0}, {}), health=Health("ok"),
     joints_age_s=0.004, camera_age_s=dict.fromkeys(CAMERAS, 0.02),

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from stereoservo.kinematics.model import CellModel, JointLoads
 from stereoservo.messages.goals import PlanReport, Request
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Health
+from stereoservo.messages.status import CoreStatus
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.ports.devices import CameraObservation, JointState, Prior
 
@@ -159,39 +159,8 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     epoch: int = 0
 
 
-class Status(msgspec.Struct, frozen=True, eq=False):
+class Status(CoreStatus[FloatArray], frozen=True, eq=False):
     """The state of the core after a step."""
-
-    t_ns: int
-    step: int
-    lifecycle: str
-    model: str
-    model_epoch: int
-    source: str
-    goal: str
-    law: str
-    level: str
-    reasons: tuple[Reason, ...]
-    positions: FloatArray
-    velocities: FloatArray
-    command_raw: FloatArray
-    command: FloatArray
-    error_px: float | None
-    task_error: FloatArray
-    """Of the components of the law, `control.law.Law.components`; empty where it has none."""
-    innovation_px: dict[str, float]
-    visible: dict[str, int]
-    progress: float | None = None
-    """Share [0, 1] of the goal's way that is done."""
-    seconds_left: float | None = None
-    efforts: FloatArray | None = None
-    """As the driver tells them (n,)."""
-    following_errors: FloatArray | None = None
-    effort_limits: FloatArray | None = None
-    """How far an effort may go from its moving mean (n,), infinite where nobody knows; None: no watch at all."""
-    following_limits: FloatArray | None = None
-    """Likewise of the following errors, from zero."""
-    health: Health = Health()
 
 
 class StepOutputs(msgspec.Struct, frozen=True, eq=False):

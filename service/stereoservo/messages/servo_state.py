@@ -14,8 +14,7 @@ from typing import Any
 import msgspec
 
 from stereoservo.messages.files import read_bounded
-from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Halt, Health, RefinementState
+from stereoservo.messages.status import CoreStatus, Halt, Health, RefinementState, StatusHead
 from stereoservo.messages.wire import LoopInfo, StateMessage
 
 STATE_LAYOUT = "ServoState.1"
@@ -40,32 +39,6 @@ class Numbers:
         return iter(self.values)
 
 
-class _Status(msgspec.Struct):
-    t_ns: int
-    lifecycle: str
-    model: str
-    model_epoch: int
-    source: str
-    goal: str
-    law: str
-    level: str
-    reasons: tuple[Reason, ...]
-    positions: Numbers
-    velocities: Numbers
-    command: Numbers
-    error_px: float | None
-    task_error: Numbers
-    innovation_px: dict[str, float]
-    visible: dict[str, int]
-    progress: float | None = None
-    seconds_left: float | None = None
-    efforts: Numbers | None = None
-    following_errors: Numbers | None = None
-    effort_limits: Numbers | None = None
-    following_limits: Numbers | None = None
-    health: Health = Health()
-
-
 class LoopStatistics(msgspec.Struct, frozen=True):
     """Counts and quantiles of the loop's cycles since its start. Lateness: time of waking after the slot [us]."""
 
@@ -84,7 +57,7 @@ class LoopStatistics(msgspec.Struct, frozen=True):
 class StateRecord(msgspec.Struct):
     """What of a `daemon.ipc_messages.ServoState` clients are told."""
 
-    status: _Status
+    status: CoreStatus[Numbers]
     loop: LoopStatistics
     driver_active: bool
     records_dropped: int
@@ -173,19 +146,12 @@ def state_message(
     names = tuple(joint.name for joint in run.joints.joints)
     cameras = {camera.name: _age_s(state.frames_ns.get(camera.name, 0), now_ns) for camera in run.cameras}
     fresh = {camera.name for camera in run.cameras if _fresh(cameras[camera.name], camera.rate_hz)}
+    head: dict[str, Any] = {name: getattr(status, name) for name in StatusHead.__struct_fields__}
     return StateMessage(
+        **head,
         cell=run.cell.cell.name,
         boot=boot,
-        t_ns=status.t_ns,
         t_wall=time.time() - (time.monotonic_ns() - status.t_ns) * 1e-9,
-        lifecycle=status.lifecycle,
-        model=status.model,
-        model_epoch=status.model_epoch,
-        source=status.source,
-        goal=status.goal,
-        law=status.law,
-        level=status.level,
-        reasons=tuple(status.reasons),
         joints=_finite(names, status.positions if measured else None),
         velocities=_finite(names, status.velocities if measured else None),
         command=_finite(names, status.command),

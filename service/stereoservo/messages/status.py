@@ -1,10 +1,18 @@
-"""Lifecycle, model readiness, model health and refinement of a cell, as the core writes them and clients read them."""
+"""Lifecycle, model readiness, model health, status and refinement of a cell, as the core writes them and clients read
+them.
+"""
 
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Generic, TypeVar
 
 import msgspec
+
+from stereoservo.messages.reasons import Reason
+
+Values = TypeVar("Values")
+"""Type of an array: of numpy where the core works, of numbers alone where numpy is not loaded."""
 
 
 class Lifecycle(StrEnum):
@@ -59,6 +67,49 @@ class Health(msgspec.Struct, frozen=True):
     cameras: dict[str, CameraHealth] = {}
     masked: tuple[int, ...] = ()
     reanchoring: str = ""
+
+
+class StatusHead(msgspec.Struct, frozen=True):
+    """What the core is doing and why, as every process and every client reads it, after ``step`` at ``t_ns``
+    (monotonic).
+    """
+
+    t_ns: int
+    step: int
+    lifecycle: str
+    model: str
+    model_epoch: int
+    source: str
+    goal: str
+    law: str
+    level: str
+    reasons: tuple[Reason, ...]
+
+
+class CoreStatus(StatusHead, Generic[Values], frozen=True, eq=False):
+    """The state of the core after a step; arrays are of the joints (n,)."""
+
+    positions: Values
+    velocities: Values
+    command_raw: Values
+    """Before the safety stage."""
+    command: Values
+    error_px: float | None
+    task_error: Values
+    """Of the components of the law, `control.law.Law.components`; empty where it has none."""
+    innovation_px: dict[str, float]
+    visible: dict[str, int]
+    progress: float | None = None
+    """Share [0, 1] of the goal's way that is done."""
+    seconds_left: float | None = None
+    efforts: Values | None = None
+    """As the driver tells them."""
+    following_errors: Values | None = None
+    effort_limits: Values | None = None
+    """How far an effort may go from its moving mean, infinite where nobody knows; None: no watch at all."""
+    following_limits: Values | None = None
+    """Likewise of the following errors, from zero."""
+    health: Health = Health()
 
 
 class Halt(msgspec.Struct, frozen=True):

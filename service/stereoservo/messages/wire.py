@@ -38,7 +38,7 @@ from stereoservo.messages.goals import (
 )
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.recording_request import ImagesRecorded
-from stereoservo.messages.status import Halt, Health, RefinementState
+from stereoservo.messages.status import Halt, Health, RefinementState, StatusHead
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
@@ -179,7 +179,7 @@ class LoopInfo(msgspec.Struct, frozen=True):
     records_dropped: int = 0
 
 
-class StateMessage(msgspec.Struct, frozen=True):
+class StateMessage(StatusHead, frozen=True):
     """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970].
 
     What has lost its source is left out: of joints ``joints``, ``velocities``, ``efforts``, ``following_errors`` and
@@ -189,16 +189,7 @@ class StateMessage(msgspec.Struct, frozen=True):
 
     cell: str
     boot: str
-    t_ns: int
     t_wall: float
-    lifecycle: str
-    model: str
-    model_epoch: int
-    source: str
-    goal: str
-    law: str
-    level: str
-    reasons: tuple[Reason, ...]
     joints: dict[str, float]
     velocities: dict[str, float]
     command: dict[str, float]
@@ -217,17 +208,17 @@ class StateMessage(msgspec.Struct, frozen=True):
     progress: float | None = None
     """Path parameter of the active goal, 0 to 1, where it is known."""
     seconds_left: float | None = None
-    efforts: dict[str, float] = {}
+    efforts: dict[str, float] = msgspec.field(default_factory=dict)
     """As the drives report them [N m or N, or shares of the rated torque]; empty where they do not."""
-    following_errors: dict[str, float] = {}
+    following_errors: dict[str, float] = msgspec.field(default_factory=dict)
     """Set less actual position [rad or m]."""
-    effort_limits: dict[str, float] = {}
+    effort_limits: dict[str, float] = msgspec.field(default_factory=dict)
     """How far efforts may go from their moving mean before the arm stops for a contact; absent where unknown."""
-    following_limits: dict[str, float] = {}
+    following_limits: dict[str, float] = msgspec.field(default_factory=dict)
     """How large following errors may become before the arm stops for a contact."""
     health: Health = Health()
     """Whether the images agree with the model, by camera; what explains it where they do not, and what is done."""
-    auxiliary: dict[str, float] = {}
+    auxiliary: dict[str, float] = msgspec.field(default_factory=dict)
     """Auxiliary joints [rad or m] and digital outputs (0 or 1), as the driver tells them."""
     refused_messages: int = 0
     """Messages that the gateway could not take since its start: not JSON, of a wrong shape, on a wrong key."""
@@ -235,7 +226,7 @@ class StateMessage(msgspec.Struct, frozen=True):
     """With `[calibration] refine`; None: nothing is refined on-line."""
     joints_age_s: float | None = None
     """Age of the newest joint sample [s]; None: there was none yet."""
-    camera_age_s: dict[str, float | None] = {}
+    camera_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)
     """Of each camera, time [s] since the shutter of its newest frame; None: there was none yet."""
     halt: Halt | None = None
     """While the arm is stopped or held at somebody's request: whose."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 import zlib
 from operator import attrgetter
-from typing import Any, get_type_hints
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -63,8 +63,7 @@ _rest_decoder = msgspec.msgpack.Decoder(StepInputs, dec_hook=decode_array)
 
 def _fields(*wanted: Any) -> tuple[str, ...]:
     """Names of the status's fields of these types."""
-    kinds = {str(kind) for kind in wanted}
-    return tuple(name for name, hint in get_type_hints(Status).items() if str(hint) in kinds)
+    return tuple(field.name for field in msgspec.structs.fields(Status) if field.type in wanted)
 
 
 _ARRAYS, _NUMBERS = _fields(FloatArray, FloatArray | None), _fields(float | None)
