@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 from oracles.safety import expected
 from stereoservo.core import limit
 from stereoservo.core.block import Block, views
-from stereoservo.core.command import command
-from stereoservo.core.limit import (
+from stereoservo.core.command import (
     Bounds,
     SafetyConfigurationError,
     SafetyInputs,
     SafetyLimits,
     SafetyResult,
     Wanted,
+    command,
     explained,
     limit_velocity,
 )
-from stereoservo.core.workspace import ARRAYS, WORKSPACE, Numbers
+from stereoservo.core.context import ARRAYS, WORKSPACE, Numbers
 
 DT = 0.004
 

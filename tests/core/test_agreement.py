@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
 from stereoservo.core.monitors import agreement
-from stereoservo.core.monitors.agreement import (
+from stereoservo.core.sources.progress import (
     AGREED,
     DISPLACED,
     DOUBTFUL,

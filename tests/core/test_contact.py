@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from stereoservo.core import monitor
+from stereoservo.core.context import Workspace
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.estimate import workspace
 from stereoservo.core.ingest import fill_sample
@@ -17,7 +18,6 @@ from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import ContactSettings, CoreSettings
 from stereoservo.core.state import CoreState, initial_state
 from stereoservo.core.state_encoding import decode_state, encode_state
-from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.messages.goals import Calibrate, Enable, Goal, Jog, JointTarget, Resume, RunGoal
 from stereoservo.messages.reasons import Reason

@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.core.context import Workspace
 from stereoservo.core.estimate import workspace
 from stereoservo.core.monitor import account_following, explain_following
 from stereoservo.core.monitors.following import PLAY, SILENCE_S
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import CoreState, initial_state
-from stereoservo.core.workspace import Workspace
 from stereoservo.messages.goals import Calibrate, Enable, FeatureTarget, Jog, JointTarget, Reset
 from stereoservo.messages.reasons import Reason
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.core.friction import MOST
+from stereoservo.core.command import MOST
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.messages.goals import FeatureTarget, JointTarget

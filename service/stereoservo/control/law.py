@@ -139,7 +139,7 @@ class Law:
     law, of ``centre``, ``jacobian`` and ``profile``.
 
     ``kernel``: the same step in one compiled call, bit for bit. It takes an array (1,) of a record,
-    `core.workspace.WORKSPACE`, which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as
+    `core.context.WORKSPACE`, which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as
     ``body``; of the cameras that keep sight of the face the centres as ``eyes``) and of Options ``gain``, ``dt_s`` and
     ``jacobian_choice``, whose rest is as by default; it fills in ``velocity``, ``components`` (errors, then what
     is allowed), ``component_status`` and ``conditioning``. None: the step is called.

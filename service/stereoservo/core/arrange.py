@@ -7,9 +7,9 @@ from __future__ import annotations
 import sys
 
 from stereoservo.core import monitor
+from stereoservo.core.command import friction_bounds
 from stereoservo.core.context import StepContext
 from stereoservo.core.estimate import offset_rules, place_unknown
-from stereoservo.core.friction import friction_bounds
 from stereoservo.core.monitor import NOISE, QUIET, looks_apart
 from stereoservo.core.move import MOTION_SOURCES, arrange_motion, paused
 from stereoservo.core.sources.law import aim_at, by_kernel

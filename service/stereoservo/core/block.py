@@ -204,7 +204,7 @@ class Block:
     Cameras: ``round_due``: one has given two frames since the last round, the others are not waited for; ``estimates``
     and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns`` (c, m), and
     ``frame_…`` (c, k, …) for the newest frames, have the arrays, a row a camera. Of the frames in which the error of
-    the law at work has been inside its tolerance (see `core.monitors.agreement`): the sums of their innovations,
+    the law at work has been inside its tolerance (see `core.sources.progress`): the sums of their innovations,
     ``settled_innovation`` (c, m, 2), and variances, ``settled_variance`` (c, m) [px²], how many they are,
     ``settled_count`` (c, m), and the stamp of each camera's last one, ``settled_ns`` (c,).
     """

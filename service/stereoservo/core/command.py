@@ -1,15 +1,32 @@
-"""What becomes of the motion source's velocity, in one kernel: friction is added, late drives are looked ahead of, and
-the safety stage, the last one, makes a command of it.
+"""What becomes of the motion source's velocity, in one kernel: what friction takes is added, late drives are looked ahead
+of, and the safety stage, the last one, makes a command of it.
+
+Friction is estimated for each joint from small commands and the travel that they have brought: an integral action for a
+joint that stands, and none for one that follows. Play and sag wind nothing up, since the encoder of a motor that turns
+through its play does move; for encoders behind the play see `friction_bounds`.
+
+The safety stage limits joint velocities in this order: finite check, stale-input policy (coast on prediction, then
+brake), uniform velocity scale, braking-aware position margins and joint-space keep-outs, uniform acceleration limit. It
+is not a safety function in the sense of the standards: it limits commands, it does not watch the machine.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import NOT_MEASURED
-from stereoservo.core.friction import add_friction
 from stereoservo.core.ingest import TAKEN
-from stereoservo.core.limit import FRESH, Bounds, Wanted, limit_velocity
+from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.progress import follow_error
-from stereoservo.numerics.arrays import FloatArray, Record
+from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 
 
@@ -71,3 +88,652 @@ def _foresee(block: Record, room: Record) -> None:
         ahead = q + memory.delay_under_way[j]
         towards = velocity if velocity != 0.0 else memory.command[j]
         work.outermost[j] = max(q, ahead) if towards > 0.0 else min(q, ahead)
+
+
+RISE_S = 0.25
+"""Time constant of the estimate; a joint that stands is sent its source's velocity once more in this time."""
+LAG_S = 0.06
+"""Of a healthy drive: its travel is compared over longer."""
+MOST = {"revolute": 0.015, "prismatic": 0.0015}
+"""[rad/s, m/s] Half as much again as the friction of a healthy joint; see `monitors.following.FRICTION`."""
+SMALL = 2.0
+"""Times ``MOST``, up to which a wanted velocity is small."""
+LEAST_TRAVEL = {"revolute": 2e-4, "prismatic": 2e-5}
+"""[rad, m] over which travel is compared, beside what lags, where encoders are fine."""
+LEAST_STEPS = 5.0
+"""Steps of the encoder likewise."""
+
+
+# -- friction -----------------------------------------------------------------------------------------------------
+
+
+def friction_bounds(
+    kinds: tuple[str, ...], resolution: tuple[float, ...], inexact: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared; not to be
+    written to.
+
+    Nothing is added to joints with coarse encoders where the model states errors of joint readings (``inexact``): play
+    before the encoder looks like friction, and steps show too late that it is taken up; the joint would hunt.
+    """
+    most, travel = (np.array([value[kind] for kind in kinds]) for value in (MOST, LEAST_TRAVEL))
+    if resolution:
+        least = LEAST_STEPS * np.array(resolution)
+        most = np.where((least > travel) & inexact, 0.0, most)
+        travel = np.maximum(travel, least)
+    return most, travel
+
+
+@kernel
+def begin_friction(block: Record, room: Record) -> None:
+    """Nothing is known of friction; travel is compared from the joints as they are."""
+    memory, n = block[0], block[0].joints
+    memory.friction[:n] = memory.friction_sent[:n] = memory.friction_s[:n] = 0.0
+    memory.friction_from[:n] = room[0].q[:n]
+
+
+@kernel
+def add_friction(block: Record, room: Record, looks: bool) -> bool:
+    """Into ``raw`` (n,) of the ``room``, its motion's ``velocity`` (n,) with the friction on top, and whether there is
+    any. Zero stays zero: nothing is added to a joint that is not to move.
+
+    Where it ``looks``, the travel that was sent, as it arrives, once it is enough, is compared with what came of it,
+    and begins again where it reverses.
+    """
+    memory, work = block[0], room[0]
+    n, dt_s, q = memory.joints, work.dt_s, work.q[: memory.joints]
+    wanted, velocity, most, travel = (
+        work.velocity[:n],
+        work.raw[:n],
+        work.friction_most[:n],
+        work.friction_travel[:n],
+    )
+    arrives = memory.delay_velocity[:n] if work.watches_following != 0 else memory.command[:n]
+    friction, stood_at = memory.friction[:n], memory.friction_from[:n]
+    sent, sent_s = memory.friction_sent[:n], memory.friction_s[:n]
+    changed = False
+    for j in range(wanted.size):
+        velocity[j] = 0.0
+        sent[j] += arrives[j] * dt_s
+        sent_s[j] += dt_s
+        if looks:
+            valid = abs(wanted[j]) < SMALL * most[j] and wanted[j] * sent[j] >= 0.0
+            enough = valid and abs(sent[j]) > travel[j] + LAG_S * abs(sent[j]) / sent_s[j]
+            if enough:
+                share = (q[j] - stood_at[j]) / sent[j]
+                lost = max(0.0, min(1.0 - share, 1.0)) * sent[j] / sent_s[j]
+                friction[j] += min(sent_s[j] / RISE_S, 1.0) * (lost - friction[j])
+            if wanted[j] * friction[j] < 0.0:
+                friction[j] *= 1.0 - min(dt_s / RISE_S, 1.0)
+            friction[j] = max(-most[j], min(friction[j], most[j]))
+            if enough or not valid:
+                sent[j], sent_s[j], stood_at[j] = 0.0, 0.0, q[j]
+        changed = changed or friction[j] != 0.0
+        if wanted[j] != 0.0:
+            velocity[j] = wanted[j] + friction[j]
+    return changed
+
+
+NON_FINITE_COMMAND = "NON_FINITE_COMMAND"
+JOINTS_STALE = "JOINTS_STALE"
+FEATURES_STALE = "FEATURES_STALE"
+COASTING = "COASTING"
+JOINT_LIMIT = "JOINT_LIMIT"
+KEEP_OUT = "KEEP_OUT"
+VELOCITY_SCALED = "VELOCITY_SCALED"
+ACCELERATION_LIMITED = "ACCELERATION_LIMITED"
+BRAKING = "BRAKING"
+
+TOUCHED = 1e-9
+"""Relative change of a command that is worth a reason."""
+MARGIN, TIMEOUT, FRESH, COAST = range(4)
+"""Of `SafetyLimits.bounds`."""
+TINY = 1e-300
+"""Share of a command's step that is none."""
+
+
+# -- the safety stage: limits, and what is told of them ----------------------------------------------------------
+
+
+class SafetyConfigurationError(ValueError):
+    """Limits or a step that the stage cannot work with; ``data`` holds the values the message speaks of."""
+
+    def __init__(self, message: str, **data: object) -> None:
+        super().__init__(message)
+        self.data = data
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyLimits:
+    """What may never be exceeded; all arrays in joint order, [rad] or [m] and seconds.
+
+    ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box. The
+    boxes and the position range are kept away from by ``position_margin``. ``coast_s``: how long a law may
+    run on prediction; ``features_fresh_s``: the age of the newest features up to which a law does not coast
+    at all (a frame or two); the arm brakes when they are older than both. Raises
+    SafetyConfigurationError.
+    """
+
+    joint_names: tuple[str, ...]
+    position_min: FloatArray
+    position_max: FloatArray
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    position_margin: float
+    keep_outs: FloatArray
+    keep_out_names: tuple[str, ...]
+    joint_timeout_s: float
+    coast_s: float
+    features_fresh_s: float = 0.15
+
+    @cached_property
+    def table(self) -> FloatArray:
+        """The joints' limits as the kernel takes them (4, n): smallest and largest position, velocity, acceleration."""
+        return np.array([self.position_min, self.position_max, self.velocity_max, self.acceleration_max])
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Likewise the margin of positions, and the longest ages of joints and features: fresh ones, and at all."""
+        return np.array([self.position_margin, self.joint_timeout_s, self.features_fresh_s, self.coast_s])
+
+    def __post_init__(self) -> None:
+        n = len(self.joint_names)
+        for name in ("position_min", "position_max", "velocity_max", "acceleration_max"):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if array.shape != (n,) or np.isnan(array).any():
+                raise SafetyConfigurationError(
+                    f"{name} is {array.tolist()}; {n} numbers, one a joint, are needed",
+                    name=name,
+                    value=array.tolist(),
+                )
+            object.__setattr__(self, name, array)
+        boxes = np.ascontiguousarray(self.keep_outs, dtype=np.float64).reshape(-1, n, 2)
+        object.__setattr__(self, "keep_outs", boxes)
+        for j, joint in enumerate(self.joint_names):
+            if not self.position_min[j] + self.position_margin <= self.position_max[j] - self.position_margin:
+                raise SafetyConfigurationError(
+                    f"joint {joint!r}: {self.position_min[j]} to {self.position_max[j]} leaves "
+                    f"nothing inside the margin {self.position_margin}",
+                    joint=joint,
+                )
+            for name in ("velocity_max", "acceleration_max"):
+                value = float(getattr(self, name)[j])
+                if not 0.0 < value < math.inf:
+                    raise SafetyConfigurationError(
+                        f"joint {joint!r}: {name} is {value}; a positive finite number is needed",
+                        joint=joint,
+                        value=value,
+                    )
+        if len(self.keep_out_names) != boxes.shape[0]:
+            raise SafetyConfigurationError(
+                f"{boxes.shape[0]} keep-outs have {len(self.keep_out_names)} names; one each is needed"
+            )
+        for k, name in enumerate(self.keep_out_names):
+            if np.isnan(boxes[k]).any() or not (boxes[k, :, 0] < boxes[k, :, 1]).all():
+                raise SafetyConfigurationError(
+                    f"keep-out {name!r}: every low must be below its high, got {boxes[k].tolist()}"
+                )
+            if not np.isfinite(boxes[k]).any():
+                raise SafetyConfigurationError(
+                    f"keep-out {name!r} bounds no joint: the arm would have nowhere to be"
+                )
+        for name in ("position_margin", "joint_timeout_s", "coast_s", "features_fresh_s"):
+            if not getattr(self, name) >= 0.0:
+                raise SafetyConfigurationError(
+                    f"{name} is {getattr(self, name)}; zero or more is needed", name=name
+                )
+
+
+class SafetyInputs(msgspec.Struct, frozen=True, eq=False):
+    """One step: ``raw`` (n,) what the motion source wants, ``positions`` (n,) as measured, ``previous`` (n,)
+    command.
+
+    ``joint_age_s``, ``feature_age_s``: ages of the newest joint sample and of the newest accepted features
+    [s]; negative and not finite ones are stale. ``needs_features``: whether the source may not go on without.
+    ``speed_scale`` in [0, 1]. ``brake``: stop or hold.
+    """
+
+    raw: FloatArray
+    positions: FloatArray
+    previous: FloatArray
+    dt_s: float
+    joint_age_s: float = 0.0
+    feature_age_s: float = 0.0
+    needs_features: bool = False
+    speed_scale: float = 1.0
+    brake: bool = False
+
+
+class SafetyResult(msgspec.Struct, frozen=True, eq=False):
+    """``raw`` and ``limited`` joint velocities (n,) and why they differ; ``braking``: the stage overrules the
+    source.
+    """
+
+    raw: FloatArray
+    limited: FloatArray
+    reasons: tuple[Reason, ...] = ()
+    braking: bool = False
+
+
+def explained(
+    inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: LimitsFound, acted: FloatArray
+) -> SafetyResult:
+    """The result with its reasons, by what `limit_velocity` has ``found`` and ``acted`` (n,)."""
+    reasons: list[Reason] = []
+    brake = _stale(inputs, limits, reasons) or inputs.brake
+    finite, speed_scale, scale, scaled_by, share, shared_by = found
+    if not finite:
+        brake = True
+        _tell_non_finite(inputs.raw, inputs.positions, limits, reasons)
+    if brake:
+        reasons.append(_braking(limited, limits, inputs.brake))
+    _tell_positions(acted.tolist(), inputs, limits, reasons)
+    if scaled_by >= 0 and scale < 1.0 - TOUCHED:
+        j = scaled_by
+        reasons.append(
+            Reason(
+                VELOCITY_SCALED,
+                "slow",
+                limits.joint_names[j],
+                float(abs(inputs.raw[j])),
+                float(limits.velocity_max[j] * speed_scale),
+                "1/s",
+                "slower, in the same direction; a lower gain or a higher speed scale avoids it",
+            )
+        )
+    if not brake and shared_by >= 0 and share < 1.0 - TOUCHED:
+        j = shared_by
+        reasons.append(
+            Reason(
+                ACCELERATION_LIMITED,
+                "info",
+                limits.joint_names[j],
+                _number(float(limits.acceleration_max[j]) / max(share, TINY)),
+                float(limits.acceleration_max[j]),
+                "1/s²",
+                "passes by itself",
+            )
+        )
+    return SafetyResult(inputs.raw, limited, tuple(reasons), brake)
+
+
+def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
+    """What the safety stage has made of this step's motion, with its reasons."""
+    room, block = context.derived.room, context.state.block
+    work, given = room.numbers, room.arrays
+    raw, command = given["raw"].copy(), block.command.copy()
+    if not work.limited:
+        return SafetyResult(raw, command)
+    inputs = SafetyInputs(
+        raw, given["outermost"], given["previous"], context.dt_s,
+        (context.now_ns - block.numbers.last_joints_ns) * 1e-9, (context.now_ns - work.features_ns) * 1e-9,
+        bool(work.needs_features), work.speed_scale, bool(work.paused),
+    )  # fmt: skip
+    found = LimitsFound(
+        bool(work.finite), work.allowed_scale, work.scale, work.scaled_by, work.share, work.shared_by
+    )
+    return explained(inputs, limits, command, found, given["acted"])
+
+
+def safety_limits(settings: CoreSettings, features_fresh_s: float) -> SafetyLimits:
+    """The limits of a cell. Raises SafetyConfigurationError."""
+    limits = settings.limits
+    return SafetyLimits(
+        joint_names=settings.joint_names,
+        position_min=limits.position_min,
+        position_max=limits.position_max,
+        velocity_max=limits.velocity_max,
+        acceleration_max=limits.acceleration_max,
+        position_margin=limits.position_margin,
+        keep_outs=limits.keep_outs,
+        keep_out_names=limits.keep_out_names,
+        joint_timeout_s=limits.joint_timeout_s,
+        coast_s=limits.coast_s,
+        features_fresh_s=features_fresh_s,
+    )
+
+
+def _within(age_s: float, limit_s: float) -> bool:
+    """Whether an age can be trusted: neither NaN nor of the future, and not beyond its limit."""
+    return 0.0 <= age_s <= limit_s
+
+
+def _stale(inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) -> bool:
+    """Whether the inputs are too old, or of no credible age, to move on."""
+    brake = False
+    if not _within(inputs.joint_age_s, limits.joint_timeout_s):
+        brake = True
+        reasons.append(
+            Reason(
+                JOINTS_STALE,
+                "hold",
+                "",
+                _number(inputs.joint_age_s),
+                limits.joint_timeout_s,
+                "s",
+                "the joint driver delivers no samples: check drives and bus",
+            )
+        )
+    if inputs.needs_features and not _within(inputs.feature_age_s, limits.features_fresh_s):
+        if _within(inputs.feature_age_s, limits.coast_s):
+            reasons.append(
+                Reason(
+                    COASTING,
+                    "info",
+                    "",
+                    inputs.feature_age_s,
+                    limits.coast_s,
+                    "s",
+                    "moving on the prediction of the joints; brakes when no camera shows markers in time",
+                )
+            )
+        else:
+            brake = True
+            reasons.append(
+                Reason(
+                    FEATURES_STALE,
+                    "hold",
+                    "",
+                    _number(inputs.feature_age_s),
+                    limits.coast_s,
+                    "s",
+                    "no camera shows enough markers: clear the view, or move the arm back by joints",
+                )
+            )
+    return brake
+
+
+def _tell_non_finite(
+    raw: FloatArray, positions: FloatArray, limits: SafetyLimits, reasons: list[Reason]
+) -> None:
+    for j, name in enumerate(limits.joint_names):
+        for what, value in (("command", raw[j]), ("measured position", positions[j])):
+            if not math.isfinite(value):
+                reasons.append(
+                    Reason(
+                        NON_FINITE_COMMAND,
+                        "hold",
+                        name,
+                        None,
+                        None,
+                        "",
+                        f"{what} of joint {name} is {value}: a fault of the source or the driver",
+                    )
+                )
+
+
+def _tell_positions(
+    acted: list[float], inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]
+) -> None:
+    margin = limits.position_margin
+    for j, code in enumerate(int(one) for one in acted):
+        if not code:
+            continue
+        name, position = limits.joint_names[j], float(inputs.positions[j])
+        upward = (
+            inputs.previous[j] if inputs.raw[j] == 0.0 or not math.isfinite(inputs.raw[j]) else inputs.raw[j]
+        ) > 0.0
+        if code == 1:
+            bound = float(limits.position_max[j] - margin if upward else limits.position_min[j] + margin)
+            hint = f"jog {name} {'down' if upward else 'up'}, away from its limit"
+            reasons.append(Reason(JOINT_LIMIT, "slow", name, position, bound, "", hint))
+            continue
+        box = limits.keep_outs[code - 2, j]
+        bound = float(box[0] - margin if upward else box[1] + margin)
+        hint = f"keep-out {limits.keep_out_names[code - 2]!r}: jog {name} {'down' if upward else 'up'}"
+        reasons.append(Reason(KEEP_OUT, "slow", name, position, bound, "", hint))
+
+
+def _braking(limited: FloatArray, limits: SafetyLimits, asked: bool) -> Reason:
+    j = int(np.abs(limited).argmax())
+    hint = "stop or hold was asked for; resume to go on" if asked else "passes with the reason beside it"
+    return Reason(BRAKING, "hold", limits.joint_names[j], float(abs(limited[j])), 0.0, "1/s", hint)
+
+
+def _number(value: float) -> float | None:
+    """JSON carries no NaN or infinity."""
+    return value if math.isfinite(value) else None
+
+
+# -- the safety stage's kernels ------------------------------------------------------------------------------------
+
+
+@kernel
+def stoppable_speed(distance: float, acceleration: float, dt: float) -> float:
+    """Largest speed to hold for ``dt`` and still brake within ``distance``: ``v·dt + v²/2a = d``; 0 for d <=
+    0.
+
+    The discrete braking ``v, v − a·dt, …`` needs no more than that, and each of its steps is stoppable again.
+    """
+    if not distance > 0.0:
+        return 0.0
+    step = acceleration * dt
+    # the root of the quadratic in the form that does not cancel for small distances
+    return 2.0 * acceleration * distance / (step + math.sqrt(step * step + 2.0 * acceleration * distance))
+
+
+class JointLimits(NamedTuple):
+    """Limits of the joints, (n,) each, with the ``margin`` of positions and ``keep_outs`` (k, n, 2): `SafetyLimits`."""
+
+    position_min: FloatArray
+    position_max: FloatArray
+    velocity_max: FloatArray
+    acceleration_max: FloatArray
+    margin: float
+    keep_outs: FloatArray
+
+
+class VelocityCaps(NamedTuple):
+    """Velocity caps ``low``, ``high`` (n,) and who set them (n,): -1 the position limit, k >= 0 keep-out box k."""
+
+    low: FloatArray
+    high: FloatArray
+    low_by: IntArray
+    high_by: IntArray
+
+
+@kernel
+def _position_caps(
+    ahead: FloatArray, behind: FloatArray, previous: FloatArray, dt: float, limits: JointLimits
+) -> VelocityCaps:
+    """The caps that position limits and keep-outs set.
+
+    ``ahead`` and ``behind`` (n,): the joint's extreme positions, given the age of its sample; NaN caps
+    nothing.
+    """
+    position_min, position_max, velocity_max, acceleration_max, margin, keep_outs = limits
+    n = previous.shape[0]
+    low, high = np.empty(n), np.empty(n)
+    low_by, high_by = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    for j in range(n):
+        low_by[j] = -1
+        high_by[j] = -1
+        low[j] = -math.inf
+        high[j] = math.inf
+        if math.isnan(ahead[j]) or math.isnan(behind[j]):
+            continue
+        high[j] = stoppable_speed(position_max[j] - margin - ahead[j], acceleration_max[j], dt)
+        low[j] = -stoppable_speed(behind[j] - (position_min[j] + margin), acceleration_max[j], dt)
+    for k in range(keep_outs.shape[0]):
+        # The joint that keeps the arm out of the box with the most time to spare answers for it: as long as
+        # one joint can always stop outside, the box is never entered.
+        best = -1
+        best_above = False
+        best_slack = -math.inf
+        for j in range(n):
+            if math.isnan(ahead[j]) or math.isnan(behind[j]):
+                continue
+            for above in (False, True):
+                if above:
+                    if math.isinf(keep_outs[k, j, 1]):
+                        continue
+                    room = behind[j] - (keep_outs[k, j, 1] + margin)
+                    speed = max(0.0, -previous[j])
+                else:
+                    if math.isinf(keep_outs[k, j, 0]):
+                        continue
+                    room = keep_outs[k, j, 0] - margin - ahead[j]
+                    speed = max(0.0, previous[j])
+                slack = (room - 0.5 * speed * speed / acceleration_max[j]) / velocity_max[j]
+                if slack > best_slack:
+                    best, best_above, best_slack = j, above, slack
+        if best < 0:
+            continue
+        if best_above:
+            cap = -stoppable_speed(
+                behind[best] - (keep_outs[k, best, 1] + margin), acceleration_max[best], dt
+            )
+            if cap > low[best]:
+                low[best] = cap
+                low_by[best] = k
+        else:
+            cap = stoppable_speed(keep_outs[k, best, 0] - margin - ahead[best], acceleration_max[best], dt)
+            if cap < high[best]:
+                high[best] = cap
+                high_by[best] = k
+    return VelocityCaps(low, high, low_by, high_by)
+
+
+@kernel
+def _within_speed_limits(previous: FloatArray, velocity_max: FloatArray) -> FloatArray:
+    """The previous command (n,) scaled into the speed limits: nothing may continue from beyond them."""
+    before = np.zeros(previous.shape[0])
+    shrink = 1.0
+    for j in range(before.shape[0]):
+        if math.isfinite(previous[j]):
+            before[j] = previous[j]
+            if abs(before[j]) > velocity_max[j]:
+                shrink = min(shrink, velocity_max[j] / abs(before[j]))
+    for j in range(before.shape[0]):
+        before[j] *= shrink
+    return before
+
+
+@kernel
+def _velocity_scale(
+    wanted: FloatArray, low: FloatArray, high: FloatArray, velocity_max: FloatArray, speed_scale: float
+) -> tuple[float, int]:
+    """The factor that brings all joints within their speed limits, and the joint that asks for it, -1 for none.
+
+    A joint that brakes for its position limit is held below its speed limit by its cap: it slows no other joint.
+    """
+    scale, scaled_by = 1.0, -1
+    for j in range(wanted.shape[0]):
+        limit = velocity_max[j] * speed_scale
+        cap = high[j] if wanted[j] > 0.0 else -low[j]
+        if cap > limit and abs(wanted[j]) * scale > limit:
+            scale = limit / abs(wanted[j])
+            scaled_by = j
+    return scale, scaled_by
+
+
+class Wanted(NamedTuple):
+    """What a motion asks for: ``raw``, with joints at ``positions`` after the command ``previous``, (n,) each; the rest
+    as in `SafetyInputs`.
+    """
+
+    raw: FloatArray
+    positions: FloatArray
+    previous: FloatArray
+    brake: bool
+    dt: float
+    joint_age: float
+    feature_age: float
+    needs_features: bool
+    speed_scale: float
+
+
+class Bounds(NamedTuple):
+    """``table`` (4, n), ``bounds`` (4,) and ``keep_outs`` (k, n, 2) of `SafetyLimits`."""
+
+    table: FloatArray
+    bounds: FloatArray
+    keep_outs: FloatArray
+
+
+class LimitsFound(NamedTuple):
+    """Whether all was ``finite``; the ``speed_scale`` that holds; velocity ``scale`` and acceleration ``share``, each
+    with the joint that asks for it, -1 for none.
+    """
+
+    finite: bool
+    speed_scale: float
+    scale: float
+    scaled_by: int
+    share: float
+    shared_by: int
+
+
+@kernel
+def limit_velocity(
+    wanted: Wanted, by: Bounds, limited: FloatArray, acted: FloatArray
+) -> tuple[bool, LimitsFound]:
+    """Staleness, braking, velocity, positions and keep-outs, acceleration, in this order; whether there is anything to
+    tell, and what.
+
+    Where velocity or positions are not finite it brakes, too. Into ``limited`` the velocity (n,), and into ``acted``
+    (n,) who has acted on each joint: 0 nobody, 1 position limit, 2 + k keep-out k.
+    """
+    raw, positions, previous, brake, dt, joint_age, feature_age, needs_features, speed_scale = wanted
+    table, bounds, keep_outs = by
+    margin, timeout, fresh, coast = bounds[MARGIN], bounds[TIMEOUT], bounds[FRESH], bounds[COAST]
+    limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)
+    told, sample_age = brake, joint_age
+    if not 0.0 <= joint_age <= timeout:
+        brake, sample_age = True, timeout
+    if needs_features and not 0.0 <= feature_age <= fresh:
+        told, brake = True, brake or not 0.0 <= feature_age <= coast
+    speed_scale = min(max(speed_scale, 0.0), 1.0) if math.isfinite(speed_scale) else 0.0
+    velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
+    n = raw.shape[0]
+    finite = True
+    for j in range(n):
+        acted[j] = 0.0
+        finite = finite and math.isfinite(raw[j]) and math.isfinite(positions[j])
+    brake = brake or not finite
+    before = _within_speed_limits(previous, velocity_max)
+    ahead, behind = np.empty(n), np.empty(n)
+    for j in range(n):
+        # since the sample the joint may have been faster than now, by what it can have braked
+        drift = before[j] * sample_age
+        faster = 0.5 * acceleration_max[j] * sample_age * sample_age
+        position = positions[j] if math.isfinite(positions[j]) else math.nan
+        ahead[j] = position + max(0.0, drift + faster)
+        behind[j] = position + min(0.0, drift - faster)
+    low, high, low_by, high_by = _position_caps(ahead, behind, before, dt, limits)
+
+    for j in range(n):
+        limited[j] = 0.0 if brake else raw[j]
+    scale, scaled_by = _velocity_scale(limited, low, high, velocity_max, speed_scale)
+    for j in range(n):
+        # Scaled before it is compared with its caps: far from its limits no joint is clipped, whatever was asked.
+        limited[j] *= scale
+        if limited[j] > high[j]:
+            limited[j] = high[j]
+            acted[j] = high_by[j] + 2
+        elif limited[j] < low[j]:
+            limited[j] = low[j]
+            acted[j] = low_by[j] + 2
+
+    share, shared_by = 1.0, -1
+    for j in range(n):
+        step = abs(limited[j] - before[j])
+        limit = acceleration_max[j] * dt
+        if step * share > limit:
+            share = limit / step
+            shared_by = j
+    for j in range(n):
+        if share < 1.0:
+            limited[j] = before[j] + share * (limited[j] - before[j])
+        # The share of another joint may leave this one above its cap: then it brakes with all it has.
+        step = acceleration_max[j] * dt
+        if limited[j] > high[j]:
+            limited[j] = min(limited[j], max(high[j], before[j] - step))
+            acted[j] = high_by[j] + 2
+        elif limited[j] < low[j]:
+            limited[j] = max(limited[j], min(low[j], before[j] + step))
+            acted[j] = low_by[j] + 2
+    told = told or brake or scaled_by >= 0 or shared_by >= 0
+    for j in range(n):
+        told = told or acted[j] != 0.0
+    return told, LimitsFound(finite, speed_scale, scale, scaled_by, share, shared_by)

@@ -1,9 +1,15 @@
-"""Data types that the stages of one core step share: accepted inputs, robot and camera state, monitors' findings,
-velocity output, refused requests.
+"""What the stages of one core step share: the workspace of the kernels, and, for Python, accepted inputs, monitors'
+findings, velocity output and refused requests.
+
+Workspace: what kernels take beside the block, as one flat record of fixed size: the inputs of one step, the constants
+of settings and model, what the core's Python state says of this step, and room for the results. Nothing of it is
+remembered: it follows from inputs, settings, model and state.
 """
 
 from __future__ import annotations
 
+import ctypes
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -12,19 +18,337 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from stereoservo.control.law import Law
+from stereoservo.control.faces import FaceChoice
+from stereoservo.control.law import Law, Scene, Task
+from stereoservo.core.block import JOINTS, Shapes, packed_type, views
 from stereoservo.core.cycle import Event, StepInputs
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.prediction import Prediction
+from stereoservo.core.monitors.following import LAG_S, of_kinds
+from stereoservo.core.prediction import (
+    SEEN_SLACK_NS,
+    FrameResiduals,
+    Prediction,
+    gate_threshold,
+    improbable,
+)
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
-from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Health
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.ports.devices import CameraObservation, JointState
+
+LENS_SIZE = 7
+"""Numbers of a lens, at most."""
+MAX_FRAMES = 4 * MAX_CAMERAS
+"""Frames that a step looks at, at most: the newest ones."""
+
+
+class Numbers(ctypes.Structure):
+    """The numbers at the head of the record."""
+
+    period_s: float
+    lasting_ns: int
+    tip_first: int
+    worst: int
+    missing: float
+    lens_size: int
+    known_s: float
+    filter_s: float
+    gate: float
+    joints: int
+    cameras: int
+    markers: int
+    composition: int
+    eye_count: int
+    measured: int
+    error_px: float
+    conditioning: float
+    gain: float
+    gain_near: float
+    gain_far: float
+    gain_slope: float
+    tolerance_px: float
+    time_limit_s: float
+    hold_frames: int
+    now_ns: int
+    dt_s: float
+    stop: int
+    frames: int
+    has_sent: int
+    joints_given: int
+    joints_ns: int
+    joints_seq: int
+    joints_whole: int
+    tells_efforts: int
+    tells_following: int
+    elapsed_s: float
+    nominal_s: float
+    longest_gap_s: float
+    joint_timeout_s: float
+    frame_timeout_s: float
+    active_before: int
+    active: int
+    faulty: int
+    modelled: int
+    frames_apart: int
+    erring: int
+    stopped: int
+    by_images: int
+    watches_following: int
+    watches_loads: int
+    learning: int
+    rounds_apart: int
+    quiet: int
+    paused: int
+    aims: int
+    markers_needed: int
+    joints_found: int
+    frames_passed: int
+    frames_refused: int
+    gap: int
+    contact_watched: int
+    contact: int
+    following: int
+    looked_at: int
+    odd: int
+    any_masked: int
+    followed: int
+    seen: int
+    run_found: int
+    rests: int
+    jacobian_choice: int
+    compensates: int
+    needs_features: int
+    speed_scale: float
+    runs: int
+    features_ns: int
+    added: int
+    finite: int
+    allowed_scale: float
+    scale: float
+    scaled_by: int
+    share: float
+    shared_by: int
+    limited: int
+    _fields_ = [
+        (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
+        for name, kind in __annotations__.items()
+    ]
+
+
+ARRAYS: Shapes = {
+    "velocity_max": JOINTS, "lag": JOINTS, "play": JOINTS, "answers": JOINTS, "friction": JOINTS,
+    "effort_limits": JOINTS, "following_limits": JOINTS, "stated_effort_limits": JOINTS,
+    "stated_following_limits": JOINTS, "generators": ("joints", 4, 4), "kinds": JOINTS, "zero": JOINTS,
+    "marker_points": ("markers", 4), "matrices": ("cameras", 3, 4),
+    "lenses": ("cameras", LENS_SIZE), "scene_pixels": ("cameras", "rows", 2), "row_ids": ("rows",), "row_of": ("rows",),
+    "camera_rates": ("cameras",), "noise_chi2": (MAX_MARKERS + 1,),
+    "sample": (4, "joints"), "operators": ("joints", 4, 4), "points": ("markers", 4),
+    "predicted": ("cameras", "markers", 2), "jacobian": ("cameras", "markers", 2, "joints"),
+    "weights": ("cameras", "markers"), "pixels": ("cameras", "markers", 2),
+    "frame_q": JOINTS, "frame_innovation": ("rows", 2), "frame_spread": ("rows", 2, 2), "frame_noise": ("rows",),
+    "frame_seen": ("rows",), "frame_velocity": ("rows", 2), "unseen_px": ("cameras", "markers"),
+    "camera_centres": ("cameras", 4), "no_rates": ("cameras", "markers", 2),
+    "used": ("cameras",), "wanted": ("cameras", "markers"), "set_points": ("cameras", "markers", 2),
+    "target_points": ("markers", 4), "target_known": ("markers",), "centre_weights": ("markers",), "centre_body": (4,),
+    "centre_target": (4,), "face": (3,), "eyes": ("cameras", 4),
+    "usable": ("cameras", "markers"), "body": ("markers", 4), "centre": (4,),
+    "velocity": JOINTS, "components": (2, 3), "component_status": (3,),
+    "q": JOINTS, "sent": JOINTS, "masked": ("markers",), "unknown": ("cameras",), "offset_rule": ("cameras",),
+    "stated_offset_ns": ("cameras",), "image_sizes": ("cameras", 2), "joint_deviations": JOINTS,
+    "limits": (4, "joints"), "bounds": (4,), "friction_most": JOINTS, "friction_travel": JOINTS, "raw": JOINTS,
+    "outermost": JOINTS, "previous": JOINTS, "acted": JOINTS, "result": (1 + 3 * MAX_JOINTS,),
+    "arrived_camera": (MAX_FRAMES,), "arrived_seq": (MAX_FRAMES,), "arrived_ns": (MAX_FRAMES,),
+    "arrived_count": (MAX_FRAMES,), "arrived_found": (MAX_FRAMES,), "arrived_ids": (MAX_FRAMES, MAX_MARKERS),
+    "arrived_pixels": (MAX_FRAMES, MAX_MARKERS, 2), "arrived_covariances": (MAX_FRAMES, MAX_MARKERS, 2, 2),
+}  # fmt: skip
+INTEGERS = (
+    "row_ids", "row_of", "face", "component_status", "unknown", "offset_rule", "stated_offset_ns", "arrived_camera",
+    "arrived_seq", "arrived_ns", "arrived_count", "arrived_found", "arrived_ids",
+)  # fmt: skip
+OTHER_TYPES = {"kinds": np.uint8, "frame_seen": np.uint8, **dict.fromkeys(INTEGERS, np.int64)}
+WORKSPACE = packed_type(Numbers, ARRAYS, OTHER_TYPES, {})
+_INPUTS = struct.Struct("=qd9q")
+"""The numbers of a step's inputs, ``now_ns`` to ``tells_following``, as they lie in the record."""
+_INPUTS_AT = Numbers.now_ns.offset  # type: ignore[attr-defined]
+NOISE_CHI2 = np.array([improbable(2.0 * count) for count in range(MAX_MARKERS + 1)])
+"""Of so many markers: what `improbable` says of a frame that is nothing but noise."""
+Limits = tuple[FloatArray, FloatArray]
+
+
+class Workspace:
+    """Constants and room; ``record`` (1,) of type `WORKSPACE` is all of it, and what kernels take.
+
+    Inputs of the step, put there by `core.ingest`: the time ``now_ns`` and the period ``dt_s``, at most the nominal one
+    ``nominal_s``; whether the ``stop`` was raised; the joint ``sample`` (4, n) (positions, velocities, efforts,
+    following errors; ``joints_given``, ``joints_whole``: of every joint) with ``joints_ns`` and ``joints_seq``; what
+    the driver ``sent`` (n,) in place of the last command, where ``has_sent``; and ``frames`` that have ``arrived_…``,
+    each with its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes),
+    ``ids``, ``pixels``, ``covariances``.
+
+    Of the settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad
+    or m] of a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for
+    how long a sight has a weight, ``lasting_ns``; of a frame's gate: the squared distance ``gate``, for how long an
+    innovation is known, ``known_s``, and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,),
+    ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): of the model, and those that the cell file
+    states. ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.command.SafetyLimits`. Of the model: as
+    in `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of readings that err.
+
+    What the state says of the step, by `core.arrange`: the lifecycle, ``active_before`` the driver's newest news and
+    ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python has looked at the frames; ``erring``:
+    joints may stand beside their readings; the arm is ``stopped``, ``paused``; what is watched; ``rounds_apart``:
+    Python looks at the rounds of frames, and ``quiet``: none of the last ones needed an explanation; ``masked`` (m,);
+    of each camera whether its place is ``unknown`` and what becomes of the offset of its stamps (``offset_rule``).
+
+    Of a step: the joints ``q`` (n,), what `ingest` has found of ``joints``, ``frames`` and the ``gap`` of the loop; the
+    fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); what the monitors have found:
+    ``contact``, ``following``, of which joint ``worst`` with what it is ``missing``; of a round the cameras that were
+    ``looked_at`` and are ``odd``, as bits. Of the frame that was looked at last: joints ``frame_q`` (n,), what
+    `residuals` gives, and until the present is there the prediction of its camera alone, ``of_frame``.
+
+    Of the goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are
+    ``wanted`` (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres
+    ``eyes`` of the ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and
+    ``centre`` now, and whether an ``error_px`` was ``measured``; whether it was ``followed`` in this step, how many of
+    its markers were ``seen`` and what `account_run` has ``run_found``. Its ``gain`` now, and the goal's gains,
+    tolerance and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those
+    that laws take; ``aim`` and ``faced``: of which goal and face they are.
+
+    Of the motion: the source's ``velocity`` (n,), what else `core.context.SourceOutput` says of it, and ``raw``
+    (n,), with what friction takes. What `core.command` has found: ``finite`` to ``shared_by``, ``acted`` (n,),
+    ``previous`` (n,) the command before. ``result`` (1 + 3n,): what recordings keep of a step, see
+    `core.cycle.StepResult`. ``arrays``: all arrays by name.
+    """
+
+    def __init__(self, settings: CoreSettings, load_limits: Limits | None, stated: Limits) -> None:
+        self.record: np.ndarray[Any, Any] = np.zeros(1, WORKSPACE)
+        self._counts = {
+            "joints": len(settings.joint_names),
+            "cameras": len(settings.cameras),
+            "markers": 0,
+            "rows": 0,
+        }
+        self.arrays: dict[str, Any] = {}
+        self._view()
+        self._bytes = self.record.view(np.uint8).data
+        self.numbers = Numbers.from_buffer(self._bytes)
+        self.numbers.joints, self.numbers.cameras = self._counts["joints"], self._counts["cameras"]
+        self.numbers.period_s = 1.0 / settings.rate_hz
+        self.numbers.lasting_ns = int(settings.limits.coast_s * 1e9) + SEEN_SLACK_NS
+        self.numbers.known_s, self.numbers.filter_s = settings.limits.coast_s + 1.0, settings.filter_s
+        self.numbers.gate = gate_threshold(settings.gate_sigma)
+        self.numbers.joint_timeout_s = settings.limits.joint_timeout_s
+        self.numbers.watches_following = settings.watch_following
+        given = self.arrays
+        given["noise_chi2"][:] = NOISE_CHI2
+        given["camera_rates"][:] = [camera.rate_hz for camera in settings.cameras]
+        for sizes, camera in zip(given["image_sizes"], settings.cameras, strict=True):
+            sizes[:] = camera.width, camera.height
+        given["velocity_max"][:] = settings.limits.velocity_max
+        given["lag"][:] = LAG_S * settings.limits.velocity_max
+        given["play"][:], given["answers"][:], given["friction"][:] = of_kinds(
+            settings.joint_kinds, settings.resolution
+        )
+        self.limit_loads(load_limits)
+        efforts, following = stated
+        given["stated_effort_limits"][:], given["stated_following_limits"][:] = efforts, following
+
+    def limit_loads(self, limits: Limits | None) -> None:
+        """Collision thresholds (n,), (n,) from here on; None: nothing reaches them."""
+        self.numbers.watches_loads = limits is not None
+        efforts, following = limits or (np.inf, np.inf)
+        self.arrays["effort_limits"][:], self.arrays["following_limits"][:] = efforts, following
+
+    def use(self, arrays: ModelArrays) -> None:
+        """Work with a model from here on."""
+        self._counts["markers"], self._counts["rows"] = len(arrays.marker_points), len(arrays.row_ids)
+        self._view()
+        numbers, given = self.numbers, self.arrays
+        numbers.markers, numbers.tip_first = len(arrays.marker_points), arrays.tip_first
+        numbers.composition = arrays.composition
+        for name in (
+            "generators",
+            "kinds",
+            "zero",
+            "marker_points",
+            "matrices",
+            "camera_centres",
+            "row_ids",
+            "row_of",
+        ):
+            given[name][:] = getattr(arrays, name)
+        self.numbers.lens_size = arrays.lenses.shape[1]
+        given["lenses"][:, : arrays.lenses.shape[1]] = arrays.lenses
+        given["scene_pixels"][:, : len(arrays.scene_points)] = arrays.scene_pixels
+        self.unseen_px[:] = arrays.unseen_px
+        given["joint_deviations"][:] = np.sqrt(arrays.joint_variances)
+        numbers.modelled, numbers.erring = True, arrays.joint_accuracy is not None
+        present = self.prediction
+        self.scene = Scene(
+            present.operators, arrays.composition, given["matrices"], given["camera_centres"], given["body"],
+            self.pixels, given["usable"],
+        )  # fmt: skip
+        self.task = Task(
+            given["set_points"], given["wanted"], given["no_rates"], given["target_points"], given["target_known"],
+            given["centre"], given["centre_target"], given["face"],
+        )  # fmt: skip
+        self.aim: tuple[Any, ...] = ()
+        self.faced: FaceChoice | None = None
+
+    def put_numbers(self, *numbers: float) -> None:
+        """The numbers of a step's inputs, in their order in `Numbers`. Raises struct.error for integers of more than 64
+        bits.
+        """
+        _INPUTS.pack_into(self._bytes, _INPUTS_AT, *numbers)
+
+    def put_frame(
+        self, k: int, camera: int, stamp: tuple[int, int], sights: tuple[IntArray, FloatArray, FloatArray]
+    ) -> None:
+        """Frame ``k`` of a step: number of its camera, sequence number and shutter stamp [ns]; ids (s,), raw pixels
+        (s, 2) and covariances (s, 2, 2) of its markers. Arrays of other shapes count as wrong.
+        """
+        given, count = self.arrays, len(sights[0])
+        if count > MAX_MARKERS or sights[1].shape != (count, 2) or sights[2].shape != (count, 2, 2):
+            count = -1
+        else:
+            given["arrived_ids"][k, :count] = sights[0]
+            given["arrived_pixels"][k, :count], given["arrived_covariances"][k, :count] = sights[1:]
+        given["arrived_camera"][k], given["arrived_count"][k] = camera, count
+        given["arrived_seq"][k], given["arrived_ns"][k] = stamp
+
+    def _view(self) -> None:
+        given = self.arrays = views(self.record, ARRAYS, self._counts)
+        self.sample: FloatArray = given["sample"]
+        self.q: FloatArray = given["q"]
+        self.sent: FloatArray = given["sent"]
+        self.raw: FloatArray = given["raw"]
+        self.load_limits: Limits = given["effort_limits"], given["following_limits"]
+        self.stated_load_limits: Limits = given["stated_effort_limits"], given["stated_following_limits"]
+        self.weights: FloatArray = given["weights"]
+        self.velocity: FloatArray = given["velocity"]
+        self.result: FloatArray = given["result"][: 1 + 3 * self._counts["joints"]]
+        self.pixels: FloatArray = given["pixels"]
+        self.prediction = Prediction(
+            given["operators"], given["points"], given["predicted"], given["jacobian"]
+        )
+        self.of_frame = Prediction(
+            given["operators"], given["points"], given["predicted"][:1], given["jacobian"][:1]
+        )
+        self.frame_q: FloatArray = given["frame_q"]
+        self.unseen_px: FloatArray = given["unseen_px"]
+
+    def residuals(self, t_shutter_ns: int) -> FrameResiduals:
+        """The frame that was looked at last."""
+        given = self.arrays
+        return FrameResiduals(
+            t_shutter_ns, given["frame_innovation"], given["frame_spread"], given["frame_noise"],
+            given["frame_seen"].view(np.bool_), given["frame_velocity"],
+        )  # fmt: skip
+
 
 Motion = tuple[Callable[[Any, "StepContext"], "SourceOutput | None"], str]
 """The step of a motion source, and the id of the goal that it works on, '' where there is none."""
@@ -61,7 +385,7 @@ class Derived:
     motion: Motion = (lambda source, context: None, "")
     """Of the active source, as `core.move` arranges it."""
     parameters: tuple[CellModel, Any] | None = None
-    """The model whose parameters `core.monitors.agreement` has, and these."""
+    """The model whose parameters `core.sources.progress` has, and these."""
 
     def use(self, arrays: ModelArrays) -> None:
         """Work with a model from here on."""
@@ -94,7 +418,7 @@ class StepContext:
     all steps of a core; what a goal is to keep of a step, it copies. ``ingested``: what of the inputs has passed, in
     steps in which Python looks at them.
 
-    `core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) of
+    `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) of
     the markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at most,
     for it is work. ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few
     markers. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing

@@ -15,7 +15,7 @@ import numpy as np
 
 from stereoservo.core.block import HISTORY, SETTLED_FRAMES
 from stereoservo.core.camera_state import CameraEstimate
-from stereoservo.core.context import StepContext
+from stereoservo.core.context import LENS_SIZE, StepContext, Workspace
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.ingest import TAKEN, newest_frames
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays, require_fitting
@@ -44,7 +44,6 @@ from stereoservo.core.prediction import (
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState, share_sights
 from stereoservo.core.target import track
-from stereoservo.core.workspace import LENS_SIZE, Workspace
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.messages.status import ModelReadiness

@@ -13,12 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.core.block import HISTORY, VELOCITY_FILTER_S
-from stereoservo.core.context import Ingested, StepContext
+from stereoservo.core.context import MAX_FRAMES, Ingested, StepContext
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import LEAST_APART_NS, Refused
-from stereoservo.core.workspace import MAX_FRAMES
 from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle

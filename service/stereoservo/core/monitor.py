@@ -26,12 +26,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.core.camera_state import CameraMonitor
-from stereoservo.core.context import Finding, StepContext
+from stereoservo.core.context import Finding, StepContext, Workspace
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
 from stereoservo.core.ingest import TAKEN, VALUES
-from stereoservo.core.late_drives import account_travel, delays_of, measure_delays
 from stereoservo.core.monitor_state import LATE_S, MOVED, STALE_PERIODS, ModelDiagnosis, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
@@ -46,6 +45,9 @@ from stereoservo.core.monitors.following import (
     LAG_S,
     SILENCE_S,
     account_silence,
+    account_travel,
+    delays_of,
+    measure_delays,
     not_following,
     silent,
     worst_follower,
@@ -66,7 +68,6 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
 from stereoservo.core.state import CalibrationMotion, CoreState
 from stereoservo.core.target.track import beside_target
-from stereoservo.core.workspace import Workspace
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import FloatArray, Record

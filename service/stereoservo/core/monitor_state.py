@@ -159,7 +159,7 @@ class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
 
 
 class DriveDelays(NamedTuple):
-    """How late the joints' drives are, and what they lack of their travel besides; see `core.late_drives`.
+    """How late the joints' drives are, and what they lack of their travel besides; see `core.monitors.following`.
 
     ``delay_s`` (n,) as measured, 0 before and where it is no matter: the median of ``samples`` (k, n) [s]. ``onset``
     (7, n): the measurement in progress. ``sent`` (n,) [rad or m] in all, and ``past`` (r, n) of the last r steps.

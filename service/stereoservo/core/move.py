@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from stereoservo.core.command import begin_friction
 from stereoservo.core.context import Motion, SourceOutput, StepContext
-from stereoservo.core.friction import begin_friction
 from stereoservo.core.goals.servoing import unplanned_report
 from stereoservo.core.sources.calibration import trials_step
 from stereoservo.core.sources.check import check_step

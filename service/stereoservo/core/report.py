@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.core.camera_state import CameraTiming
-from stereoservo.core.context import COMPILING, SourceOutput, StepContext
+from stereoservo.core.command import SafetyLimits, SafetyResult, limited_command
+from stereoservo.core.context import COMPILING, LENS_SIZE, SourceOutput, StepContext
 from stereoservo.core.cycle import NOT_MEASURED, Status
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
-from stereoservo.core.limit import SafetyLimits, SafetyResult, limited_command
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
@@ -24,7 +24,6 @@ from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import TIMING_SIGMA_S, Prediction, propagate_covariance
 from stereoservo.core.sources.law import found_by_kernel
 from stereoservo.core.state import CoreState, LawRun, ServoGoal
-from stereoservo.core.workspace import LENS_SIZE
 from stereoservo.kinematics.kernels import distort_pixel, distortion_jacobian
 from stereoservo.messages.reasons import Level, Reason
 from stereoservo.messages.status import CameraHealth, Health, ModelReadiness

@@ -18,32 +18,64 @@ from __future__ import annotations
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.arrange import arrange, attends, lease_until_ns
 from stereoservo.core.block import steps_of_delay
-from stereoservo.core.command import command
+from stereoservo.core.command import SafetyLimits, command, safety_limits
 from stereoservo.core.context import NOTHING, Derived, StepContext
 from stereoservo.core.cycle import Event, Status, StepInputs, StepOutputs
-from stereoservo.core.estimate import load_limits, take_model, workspace
+from stereoservo.core.estimate import (
+    estimate,
+    load_limits,
+    note_frames,
+    take_frames_apart,
+    take_model,
+    workspace,
+)
 from stereoservo.core.execute_goals import execute_goals
 from stereoservo.core.ingest import (
     account_inputs,
     features_fresh_s,
     follow_driver,
     frame_timeout_s,
+    ingest,
     longest_gap_s,
     nominal_period_ns,
     put_inputs,
 )
-from stereoservo.core.limit import SafetyLimits, safety_limits
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.monitor import monitor
+from stereoservo.core.monitor import detect, monitor
 from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import move
-from stereoservo.core.observe import observe
 from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
+from stereoservo.core.sources.law import follow_goal
 from stereoservo.core.state import CoreState, Holding, ServoGoal, Source, initial_state
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Prior
+
+
+def observe(context: StepContext, *, decides: bool) -> int:
+    """What the stages have found, as bits of a number (`ingest`, `monitor`); the present, where there is a model.
+
+    The goal's progress is looked at here in steps in which nothing is decided before the motion; where Python
+    ``decides``, or anything is found, the goal may be another one then, and its law looks itself.
+    """
+    derived = context.derived
+    room, block = derived.room, context.state.block
+    work, record, space = room.numbers, block.record, room.record
+    found = ingest(record, space)
+    if work.frames_apart:
+        take_frames_apart(context)
+    if derived.arrays is None:
+        note_frames(record, space)
+    else:
+        estimate(record, space)
+        if block.numbers.history_count:
+            context.arrays = context.moved_arrays or derived.arrays
+            context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
+    found |= detect(record, space)
+    context.goes_on = bool(work.aims) and not found and not decides and follow_goal(record, space)
+    return found
+
 
 PRIOR_RATE_HZ = 125.0
 LOOK_EVERY_S = 0.2

@@ -120,7 +120,7 @@ class LawRun(Leased, eq=False, kw_only=True):
 
     Gains [1/s] as in `messages.goals.AdaptiveGain`, ``damping`` as in `control.pd`. ``reasons``: what was found when
     its progress, which is in the block (`core.block.RunProgress`), was last looked at. ``apart``: why it is held inside
-    its tolerance (see `core.monitors.agreement`), as of the first ``apart_frames`` frames of all cameras.
+    its tolerance (see `core.sources.progress`), as of the first ``apart_frames`` frames of all cameras.
     """
 
     goal: Goal

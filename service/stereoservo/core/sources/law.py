@@ -15,10 +15,9 @@ from stereoservo.control.law import JacobianChoice, Law, LawStep, Options, Scene
 from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.control.pd import damped_velocity
-from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.context import SourceOutput, StepContext, Workspace
 from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
 from stereoservo.core.model_arrays import ModelArrays
-from stereoservo.core.monitors.agreement import disagreement
 from stereoservo.core.prediction import (
     Centre,
     arm_in,
@@ -38,13 +37,13 @@ from stereoservo.core.sources.progress import (
     account_run,
     begin_run,
     decay_of_error,
+    disagreement,
     error_of_run,
     examine_progress,
 )
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import IncidenceGoal, LawRun, ServoGoal
 from stereoservo.core.target.follow import Follower, follow_target, stands, start_following
-from stereoservo.core.workspace import Workspace
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record

@@ -1,24 +1,51 @@
-"""The progress of a law's run: what every step adds to it, and why it is slow or stuck: what is found when it is looked
-at, a few times a second.
+"""The progress of a law's run: what every step adds to it, why it is slow or stuck, and whether the cameras agree with
+each other and with the joints where a goal ends, as far as the noise of the pictures and the accuracy of the model tell.
+
+The law takes the arm along with a camera that creeps: where both pictures show the set-points the arm is beside the
+goal. A difference between observed and predicted pixels remains in that camera alone. It is too small for one round of
+frames (`monitors.fault_isolation`), and is seen in the mean over the frames in which the goal's error is inside its
+tolerance.
+
+These mean innovations ``d`` are Gaussian with the covariance ``C = Σ/N + S P Sᵀ + J_q S_q J_qᵀ`` of the detector's
+noise over N frames, the model's parameters and the errors that the model states of joint readings. For each camera the
+hypothesis that it was displaced, ``d = E ξ``, reduces the chi-square ``dᵀ C⁻¹ d`` by a chi-square of six freedoms where
+nothing was displaced: a healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each look,
+all cameras together. Displacements of less than `SHARE` of the goal's tolerance are tolerated. If the joints explain
+``d`` better than any one camera, the cameras agree: the goal is where they show it. Where a gain is in `DOUBT`, which
+noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: by the union bound a false alarm
+then has at most so many times `FALSE_ALARMS` for that goal.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.calibration.change.hypothesis_test import UNCLEAR, chi2_quantile
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.stereo import ILL_CONDITIONED
 from stereoservo.core.block import Block
 from stereoservo.core.context import StepContext
-from stereoservo.core.monitors.agreement import forget_frames, take_frames
+from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.monitors.fault_isolation import named
+from stereoservo.core.prediction import chain_at
 from stereoservo.core.state import LawRun
+from stereoservo.kinematics.kernels import (
+    distort_pixel,
+    image_jacobian,
+    multiply4_into,
+    transform_points,
+    undistort_pixel,
+)
+from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray, Record
+from stereoservo.numerics.arrays import FloatArray, IntArray, KindArray, Record
 from stereoservo.numerics.compilation import kernel
-from stereoservo.numerics.linear import damped_least_squares
+from stereoservo.numerics.linear import cholesky_solve, damped_least_squares, damped_solve, factor_solve
 
 AVERAGED_S = 0.5
 """Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
@@ -271,3 +298,434 @@ def _noise_px(source: LawRun, context: StepContext) -> float:
     if not bool((usable > 0.0).any()):
         return 0.0
     return 1.0 / float(usable[usable > 0.0].min())
+
+
+FALSE_ALARMS = 1e-6
+"""Probability, at most, that noise as stated calls any camera displaced at one look."""
+DOUBT = 1e-2
+"""Probability below which a gain is not taken for noise before more frames are averaged."""
+MOST_FRAMES = 50
+"""Of a camera that are averaged before what is still in doubt is taken for noise."""
+SHARE = 0.5
+"""Of a goal's tolerance: rms change of a camera's pixels up to which its displacement is tolerated."""
+FREEDOMS = 6
+"""Of a displacement."""
+BIAS_PX = 0.05
+"""Deviation of a marker's centre that is the same in all frames, by detector and light."""
+FEWEST = 3
+"""Markers in a camera's pictures by which it is judged, and may confirm the joints."""
+MOST_ROWS = 64
+"""Markers times cameras that are looked at: of more, evenly chosen ones."""
+DAMPING = 1e-9
+LENS_STEP = 1e-3
+"""Deviations of a lens parameter over which derivatives by it are taken."""
+AGREED, DOUBTFUL, UNDECIDED, DISPLACED = range(4)
+"""What `decide` has found."""
+
+
+# -- the mean innovations -----------------------------------------------------------------------------------
+
+
+@kernel
+def forget_frames(block: Record) -> None:
+    """Begin the means anew."""
+    memory = block[0]
+    sights = memory.cameras * memory.markers
+    memory.settled_innovation[: 2 * sights] = 0.0
+    memory.settled_variance[:sights] = 0.0
+    memory.settled_count[:sights] = 0.0
+    memory.settled_ns[: memory.cameras] = 0
+
+
+@kernel
+def take_frames(block: Record) -> None:
+    """Add the newest frame of each camera to the sums, once: its markers that passed the gate."""
+    memory = block[0]
+    m, rows = memory.markers, memory.rows
+    for c in range(memory.cameras):
+        t_ns = memory.sightings[c].t_ns
+        if t_ns <= memory.settled_ns[c]:
+            continue
+        memory.settled_ns[c] = t_ns
+        for i in range(m):
+            sight, row = c * m + i, c * rows + i
+            if memory.seen_ns[sight] != t_ns:
+                continue
+            for a in range(2):
+                memory.settled_innovation[2 * sight + a] += memory.frame_innovation[2 * row + a]
+            memory.settled_variance[sight] += 0.5 * (
+                memory.frame_spread[4 * row] + memory.frame_spread[4 * row + 3]
+            )
+            memory.settled_count[sight] += 1.0
+
+
+# -- the accuracy of the model ------------------------------------------------------------------------------
+
+GENERATOR, MATRIX, LENS, POINT = range(4)
+"""Parts of a model, in the order of `ModelCovariance.parts`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ModelParameters:
+    """The free parameters of a model as kernels take them: ``directions`` (p, 16), of a generator, a camera's matrix, a
+    lens or a point, padded; the ``part`` (p,) that each changes, `GENERATOR` to `POINT`, and the ``index`` (p,) of the
+    joint, camera (in the cell's order) or marker; their ``covariance`` (p, p).
+    """
+
+    directions: FloatArray
+    part: IntArray
+    index: IntArray
+    covariance: FloatArray
+
+
+def model_parameters(model: CellModel, cameras: tuple[str, ...]) -> ModelParameters | None:
+    """Parameters of a model in a cell with these ``cameras``; None where it states no covariance."""
+    given = model.covariance
+    if given is None:
+        return None
+    order = {name: c for c, name in enumerate(cameras)}
+    directions, parts, indices, kept = [], [], [], []
+    for part, bases in enumerate(given.parts):
+        for k, basis in enumerate(bases):
+            index = order.get(model.cameras[k].name, -1) if part in (MATRIX, LENS) else k
+            for direction in basis:
+                padded = np.zeros(16)
+                padded[: direction.size] = direction.reshape(-1)
+                directions.append(padded)
+                parts.append(part)
+                indices.append(index)
+                kept.append(index >= 0)
+    used = np.flatnonzero(kept)
+    return ModelParameters(
+        np.array(directions).reshape(-1, 16)[used], np.array(parts, np.int64)[used],
+        np.array(indices, np.int64)[used], np.ascontiguousarray(given.covariance[np.ix_(used, used)]),
+    )  # fmt: skip
+
+
+@kernel
+def pixel_slopes(
+    parameters: tuple[FloatArray, IntArray, IntArray, FloatArray],
+    chain: tuple[FloatArray, KindArray, FloatArray, bool], q: FloatArray, marker_points: FloatArray,
+    cameras: tuple[FloatArray, FloatArray], sights_of: tuple[IntArray, IntArray],
+) -> FloatArray:  # fmt: skip
+    """Derivatives (2 k, p) of the innovations of k sights, in ideal pixels, by the ``parameters`` of a model, with the
+    joints at ``q`` (n,).
+
+    ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first. ``cameras``: matrices (c, 3, 4) and
+    lenses. ``sights_of``: the camera and the marker of each sight, (k,) each.
+    """
+    (matrices, lenses), (camera_of, marker_of) = cameras, sights_of
+    directions, part, index, covariance = parameters
+    generators, kinds, zero, tip_first = chain
+    n, sights = q.size, camera_of.size
+    motions = np.empty((n, 4, 4))
+    for j in range(n):
+        _motion(generators[j], kinds[j] == 1, q[j] - zero[j], motions[j])
+    before, after = np.empty((n + 1, 4, 4)), np.empty((n + 1, 4, 4))
+    before[0], after[n] = np.eye(4), np.eye(4)
+    for k in range(n):
+        multiply4_into(before[k], motions[n - 1 - k if tip_first else k], before[k + 1])
+    for back in range(n):
+        k = n - 1 - back
+        multiply4_into(motions[n - 1 - k if tip_first else k], after[k + 1], after[k])
+    H = before[n]
+    points = transform_points(H, marker_points)
+    slopes = np.zeros((2 * sights, part.size))
+    first, second, third = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
+    for p in range(part.size):
+        at, D = index[p], directions[p].reshape((4, 4))
+        if part[p] == GENERATOR:
+            k = n - 1 - at if tip_first else at
+            multiply4_into(D, motions[at], first)
+            multiply4_into(motions[at], D, second)
+            multiply4_into(before[k], first - second, third)
+            multiply4_into(third, after[k + 1], first)
+        for s in range(sights):
+            c, i = camera_of[s], marker_of[s]
+            if ((part[p] == MATRIX or part[p] == LENS) and c != at) or (part[p] == POINT and i != at):
+                continue
+            P, X = matrices[c], points[i]
+            x, y, d = _times(P[0], X), _times(P[1], X), _times(P[2], X)
+            u, v = x / d, y / d
+            if part[p] == LENS:
+                step = LENS_STEP * math.sqrt(covariance[p, p])
+                raw_u, raw_v = distort_pixel(lenses[c], u, v)
+                size = lenses.shape[1]
+                ahead = undistort_pixel(lenses[c] + step * directions[p, :size], raw_u, raw_v)
+                behind = undistort_pixel(lenses[c] - step * directions[p, :size], raw_u, raw_v)
+                slopes[2 * s, p] = (ahead[0] - behind[0]) / (2.0 * step)
+                slopes[2 * s + 1, p] = (ahead[1] - behind[1]) / (2.0 * step)
+                continue
+            change = np.zeros(3)
+            for r in range(3):
+                if part[p] == MATRIX:
+                    change[r] = _times(D[r], X)
+                elif part[p] == GENERATOR:
+                    for a in range(4):
+                        change[r] += P[r, a] * _times(first[a], marker_points[i])
+                else:
+                    for a in range(4):
+                        change[r] += P[r, a] * _times(H[a], D[0])
+            slopes[2 * s, p] = -(change[0] - u * change[2]) / d
+            slopes[2 * s + 1, p] = -(change[1] - v * change[2]) / d
+    return slopes
+
+
+@kernel
+def _motion(generator: FloatArray, prismatic: bool, step: float, motion: FloatArray) -> None:
+    """``exp(step Ĝ)`` into (4, 4)."""
+    square = np.empty((4, 4))
+    multiply4_into(generator, generator, square)
+    half = math.sin(0.5 * step)
+    linear, quadratic = (step, 0.0) if prismatic else (math.sin(step), 2.0 * half * half)
+    for i in range(4):
+        for k in range(4):
+            motion[i, k] = (1.0 if i == k else 0.0) + linear * generator[i, k] + quadratic * square[i, k]
+
+
+@kernel
+def _times(row: FloatArray, X: FloatArray) -> float:
+    product: float = row[0] * X[0] + row[1] * X[1] + row[2] * X[2] + row[3] * X[3]
+    return product
+
+
+@kernel
+def added_covariance(C: FloatArray, slopes: FloatArray, covariance: FloatArray) -> None:
+    """Add ``S P Sᵀ`` of the ``slopes`` (r, p) to the lower triangle of ``C`` (r, r)."""
+    rows, p = slopes.shape
+    product = np.zeros(p)
+    for i in range(rows):
+        for a in range(p):
+            product[a] = 0.0
+        for b in range(p):
+            if slopes[i, b] == 0.0:
+                continue
+            for a in range(p):
+                product[a] += slopes[i, b] * covariance[b, a]
+        for k in range(i + 1):
+            total = 0.0
+            for a in range(p):
+                total += product[a] * slopes[k, a]
+            C[i, k] += total
+
+
+# -- the hypotheses -----------------------------------------------------------------------------------------
+
+
+@kernel
+def explained(
+    d: FloatArray, C: FloatArray, columns: FloatArray, first: int, last: int, x: FloatArray
+) -> float:
+    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A``
+    (r, k) has the ``columns`` in the rows from ``first`` to ``last``; by how much chi-square falls.
+    """
+    rows, count = d.size, columns.shape[1]
+    weighted = np.empty((count, rows))
+    column = np.zeros(rows)
+    for k in range(count):
+        column[:] = 0.0
+        column[first:last] = columns[first:last, k]
+        factor_solve(C, column, weighted[k])
+    N, b = np.zeros((count, count)), np.zeros(count)
+    for k in range(count):
+        for r in range(rows):
+            b[k] += weighted[k, r] * d[r]
+        for j in range(k + 1):
+            for r in range(first, last):
+                N[k, j] += weighted[k, r] * columns[r, j]
+            N[j, k] = N[k, j]
+    damped_solve(N, b, DAMPING, x)
+    gain = 0.0
+    for k in range(count):
+        gain += b[k] * x[k]
+    return gain
+
+
+@kernel
+def compare_causes(
+    d: FloatArray, C: FloatArray, displaced: FloatArray, jacobian: FloatArray, begins: IntArray,
+    found: tuple[FloatArray, FloatArray],
+) -> bool:  # fmt: skip
+    """Into the gains (c + 1,) of ``found`` the fall of the chi-square of ``d`` (2 k,) where each camera was displaced,
+    and where all joints stand elsewhere; into its effects (c,) the rms displacement of each camera's pixels then [px].
+    False where the covariance ``C`` (2 k, 2 k), which is overwritten, is not positive.
+
+    ``displaced`` (2 k, 6), ``jacobian`` (2 k, n): derivatives of the pixels, which lie in the order of the cameras, of
+    which each ``begins`` (c + 1,) at a row.
+    """
+    gains, effects = found
+    x = np.zeros(d.size)
+    if not cholesky_solve(C, d, x) > 0.0:
+        return False
+    cameras = effects.size
+    for c in range(cameras):
+        first, last = begins[c], begins[c + 1]
+        gains[c], effects[c] = 0.0, 0.0
+        if last - first < 2 * FEWEST:
+            continue
+        twist = np.zeros(displaced.shape[1])
+        gains[c] = explained(d, C, displaced, first, last, twist)
+        squares = 0.0
+        for r in range(first, last):
+            shift = 0.0
+            for k in range(twist.size):
+                shift += displaced[r, k] * twist[k]
+            squares += shift * shift
+        effects[c] = math.sqrt(2.0 * squares / (last - first))
+    gains[cameras] = explained(d, C, jacobian, 0, d.size, np.zeros(jacobian.shape[1]))
+    return True
+
+
+@lru_cache(maxsize=16)
+def significant_gain(cameras: int, probability: float = FALSE_ALARMS) -> float:
+    """Fall of chi-square that noise exceeds for one of so many cameras with this probability."""
+    return chi2_quantile(probability / cameras, FREEDOMS)
+
+
+def decide(
+    gains: FloatArray, effects: FloatArray, measurements: int, freedoms: int, limit_px: float, judged: FloatArray,
+    *, may_wait: bool = False,
+) -> tuple[int, list[int]]:  # fmt: skip
+    """What the ``gains`` (c + 1,) and ``effects`` (c,) of `compare_causes` mean, and for which cameras.
+
+    `AGREED`: none of the cameras that are ``judged`` (c,) > 0 was displaced by more than ``limit_px``. `DISPLACED`: one
+    was. `UNDECIDED`: one of several, or the joints, all ``freedoms`` of them, explain as much (Schwarz). `DOUBTFUL`,
+    where it ``may_wait``: more frames tell whether it is noise.
+    """
+    cameras = effects.size
+    penalty = math.log(measurements)
+    scores = [FREEDOMS * penalty - float(gains[c]) for c in range(cameras)]
+    joints = freedoms * penalty - float(gains[cameras])
+    least = significant_gain(cameras, DOUBT if may_wait else FALSE_ALARMS)
+    found = [c for c in range(cameras) if judged[c] > 0.0 and gains[c] > least and effects[c] >= limit_px]
+    if not found or joints < min(scores[c] for c in found) - UNCLEAR:
+        return AGREED, []
+    best = min(scores)
+    likely = [c for c in found if scores[c] < best + UNCLEAR]
+    if not likely:  # a camera that is not judged explains it better
+        return AGREED, []
+    if max(float(gains[c]) for c in likely) <= significant_gain(cameras):
+        return DOUBTFUL, likely
+    alone = len(likely) == 1 and joints > best + UNCLEAR
+    return (DISPLACED if alone else UNDECIDED), likely
+
+
+# -- where a goal ends --------------------------------------------------------------------------------------
+
+
+def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None) -> Reason | None:
+    """Why a goal whose error is inside its tolerance is not reached: a camera that it uses, with set-points ``wanted``
+    (c, m) in it (None: in all), is at odds with the others and the joints; None where they agree.
+
+    Models that state no covariance, cameras that may move and bodies that move by themselves are not judged.
+    """
+    state, arrays, model = context.state, context.derived.arrays, context.state.model
+    if arrays is None or model is None or state.target is not None or any(state.mobile):
+        return None
+    parameters = _parameters(context, model)
+    if parameters is None:
+        return None
+    sights = _chosen(state.block.settled_count)
+    begins = np.searchsorted(sights[:, 0], np.arange(len(arrays.matrices) + 1)) * 2
+    if int((np.diff(begins) >= 2 * FEWEST).sum()) < 2:
+        return None
+    moment = _moment(context, arrays, parameters, sights)
+    gains, effects = np.zeros(len(arrays.matrices) + 1), np.zeros(len(arrays.matrices))
+    if not compare_causes(*moment, begins, (gains, effects)):
+        return None
+    judged = source.used if wanted is None else source.used * (wanted > 0.0).any(axis=1)
+    limit_px = SHARE * source.tolerance_px
+    may_wait = float(state.block.settled_count.max()) < MOST_FRAMES
+    found, cameras = decide(
+        gains, effects, int(begins[-1]), len(context.q), limit_px, judged, may_wait=may_wait
+    )
+    if found == AGREED:
+        return None
+    names = tuple(context.settings.cameras[c].name for c in cameras)
+    return _reason(names, float(effects[cameras].max()), limit_px, source.tolerance_px, found)
+
+
+def _parameters(context: StepContext, model: CellModel) -> ModelParameters | None:
+    kept = context.derived.parameters
+    if kept is None or kept[0] is not model:
+        names = tuple(camera.name for camera in context.settings.cameras)
+        kept = context.derived.parameters = model, model_parameters(model, names)
+    return kept[1]
+
+
+def _chosen(count: FloatArray) -> IntArray:
+    """Cameras and markers (k, 2) of the sights that are looked at, of those that were counted (c, m)."""
+    cameras, markers = count.shape
+    seen = np.flatnonzero((count > 0.0).any(axis=0))
+    most = max(FEWEST + 1, MOST_ROWS // cameras)
+    if seen.size > most:
+        seen = seen[np.arange(most) * seen.size // most]
+    chosen = np.zeros((cameras, markers), bool)
+    chosen[:, seen] = count[:, seen] > 0.0
+    return np.argwhere(chosen)
+
+
+def _moment(
+    context: StepContext, arrays: ModelArrays, parameters: ModelParameters, sights: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of ``sights`` (k, 2): mean innovations (2 k,), their covariance (2 k, 2 k), the derivatives of the pixels by a
+    displacement (2 k, 6) and by the joints (2 k, n).
+    """
+    block, q = context.state.block, context.q
+    cameras, markers = np.ascontiguousarray(sights[:, 0]), np.ascontiguousarray(sights[:, 1])
+    given = (parameters.part != POINT) | np.isin(parameters.index, markers)
+    directions, part, index = parameters.directions[given], parameters.part[given], parameters.index[given]
+    covariance = np.ascontiguousarray(parameters.covariance[np.ix_(given, given)])
+    count = block.settled_count[cameras, markers]
+    d = (block.settled_innovation[cameras, markers] / count[:, None]).reshape(-1)
+    H, operators = chain_at(arrays, q)
+    points = transform_points(H, arrays.marker_points)
+    jacobian = image_jacobian(operators, arrays.matrices, points)[cameras, markers].reshape(len(d), -1)
+    C = np.diag(np.repeat(block.settled_variance[cameras, markers] / count**2 + BIAS_PX**2, 2))
+    slopes = pixel_slopes(
+        (directions, part, index, covariance), (arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first), q,
+        arrays.marker_points, (arrays.matrices, arrays.lenses), (cameras, markers),
+    )  # fmt: skip
+    added_covariance(C, slopes, covariance)
+    if arrays.joint_accuracy is not None:
+        deviations = arrays.joint_accuracy.deviations((q - arrays.zero)[None])[0]
+        added_covariance(C, jacobian, np.diag(deviations**2))
+    if arrays.metric_basis is not None:
+        displaced = image_jacobian(arrays.metric_basis, arrays.matrices, points)[cameras, markers]
+    else:
+        displaced = _affine_motions(d, arrays.matrices, points, cameras, markers)
+    return d, C, displaced.reshape(len(d), -1), jacobian
+
+
+def _affine_motions(
+    d: FloatArray, matrices: FloatArray, points: FloatArray, cameras: IntArray, markers: IntArray
+) -> FloatArray:
+    """Derivatives (2 k, 6) of the pixels by an affine motion of a camera's image, where its displacement is unknown."""
+    images = np.einsum("kij,kj->ki", matrices[cameras], points[markers])
+    places = images[:, :2] / images[:, 2:]
+    middle, size = places.mean(axis=0), max(float(places.std()), 1.0)
+    columns = np.concatenate([np.ones((len(places), 1)), (places - middle) / size], axis=1)
+    motions = np.zeros((len(d), FREEDOMS))
+    motions[0::2, :3], motions[1::2, 3:] = columns, columns
+    return motions
+
+
+def _reason(
+    names: tuple[str, ...], effect_px: float, limit_px: float, tolerance_px: float, found: int
+) -> Reason:
+    if found == DOUBTFUL:
+        return Reason(
+            "CAMERAS_COMPARED", "slow", ", ".join(names), effect_px, limit_px, "px",
+            f"camera {' or '.join(names)} may be off by {effect_px:.3g} px rms (limit {limit_px:.3g} px): more frames "
+            "are averaged before the goal counts as reached",
+        )  # fmt: skip
+    words = named(names) if found == DISPLACED else f"camera {' or '.join(names)}"
+    causes = f"{words} crept or was moved"
+    if found == UNDECIDED:
+        causes = f"either {words} crept or was moved, or a joint's zero is off, or the marker body slipped on the arm"
+    return Reason(
+        "CAMERAS_DISAGREE", "hold", ", ".join(names), effect_px, limit_px, "px",
+        f"the error is within its tolerance of {tolerance_px:g} px, but {words} is off by {effect_px:.3g} px rms "
+        f"beside what the joints and the other cameras show (limit {limit_px:.3g} px): {causes}. Run calibrate "
+        "--check; put back what moved, or calibrate",
+    )  # fmt: skip

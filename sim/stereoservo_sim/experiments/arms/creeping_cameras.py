@@ -49,7 +49,7 @@ SHARE = 0.5
 """Of the trials' ranges, in which goals are."""
 FALSE = 1.5
 """Tolerances beside its set-points, in the pictures of cameras that stand, from which on a goal is falsely called
-reached: its tolerance, and the part of it by which cameras may be displaced (`core.monitors.agreement.SHARE`).
+reached: its tolerance, and the part of it by which cameras may be displaced (`core.sources.progress.SHARE`).
 """
 
 
