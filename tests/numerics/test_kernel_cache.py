@@ -55,6 +55,27 @@ enclosed = around(FACTOR)
 """
 
 
+TAKES_PAIR = """
+from acme.{home} import Pair
+from stereoservo.numerics.compilation import kernel
+
+@kernel
+def second(pair):
+    return pair.second
+
+@kernel
+def caller(x):
+    return second(Pair(x, 20.0 * x))
+"""
+PAIR = """
+from typing import NamedTuple
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+"""
+
+
 @pytest.fixture
 def acme(tmp_path: Path) -> Path:
     """A distribution with a kernel that calls another one, of another file."""
@@ -124,6 +145,23 @@ def test_a_kernel_of_before_an_upgrade_is_not_taken_for_one_of_after(acme: Path,
     upgrade = f"import pathlib, acme.caller; pathlib.Path({str(file)!r}).write_text({after!r})"
     assert run(acme, tmp_path / "cache", upgrade)[0] == 20.0
     assert run(acme, tmp_path / "cache")[0] == 30.0
+
+
+@pytest.mark.parametrize("change", ["moved", "damaged"])
+def test_a_list_of_kernels_that_cannot_be_read_is_written_anew(
+    acme: Path, tmp_path: Path, change: str
+) -> None:
+    (acme / "pairs.py").write_text(PAIR)
+    (acme / "caller.py").write_text(TAKES_PAIR.format(home="pairs"))
+    assert run(acme, tmp_path / "cache") == (20.0, {"caller", "second"})
+    if change == "moved":  # an upgrade without the module of a type that the list names
+        (acme / "pairs.py").rename(acme / "moved.py")
+        (acme / "caller.py").write_text(TAKES_PAIR.format(home="moved"))
+    else:
+        for file in (tmp_path / "cache").rglob("*.nbi"):
+            file.write_bytes(file.read_bytes()[:40])
+    assert run(acme, tmp_path / "cache") == (20.0, {"caller", "second"})
+    assert run(acme, tmp_path / "cache") == (20.0, set())
 
 
 def test_installed_kernels_are_used_where_they_fit(acme: Path, tmp_path: Path) -> None:

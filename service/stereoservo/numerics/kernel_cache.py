@@ -45,9 +45,10 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         for load in (super()._load_overload, self._load_shipped):
             try:
                 found = load(sig, target_context)
-            except Exception as error:  # of a damaged file: whatever unpickling and LLVM raise
+            except Exception as error:  # whatever unpickling and LLVM raise
                 warnings.warn(
-                    f"{self._name}: its file in the cache is damaged ({error!r:.200}); compiling it again",
+                    f"{self._name}: its file in the cache is of another version or damaged ({error!r:.200}); "
+                    "compiling it again",
                     RuntimeWarning,
                     stacklevel=2,
                 )
@@ -55,6 +56,15 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
             if found is not None:
                 return _without_module(found)
         return None
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            self._cache_file._load_index()
+        except OSError:
+            raise
+        except Exception:  # damaged, or of another version, with types of a module that is gone
+            self._cache_file.flush()
+        super()._save_overload(sig, data)
 
     def _load_shipped(self, sig: Any, target_context: Any) -> Any:
         folder = shipped_folder()
