@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stereoservo.control.cartesian_components import minors
 from stereoservo.control.faces import (
     CLEARLY_BETTER,
     LASTING,
@@ -24,7 +25,6 @@ from stereoservo.control.faces import (
 )
 from stereoservo.control.law import Options
 from stereoservo.control.law_registry import LAWS
-from stereoservo.control.primitives_kernel import minors
 
 from .bodies import SIGMA, Body, scene_of, six_faces, task_of, upright
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from oracles.coplanar_groups import faces_of_all_triples
+from stereoservo.control.cartesian_components import minors
 from stereoservo.control.faces import find_faces, select_faces
 from stereoservo.control.marker_groups import (
     EXHAUSTIVE,
@@ -18,7 +19,6 @@ from stereoservo.control.marker_groups import (
     triangle_altitudes,
     turned_average,
 )
-from stereoservo.control.primitives_kernel import minors
 from stereoservo.geometry.homogeneous import plane_of_points
 
 from .bodies import SIGMA, Body, corner, many_plates, outward_is_right, six_faces, upright

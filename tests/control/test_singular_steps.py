@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stereoservo.control.cartesian_components import normal_frame, stacked_singular
 from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.cartesian3 import LONGEST_STEP
-from stereoservo.control.primitives_kernel import normal_frame, stacked_singular
 from stereoservo.control.step_correction import SINGULAR, damped_step, rigid_motions
 from stereoservo.kinematics.composition import Composition
 

@@ -12,16 +12,16 @@ import pytest
 
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.sources import calibration
-from stereoservo.core.sources.calibration import start_trials
-from stereoservo.core.sources.check import check_targets
-from stereoservo.core.sources.measure_at_pose import markers_lost
-from stereoservo.core.sources.trial_stops import (
+from stereoservo.core.sources.calibration import (
     combined_offsets,
     enough_inside,
     extrapolated,
     plan_sides,
+    start_trials,
     stop_offset,
 )
+from stereoservo.core.sources.check import check_targets
+from stereoservo.core.sources.measure_at_pose import markers_lost
 from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.messages.cell_file import MAX_JOINTS
 from stereoservo.messages.goals import Calibrate, Enable, Home, JointTarget, RenewGoal

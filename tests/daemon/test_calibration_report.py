@@ -13,7 +13,7 @@ import pytest
 
 from stereoservo.calibration.fit_assessment import REMEDIES, assess_failure, assess_fit
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials, save_trials
-from stereoservo.core.sources.trial_stops import combined_offsets
+from stereoservo.core.sources.calibration import combined_offsets
 from stereoservo.daemon.jobs.calibration_report import floors, residuals_of, write_report
 from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
 from stereoservo.kinematics.denavit_hartenberg import denavit_hartenberg

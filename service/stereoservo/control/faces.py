@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.control.cartesian_components import dot, minors
 from stereoservo.control.law import Scene, Task
 from stereoservo.control.marker_groups import IN_PLANE, MarkerGroups, find_groups
-from stereoservo.control.primitives_kernel import dot, minors
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import Fields, kernel, plain

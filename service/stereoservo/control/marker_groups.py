@@ -20,7 +20,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.control.primitives_kernel import dot, minors
+from stereoservo.control.cartesian_components import dot, minors
 from stereoservo.kinematics.kernels import exp_twist, invert4
 from stereoservo.kinematics.model import CellModel, MarkerGroup
 from stereoservo.numerics.arrays import FloatArray, IntArray

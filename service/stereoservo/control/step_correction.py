@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.primitives_kernel import product
+from stereoservo.control.cartesian_components import product
 from stereoservo.kinematics.kernels import exp_twist, multiply4_into, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel

@@ -1,5 +1,5 @@
-"""What becomes of the motion source's velocity, in one kernel: what friction takes is added, late drives are looked ahead
-of, and the safety stage, the last one, makes a command of it.
+"""What becomes of the motion source's velocity, in one kernel: what friction takes is added, late drives are looked
+ahead of, and the safety stage, the last one, makes a command of it.
 
 Friction is estimated for each joint from small commands and the travel that they have brought: an integral action for a
 joint that stands, and none for one that follows. Play and sag wind nothing up, since the encoder of a motor that turns
@@ -122,14 +122,6 @@ def friction_bounds(
         most = np.where((least > travel) & inexact, 0.0, most)
         travel = np.maximum(travel, least)
     return most, travel
-
-
-@kernel
-def begin_friction(block: Record, room: Record) -> None:
-    """Nothing is known of friction; travel is compared from the joints as they are."""
-    memory, n = block[0], block[0].joints
-    memory.friction[:n] = memory.friction_sent[:n] = memory.friction_s[:n] = 0.0
-    memory.friction_from[:n] = room[0].q[:n]
 
 
 @kernel

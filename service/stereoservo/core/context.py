@@ -195,14 +195,15 @@ class Workspace:
     how long a sight has a weight, ``lasting_ns``; of a frame's gate: the squared distance ``gate``, for how long an
     innovation is known, ``known_s``, and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,),
     ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): of the model, and those that the cell file
-    states. ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.command.SafetyLimits`. Of the model: as
-    in `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of readings that err.
+    states. ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.command.SafetyLimits`. Of the
+    model: as in `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of readings that err.
 
-    What the state says of the step, by `core.arrange`: the lifecycle, ``active_before`` the driver's newest news and
-    ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python has looked at the frames; ``erring``:
-    joints may stand beside their readings; the arm is ``stopped``, ``paused``; what is watched; ``rounds_apart``:
-    Python looks at the rounds of frames, and ``quiet``: none of the last ones needed an explanation; ``masked`` (m,);
-    of each camera whether its place is ``unknown`` and what becomes of the offset of its stamps (``offset_rule``).
+    What the state says of the step, by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's newest
+    news and ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python has looked at the frames;
+    ``erring``: joints may stand beside their readings; the arm is ``stopped``, ``paused``; what is watched;
+    ``rounds_apart``: Python looks at the rounds of frames, and ``quiet``: none of the last ones needed an explanation;
+    ``masked`` (m,); of each camera whether its place is ``unknown`` and what becomes of the offset of its stamps
+    (``offset_rule``).
 
     Of a step: the joints ``q`` (n,), what `ingest` has found of ``joints``, ``frames`` and the ``gap`` of the loop; the
     fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); what the monitors have found:
@@ -418,9 +419,9 @@ class StepContext:
     all steps of a core; what a goal is to keep of a step, it copies. ``ingested``: what of the inputs has passed, in
     steps in which Python looks at them.
 
-    `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m, 2) of
-    the markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at most,
-    for it is work. ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few
+    `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m,
+    2) of the markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at
+    most, for it is work. ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few
     markers. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing
     did. ``moved_arrays``: the model with a body that is a target where it is now.
     """

@@ -24,8 +24,14 @@ from stereoservo.core.goals.execute import (
     end_source,
 )
 from stereoservo.core.goals.marker_body import BodyState, place_now
-from stereoservo.core.goals.plan import go_on_planning, plan_again, plan_report
-from stereoservo.core.goals.prepare import prepare, set_up, trusted_model
+from stereoservo.core.goals.plan import (
+    go_on_planning,
+    plan_again,
+    plan_report,
+    prepare,
+    set_up,
+    trusted_model,
+)
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.sources.law import awaits_plan
 from stereoservo.core.sources.progress import error_of_run

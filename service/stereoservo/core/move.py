@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.core.command import begin_friction
 from stereoservo.core.context import Motion, SourceOutput, StepContext
 from stereoservo.core.goals.servoing import unplanned_report
 from stereoservo.core.sources.calibration import trials_step
@@ -46,6 +45,8 @@ from stereoservo.core.state import (
 )
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
+from stereoservo.numerics.arrays import Record
+from stereoservo.numerics.compilation import kernel
 
 
 def _rest(source: Source, context: StepContext) -> None:
@@ -205,3 +206,11 @@ def _put_output(output: SourceOutput, context: StepContext) -> None:
     work.rests, work.needs_features = False, output.needs_features
     work.speed_scale = output.speed_scale * context.settings.limits.speed_scale
     work.runs = work.runs and not output.finished
+
+
+@kernel
+def begin_friction(block: Record, room: Record) -> None:
+    """Nothing is known of friction; travel is compared from the joints as they are."""
+    memory, n = block[0], block[0].joints
+    memory.friction[:n] = memory.friction_sent[:n] = memory.friction_s[:n] = 0.0
+    memory.friction_from[:n] = room[0].q[:n]

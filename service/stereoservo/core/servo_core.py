@@ -15,16 +15,19 @@ A step observes, moves and commands, by kernels on one flat record:
 
 from __future__ import annotations
 
+import sys
+
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core.arrange import arrange, attends, lease_until_ns
 from stereoservo.core.block import steps_of_delay
-from stereoservo.core.command import SafetyLimits, command, safety_limits
+from stereoservo.core.command import SafetyLimits, command, friction_bounds, safety_limits
 from stereoservo.core.context import NOTHING, Derived, StepContext
 from stereoservo.core.cycle import Event, Status, StepInputs, StepOutputs
 from stereoservo.core.estimate import (
     estimate,
     load_limits,
     note_frames,
+    offset_rules,
+    place_unknown,
     take_frames_apart,
     take_model,
     workspace,
@@ -41,13 +44,21 @@ from stereoservo.core.ingest import (
     put_inputs,
 )
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.monitor import detect, monitor
+from stereoservo.core.monitor import MONITORS, NOISE, QUIET, detect, looks_apart, monitor
 from stereoservo.core.monitors import moving_camera
-from stereoservo.core.move import move
+from stereoservo.core.move import MOTION_SOURCES, arrange_motion, move, paused
 from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.law import follow_goal
-from stereoservo.core.state import CoreState, Holding, ServoGoal, Source, initial_state
+from stereoservo.core.sources.law import aim_at, by_kernel, follow_goal
+from stereoservo.core.state import (
+    CalibrationMotion,
+    CoreState,
+    Holding,
+    Leased,
+    ServoGoal,
+    Source,
+    initial_state,
+)
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Prior
@@ -245,3 +256,67 @@ class ServoCore:
         arrange(context)
         self._attends, self._lease_until_ns = attends(context), lease_until_ns(context.state.source)
         self._arranged = context.state.source
+
+
+FAULTY = (Lifecycle.FAULT, Lifecycle.UNCONFIGURED)
+"""In which joints are no measure of cameras."""
+
+
+def arrange(context: StepContext) -> None:
+    """Write what stands into the workspace."""
+    state, settings, derived = context.state, context.settings, context.derived
+    room, watching, kind = derived.room, state.watching, MOTION_SOURCES[type(state.source)]
+    work, given = room.numbers, room.arrays
+    work.active, work.faulty = state.lifecycle is Lifecycle.ACTIVE, state.lifecycle in FAULTY
+    work.stopped, work.by_images = state.stopped, kind.by_images
+    work.learning = isinstance(state.source, CalibrationMotion)
+    work.rounds_apart = looks_apart(state)
+    work.frames_apart = any(state.mobile) or state.target is not None
+    work.quiet = watching.last == QUIET and watching.verdict == NOISE
+    work.paused = paused(state)
+    if derived.arrays is not None:
+        given["masked"][:] = watching.masked
+    for c, (rule, stated_ns) in enumerate(offset_rules(state, settings)):
+        given["unknown"][c] = place_unknown(c, state, settings)
+        given["offset_rule"][c], given["stated_offset_ns"][c] = rule, stated_ns
+    inexact = state.model is not None and state.model.joint_accuracy is not None
+    given["friction_most"][:], given["friction_travel"][:] = friction_bounds(
+        settings.joint_kinds, settings.resolution, inexact
+    )
+    source = state.source
+    work.aims = (
+        isinstance(source, ServoGoal)
+        and derived.arrays is not None
+        and by_kernel(source, derived.laws[source.law])
+        and bool(work.active)
+        and not work.paused
+    )
+    if work.aims and isinstance(source, ServoGoal):
+        aim_at(room, source)
+    arrange_motion(context)
+
+
+def attends(context: StepContext) -> bool:
+    """Whether Python has to look after the state in every step: a monitor asks for it, or a goal that is planned,
+    queued, waits, or cannot go on.
+    """
+    state, source = context.state, context.state.source
+    return (
+        any(entry.attends(state) for entry in MONITORS)
+        or any(state.mobile)
+        or bool(state.queue or state.waiting or state.queued_until_ns)
+        or state.planning is not None
+        or state.ahead is not None
+        or MOTION_SOURCES[type(source)].waits(source, context)
+        or (state.lifecycle is not Lifecycle.ACTIVE and not isinstance(source, Holding))
+    )
+
+
+NEVER_NS = sys.maxsize
+
+
+def lease_until_ns(source: Source) -> int:
+    """When the lease of the active source runs out; `NEVER_NS` where it has none."""
+    if not isinstance(source, Leased) or source.lease_s is None:
+        return NEVER_NS
+    return source.lease_until_ns

@@ -21,7 +21,7 @@ from stereoservo.core.goals.execute import (
     preempt,
 )
 from stereoservo.core.goals.marker_body import place_now
-from stereoservo.core.goals.prepare import prepare, trusted_model
+from stereoservo.core.goals.plan import prepare, trusted_model
 from stereoservo.core.goals.resolve import joint_index
 from stereoservo.core.monitors import camera_relocalization
 from stereoservo.core.monitors.camera_relocalization import refuse_while_moved

@@ -2,8 +2,8 @@
 a while later.
 
 What a joint was sent is compared with its reading as of now and as of its drive's delay (`measure_delays`), and what
-lies between the two is not missing. Nobody may have said of a drive that it is late: the delay of each joint is measured
-where it sets out from rest, from when it was sent a small travel until its reading shows it.
+lies between the two is not missing. Nobody may have said of a drive that it is late: the delay of each joint is
+measured where it sets out from rest, from when it was sent a small travel until its reading shows it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """The progress of a law's run: what every step adds to it, why it is slow or stuck, and whether the cameras agree with
-each other and with the joints where a goal ends, as far as the noise of the pictures and the accuracy of the model tell.
+each other and with the joints where a goal ends, as far as the pictures' noise and the model's accuracy tell.
 
 The law takes the arm along with a camera that creeps: where both pictures show the set-points the arm is beside the
 goal. A difference between observed and predicted pixels remains in that camera alone. It is too small for one round of

@@ -20,7 +20,7 @@ from rich.console import Console
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.core.sources.trial_stops import combined_offsets, in_view_at, stop_offset
+from stereoservo.core.sources.calibration import combined_offsets, in_view_at, stop_offset
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
