@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from oracles.safety import expected
-from stereoservo.core import limit
+from stereoservo.core import command as stage
 from stereoservo.core.block import Block, views
 from stereoservo.core.command import (
     Bounds,
@@ -98,7 +98,7 @@ def test_any_input_gives_a_finite_command_within_velocity_and_acceleration(
     assert (np.abs(result.limited) <= limits.velocity_max * (1 + 1e-12)).all()
     assert (np.abs(result.limited - previous) <= limits.acceleration_max * DT * (1 + 1e-9) + 1e-15).all()
     if not np.isfinite(raw).all():
-        assert limit.NON_FINITE_COMMAND in codes(result)
+        assert stage.NON_FINITE_COMMAND in codes(result)
         assert result.braking
     for reason in result.reasons:
         assert reason.hint
@@ -114,9 +114,9 @@ def test_any_input_gives_a_finite_command_within_velocity_and_acceleration(
 def test_the_direction_is_kept_unless_positions_or_acceleration_act(raw, previous, scale):
     raw, previous = np.array(raw), np.array(previous)
     result = safety_stage(SafetyInputs(raw, np.zeros(3), previous, DT, speed_scale=scale), make_limits())
-    if codes(result) & {limit.ACCELERATION_LIMITED, limit.JOINT_LIMIT}:
+    if codes(result) & {stage.ACCELERATION_LIMITED, stage.JOINT_LIMIT}:
         change = result.limited - previous
-        if limit.JOINT_LIMIT not in codes(result):  # a share of the way to a multiple of raw
+        if stage.JOINT_LIMIT not in codes(result):  # a share of the way to a multiple of raw
             factor = 1.0 if not raw.any() else None
             assert (
                 factor == 1.0
@@ -137,14 +137,14 @@ def test_far_from_its_limits_no_joint_is_clipped_whatever_speed_is_asked(raw, sc
     over = max(1.0, float((np.abs(raw) / (scale * limits.velocity_max)).max()))
     result = safety_stage(SafetyInputs(raw, np.zeros(3), raw / over, DT, speed_scale=scale), limits)
     np.testing.assert_allclose(result.limited, raw / over, rtol=1e-12, atol=1e-12)
-    assert limit.JOINT_LIMIT not in codes(result)
+    assert stage.JOINT_LIMIT not in codes(result)
 
 
 def test_a_joint_that_brakes_for_its_limit_does_not_slow_the_others():
     limits = make_limits()
     q, asked = np.array([1.48, 0.0, 0.0]), np.array([40.0, 0.25, -0.5])
     result = safety_stage(SafetyInputs(asked, q, np.array([0.0, 0.25, -0.5]), DT), limits)
-    assert codes(result) == {limit.JOINT_LIMIT, limit.ACCELERATION_LIMITED}
+    assert codes(result) == {stage.JOINT_LIMIT, stage.ACCELERATION_LIMITED}
     np.testing.assert_array_equal(result.limited[1:], asked[1:])
     assert 0.0 < result.limited[0] <= limits.acceleration_max[0] * DT
 
@@ -232,7 +232,7 @@ def test_a_joint_outside_may_only_move_inward(outside):
     out = safety_stage(SafetyInputs(np.array([-inward, 0.2, 0.0]), q, np.zeros(3), DT), limits)
     assert out.limited[0] == 0.0
     assert out.limited[1] > 0.0
-    (reason,) = [r for r in out.reasons if r.code == limit.JOINT_LIMIT]
+    (reason,) = [r for r in out.reasons if r.code == stage.JOINT_LIMIT]
     assert reason.subject == "j1"
     assert reason.value == outside
     assert reason.hint.startswith("jog j1 down" if outside > 0 else "jog j1 up")
@@ -256,7 +256,7 @@ def test_a_braking_joint_has_its_full_deceleration_while_another_one_is_slow():
         q = q + command * DT
         weakest = min(weakest, 1.49 - q[0])
     assert -1e-9 <= weakest < 0.02
-    assert limit.JOINT_LIMIT in codes(result)
+    assert stage.JOINT_LIMIT in codes(result)
 
 
 def test_braking_is_uniform_and_ends_at_rest():
@@ -266,7 +266,7 @@ def test_braking_is_uniform_and_ends_at_rest():
     steps = 0
     while np.abs(command).max() > 0:
         result = safety_stage(SafetyInputs(np.full(3, 0.3), np.zeros(3), command, DT, brake=True), limits)
-        assert codes(result) == {limit.BRAKING}
+        assert codes(result) == {stage.BRAKING}
         assert np.linalg.norm(command) > np.linalg.norm(result.limited)
         command = result.limited
         np.testing.assert_allclose(command, direction * np.linalg.norm(command), atol=1e-12)
@@ -281,7 +281,7 @@ def test_stale_joints_brake():
     assert not fresh.braking
     for age in (0.11, math.nan, math.inf, -math.inf, -3600.0, -1e-9):
         result = safety_stage(SafetyInputs(moving, np.zeros(3), moving, DT, joint_age_s=age), make_limits())
-        assert codes(result) == {limit.JOINTS_STALE, limit.BRAKING}
+        assert codes(result) == {stage.JOINTS_STALE, stage.BRAKING}
         assert result.limited[0] < moving[0]
 
 
@@ -289,11 +289,11 @@ def test_stale_joints_brake():
     ("age", "needs", "expected", "braking"),
     [
         (0.05, True, set(), False),
-        (0.3, True, {limit.COASTING}, False),
-        (0.51, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
-        (math.nan, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
-        (-1e-9, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
-        (-3600.0, True, {limit.FEATURES_STALE, limit.BRAKING}, True),
+        (0.3, True, {stage.COASTING}, False),
+        (0.51, True, {stage.FEATURES_STALE, stage.BRAKING}, True),
+        (math.nan, True, {stage.FEATURES_STALE, stage.BRAKING}, True),
+        (-1e-9, True, {stage.FEATURES_STALE, stage.BRAKING}, True),
+        (-3600.0, True, {stage.FEATURES_STALE, stage.BRAKING}, True),
         (-3600.0, False, set(), False),
         (5.0, False, set(), False),
     ],
@@ -312,7 +312,7 @@ def test_speed_scale_keeps_direction_and_says_so():
     result = safety_stage(SafetyInputs(raw, np.zeros(3), 0.1 * raw, DT, speed_scale=0.1), limits)
     np.testing.assert_allclose(result.limited, 0.1 * raw)
     (reason,) = result.reasons
-    assert (reason.code, reason.subject, reason.value) == (limit.VELOCITY_SCALED, "j3", 1.0)
+    assert (reason.code, reason.subject, reason.value) == (stage.VELOCITY_SCALED, "j3", 1.0)
     assert reason.threshold == pytest.approx(0.1)
 
 
@@ -350,13 +350,13 @@ def test_only_a_change_that_counts_is_told(beyond, told):
     limits = make_limits()
     raw = np.array([limits.acceleration_max[0] * DT * (1.0 + beyond), 0.0, 0.0])
     result = safety_stage(SafetyInputs(raw, np.zeros(3), np.zeros(3), DT, 0.0, 0.0, False), limits)
-    assert (limit.ACCELERATION_LIMITED in codes(result)) == told
+    assert (stage.ACCELERATION_LIMITED in codes(result)) == told
 
 
 def test_the_shortest_period_gives_reasons_with_numbers():
     inputs = SafetyInputs(np.full(3, 9.0), np.zeros(3), np.zeros(3), 5e-324, 0.0, 0.0, False)
     result = safety_stage(inputs, make_limits())
-    assert limit.ACCELERATION_LIMITED in codes(result)
+    assert stage.ACCELERATION_LIMITED in codes(result)
     assert all(reason.value is None or math.isfinite(reason.value) for reason in result.reasons)
 
 
@@ -461,7 +461,7 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
             derived=SimpleNamespace(room=SimpleNamespace(numbers=work, arrays=arrays)),
             state=SimpleNamespace(block=block), now_ns=now_ns, dt_s=step.dt_s,
         )  # fmt: skip
-        result = limit.limited_command(context, limits)
+        result = stage.limited_command(context, limits)
         same = msgspec.structs.replace(
             step,
             positions=outermost,
@@ -482,7 +482,7 @@ def test_the_limits_are_those_of_the_cell():
     names = {field.name for field in dataclasses.fields(SafetyLimits)} - {"joint_names", "features_fresh_s"}
     limits = make_limits(keep_outs=[[[0.2, 0.4], [-0.3, 0.3], [-np.inf, np.inf]]])
     cell = SimpleNamespace(**{name: getattr(limits, name) for name in names})
-    made = limit.safety_limits(SimpleNamespace(joint_names=limits.joint_names, limits=cell), 0.07)
+    made = stage.safety_limits(SimpleNamespace(joint_names=limits.joint_names, limits=cell), 0.07)
     for field in dataclasses.fields(SafetyLimits):
         wanted = 0.07 if field.name == "features_fresh_s" else getattr(limits, field.name)
         np.testing.assert_array_equal(getattr(made, field.name), wanted)

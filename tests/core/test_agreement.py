@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binom
 
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
-from stereoservo.core.monitors import agreement
+from stereoservo.core.sources import progress
 from stereoservo.core.sources.progress import (
     AGREED,
     DISPLACED,
@@ -210,7 +210,7 @@ def test_what_may_be_noise_waits_for_more_frames() -> None:
     gains, effects = np.array([30.0, 0.0, 4.0]), np.array([0.5, 0.0])
     assert decide(gains, effects, 48, 6, 0.125, np.ones(2), may_wait=True) == (DOUBTFUL, [0])
     assert decide(gains, effects, 48, 6, 0.125, np.ones(2)) == (AGREED, [])
-    told = agreement._reason(("left",), 0.3, 0.125, 0.25, DOUBTFUL)
+    told = progress._reason(("left",), 0.3, 0.125, 0.25, DOUBTFUL)
     assert (told.code, told.level) == ("CAMERAS_COMPARED", "slow")
 
 
@@ -221,10 +221,10 @@ def test_what_joints_explain_as_well_is_told_as_not_decided() -> None:
 
 
 def test_the_reason_says_what_it_may_be_and_what_to_do() -> None:
-    told = agreement._reason(("left",), 0.3, 0.125, 0.25, DISPLACED)
+    told = progress._reason(("left",), 0.3, 0.125, 0.25, DISPLACED)
     assert (told.code, told.level, told.subject) == ("CAMERAS_DISAGREE", "hold", "left")
     assert (told.value, told.threshold, told.unit) == (0.3, 0.125, "px")
     assert "either" not in told.hint
     assert "calibrate --check" in told.hint
-    doubted = agreement._reason(("left", "right"), 0.3, 0.125, 0.25, UNDECIDED)
+    doubted = progress._reason(("left", "right"), 0.3, 0.125, 0.25, UNDECIDED)
     assert "either camera left or right crept or was moved, or a joint's zero is off" in doubted.hint

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stereoservo.control.law_registry import LAWS
-from stereoservo.core import limit
+from stereoservo.core import command
 from stereoservo.messages.goals import Target
 from stereoservo.planning.path_search import SHAPES
 from stereoservo.planning.plan import Limit
@@ -30,7 +30,7 @@ def _codes(node: ast.expr) -> set[str]:
     if isinstance(node, ast.IfExp):
         return _codes(node.body) | _codes(node.orelse)
     if isinstance(node, ast.Name):
-        return {str(getattr(limit, node.id))} if hasattr(limit, node.id) else set()
+        return {str(getattr(command, node.id))} if hasattr(command, node.id) else set()
     return set()
 
 
