@@ -49,17 +49,17 @@ LAW_NAMES = re.compile(r"""["'](stereo|cartesian3|cartesian2)["']""")
 
 class CallPath(NamedTuple):
     """The ``files`` that a call enters; its ``hops``: consecutive function calls that are in different files; and the
-    ``kernels`` among the functions, by file and name.
+    ``functions``, by file and name, in the order in which they are entered first.
     """
 
     files: frozenset[str]
     hops: int
-    kernels: frozenset[tuple[str, str]] = frozenset()
+    functions: tuple[tuple[str, str], ...] = ()
 
     @property
     def read(self) -> frozenset[str]:
         """The files that hold all that runs: with those of the kernels that kernels call, which nobody sees enter."""
-        return self.files | {file for file, _ in called_kernels(self.kernels)}
+        return self.files | {file for file, _ in called_kernels(self.functions)}
 
 
 class Figure(NamedTuple):
@@ -97,7 +97,7 @@ class Trace:
     def start(self) -> None:
         """Begin anew."""
         self._files: set[str] = set()
-        self._kernels: set[tuple[str, str]] = set()
+        self._functions: dict[tuple[str, str], None] = {}
         self._last, self._hops = "", 0
         self._outside: FrameType | None = None
         self.running, self._before = True, sys.getprofile()
@@ -107,7 +107,7 @@ class Trace:
         """End; what was entered."""
         sys.setprofile(self._before)
         self.running = False
-        return CallPath(frozenset(self._files), self._hops, frozenset(self._kernels))
+        return CallPath(frozenset(self._files), self._hops, tuple(self._functions))
 
     def _see(self, frame: FrameType, event: str, argument: Any) -> None:
         if self._outside is not None:
@@ -123,7 +123,7 @@ class Trace:
             self._outside = frame
         elif file != STANDS_FOR_PROCESSES:
             self._files.add(file)
-            self._kernels.add((file, frame.f_code.co_name))
+            self._functions[file, frame.f_code.co_name] = None
             self._hops += bool(self._last) and file != self._last
             self._last = file
 
@@ -219,6 +219,7 @@ def _longest(paths: list[CallPath]) -> CallPath:
     return most._replace(hops=max(path.hops for path in paths))
 
 
+@functools.cache
 def image_path(law: str = LAWS[0], steps: int = 40) -> CallPath:
     """From a camera driver's `poll` to the joint driver's `write_velocity`, the longest of so many steps on the way to
     a goal: drivers and detector of the demonstration's cell, and the loops of vision and servo on the slots and sockets

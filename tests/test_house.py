@@ -6,10 +6,17 @@ from pathlib import Path
 
 import pytest
 
-_spec = importlib.util.spec_from_file_location("house_figures", Path(__file__).with_name("house_figures.py"))
-house = importlib.util.module_from_spec(_spec)
-sys.modules["house_figures"] = house
-_spec.loader.exec_module(house)
+
+def _loaded(name):
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+house = _loaded("house_figures")
+pictures = _loaded("house_pictures")
 
 
 def test_modules_do_not_import_each_other_in_circles():
@@ -108,19 +115,26 @@ def test_a_path_goes_from_the_camera_driver_to_the_joint_driver(paths):
     assert not [file for file in read if file.startswith("sim/")]
 
 
+def test_the_pictures_in_the_design_page_are_those_of_the_code():
+    """`python tests/house_pictures.py` draws them again."""
+    text = pictures.DESIGN.read_text("utf-8")
+    assert pictures.drawn(text, pictures.PACKAGES) == pictures.draw_packages()
+    assert pictures.drawn(text, pictures.IMAGE_PATH) == pictures.draw_image_path(house.image_path())
+
+
 def test_a_path_counts_files_and_hops():
     from stereoservo.core.ingest import nominal_period_ns
     from stereoservo.messages.reasons import Reason
 
     path = house.traced(lambda: Reason("A", "info"))
-    assert path == (frozenset(), 0, frozenset())
+    assert path == (frozenset(), 0, ())
 
     class Settings:
         rate_hz = 250.0
 
     file = "service/stereoservo/core/ingest.py"
     path = house.traced(lambda: nominal_period_ns(Settings()))
-    assert path == (frozenset({file}), 0, frozenset({(file, "nominal_period_ns")}))
+    assert path == (frozenset({file}), 0, ((file, "nominal_period_ns"),))
     assert path.read == path.files
 
 
