@@ -11,10 +11,8 @@ from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stereoservo_sim.experiments.catalogue import find_experiment
-from stereoservo_sim.experiments.comparison import MEANINGS, Comparison, tally
-from stereoservo_sim.experiments.experiment import Experiment, cell_text
-from stereoservo_sim.experiments.thesis_contents import CONTENTS, REPRODUCED
+from stereoservo_sim.experiments.catalogue import CONTENTS, REPRODUCED, find_experiment
+from stereoservo_sim.experiments.experiment import MEANINGS, Comparison, Experiment, cell_text, tally
 from stereoservo_sim.progress import ProgressCall
 
 
@@ -38,8 +36,7 @@ def reproduce_all(
     found = []
     for name in names:
         experiment = find_experiment(name)
-        repeats = any(option.name == "seeds" for option in experiment.options)
-        result = experiment.run(seed, {"seeds": seeds} if repeats else {}, progress)
+        result = experiment.run(seed, {"seeds": seeds} if experiment.seeds else {}, progress)
         answer = experiment.report(result)
         with tempfile.TemporaryDirectory(prefix="stereoservo-figures-") as scratch:
             drawn = {path.name: path.read_bytes() for path in experiment.draw(result, Path(scratch))}

@@ -8,9 +8,8 @@ from typer.testing import CliRunner
 
 from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo.cli.dispatch import app
-from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.comparison import MEANINGS, of_error, of_limit, of_statement
-from stereoservo_sim.experiments.thesis_contents import CONTENTS, REPRODUCED
+from stereoservo_sim.experiments.catalogue import CONTENTS, EXPERIMENTS, REPRODUCED
+from stereoservo_sim.experiments.experiment import MEANINGS, of_error, of_limit, of_statement
 from stereoservo_sim.experiments.thesis_page import page, reproduce_all
 
 

@@ -10,6 +10,8 @@ import re
 import sys
 from typing import Any
 
+from stereoservo_sim.benchmarks.faults.bench import drive_cells, input_cells, service_cells
+
 PAGE = """# Reliability: what happens when something fails
 
 Made by `stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.faults.page`; nothing on this page
@@ -46,12 +48,21 @@ The driver and emulated drives on a CAN bus, in the emulator's bit time: what th
 
 {drive_table}
 """
-SERVICE_COLUMNS = (
-    "fault", "at rest", "bound", "within", "a second later", "status right", "ends", "what `status` says", "void",
-)  # fmt: skip
-INPUT_COLUMNS = (
-    "input", "fault", "goal by", "at rest", "bound", "within", "after", "told", "the goal", "ends", "works again",
-)  # fmt: skip
+
+
+SERVICE = {
+    "fault": "fault", "all at rest": "at rest", "bound": "bound", "within": "within", "after": "a second later",
+    "status right": "status right", "ends of the goal": "ends", "status says": "what `status` says", "void": "void",
+}  # fmt: skip
+"""Of each table the cells that the page has, and their headings."""
+INPUTS = {
+    name: name for name in
+    ("input", "fault", "goal by", "at rest", "bound", "within", "after", "told", "goal", "ends", "works again")
+} | {"goal": "the goal"}  # fmt: skip
+DRIVES = {
+    "protocol": "protocol", "fault": "fault", "known": "noticed", "all at rest": "at rest", "bound": "bound",
+    "by": "by", "latched": "latched", "ok": "within",
+}  # fmt: skip
 PLACEHOLDERS = (
     (re.compile(r"\b\d{8}T\d{6}(?:\.\d+)?Z?"), "STAMP"),
     (re.compile(r"\b\d{4}-\d{2}-\d{2}\b"), "YYYY-MM-DD"),
@@ -59,7 +70,6 @@ PLACEHOLDERS = (
 )
 NUMBER = re.compile(r"(?<![A-Za-z\d.])\d+(?:\.\d+)?(?![A-Za-z\d])")
 """Not one of a name (`j1`, `taught2`), nor of a unit or version behind it."""
-DRIVE_COLUMNS = ("protocol", "fault", "noticed", "at rest", "bound", "by", "latched", "within")
 
 
 def reliability_page(figures: dict[str, Any]) -> str:
@@ -71,27 +81,22 @@ def reliability_page(figures: dict[str, Any]) -> str:
         drives=max(row["trials"] for row in figures["rows"]),
         inputs=max(row["trials"] for row in figures["inputs"]),
         fastest=f"{max(row['fastest_of_limit'] for row in figures['inputs']):.2f}",
-        service_table=_table(SERVICE_COLUMNS, [_service_cells(row) for row in figures["service"]]),
-        input_table=_table(INPUT_COLUMNS, [_input_cells(row) for row in figures["inputs"]]),
-        drive_table=_table(DRIVE_COLUMNS, [_drive_cells(row) for row in figures["rows"]]),
+        service_table=_table(SERVICE, [_of_service(row) for row in figures["service"]]),
+        input_table=_table(INPUTS, [input_cells(row, 0) for row in figures["inputs"]]),
+        drive_table=_table(DRIVES, [_of_drives(row) for row in figures["rows"]]),
     )
 
 
-def _service_cells(row: dict[str, Any]) -> list[str]:
-    rest = row["rest_ms"]
-    on = "goes on" if row["trials"] else "no trial"
-    ends = ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"])
-    return [
-        row["fault"],
-        on if rest is None else _pair(rest["median"], rest["max"]),
-        "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
-        f"{row['within']} of {row['trials']}",
-        ", ".join(row["after"]),
-        f"{row['status_right']} of {row['trials']}",
-        ends,
-        "<br>".join(distinct_sentences(row["status_says"])),
-        str(len(row["void"])),
-    ]
+def _of_service(row: dict[str, Any]) -> dict[str, str]:
+    cells = service_cells(row, 0)
+    cells["status says"] = "<br>".join(distinct_sentences(row["status_says"]))
+    if not row["trials"] and row["rest_ms"] is None:
+        cells["all at rest"] = "no trial"
+    return cells
+
+
+def _of_drives(row: dict[str, Any]) -> dict[str, str]:
+    return drive_cells(row, 0) | {"latched": ", ".join(row["codes"]) or "-"}
 
 
 def distinct_sentences(said: list[str]) -> list[str]:
@@ -113,42 +118,14 @@ def _in_common(sentences: list[str]) -> str:
     return NUMBER.sub(lambda _: next(common), sentences[0])
 
 
-def _input_cells(row: dict[str, Any]) -> list[str]:
-    rest = row["rest_ms"]
-    return [
-        row["input"],
-        row["fault"],
-        row["goal"],
-        "goes on" if rest is None else _pair(rest["median"], rest["max"]),
-        "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
-        f"{row['within']} of {row['trials']}",
-        ", ".join(row["after"]),
-        ", ".join(row["reasons"]) or "-",
-        ", ".join(row["outcomes"]),
-        ", ".join(str(count) for count in row["terminal_events"]),
-        f"{row['works_again']} of {row['trials']}",
+def _table(columns: dict[str, str], rows: list[dict[str, str]]) -> str:
+    """A table of ``columns``, heading by cell."""
+    lines = [
+        list(columns.values()),
+        ["---"] * len(columns),
+        *([row[name] for name in columns] for row in rows),
     ]
-
-
-def _drive_cells(row: dict[str, Any]) -> list[str]:
-    return [
-        row["protocol"],
-        row["fault"],
-        _pair(row["detected_ms_median"], row["detected_ms_max"]),
-        _pair(row["rest_ms_median"], row["rest_ms_max"]),
-        "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}",
-        row["by"],
-        ", ".join(row["codes"]) or "-",
-        "yes" if row["ok"] else "NO",
-    ]
-
-
-def _pair(median: float | None, largest: float | None) -> str:
-    return "-" if median is None or largest is None else f"{median:.0f} / {largest:.0f}"
-
-
-def _table(columns: tuple[str, ...], rows: list[list[str]]) -> str:
-    return "\n".join(_line(cells) for cells in (list(columns), ["---"] * len(columns), *rows))
+    return "\n".join(map(_line, lines))
 
 
 def _line(cells: list[str]) -> str:

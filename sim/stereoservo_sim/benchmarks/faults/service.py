@@ -4,6 +4,9 @@ cell sees of it.
 
 The time to rest is by the emulator's true joints. Machines are shared and stall: a trial in which the arm did not move
 when the fault came, or the machine stalled, is void, counted, and tried again.
+
+A cell's state may lie on a small disk, which is filled to the last byte, or becomes read-only while files on it are
+open. To mount them is root's.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +27,6 @@ from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_drivers.kit.watchdog import StallWatch
 from stereoservo_sim.benchmarks import service_bench
-from stereoservo_sim.benchmarks.faults import disks
 from stereoservo_sim.benchmarks.service_bench import (
     CELL,
     END,
@@ -35,6 +38,147 @@ from stereoservo_sim.benchmarks.service_bench import (
 )
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.world.history import TrueJointHistory
+
+DISK_MIB = 64
+RECORDS_S = 10.0
+"""After which a recording that was asked for has begun, or has not."""
+GROWS_S = 20.0
+"""After which a flight ring that can be written again is."""
+FILLS = """
+import sys, time
+zeros, full = bytes(1 << 20), False
+with open(sys.argv[1], "ab", buffering=0) as file:
+    while True:
+        try:
+            file.write(zeros)
+        except OSError:
+            if not full:
+                print("full", flush=True)
+            full = True
+            time.sleep(0.005)
+"""
+"""Fills a disk to its last byte, and takes what becomes free."""
+RING, RECORDING = "flight ring", "left out"
+"""Of the notes that nothing is recorded."""
+
+
+def memory_disk(bench: ServiceBench) -> None:
+    """The state directory lies on a file system in memory. Raises VoidTrialError where nothing may be mounted."""
+    _mount(bench, bench.directories.state, "-t", "tmpfs", "-o", f"size={DISK_MIB}m,mode=700", "stereoservo")
+
+
+def image_disk(bench: ServiceBench) -> None:
+    """It lies on an ext4 in a file, which, unlike one in memory, becomes read-only while files on it are open: as a
+    disk with errors does. Raises VoidTrialError.
+
+    The file is in memory: what is written to a disk that the drives and slots of the trial lie on could hold them up.
+    """
+    memory = bench.folder / "memory"
+    _mount(bench, memory, "-t", "tmpfs", "-o", f"size={2 * DISK_MIB}m,mode=700", "stereoservo")
+    image = memory / "disk.img"
+    with image.open("wb") as file:
+        file.truncate(DISK_MIB << 20)
+    _called("mkfs.ext4", "-q", "-m", "0", str(image))
+    _mount(bench, bench.directories.state, "-o", "loop,errors=remount-ro", str(image))
+
+
+def _mount(bench: ServiceBench, place: Path, *arguments: str) -> None:
+    """Mount at a place, until `ServiceBench.forget_state`."""
+    place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _called("mount", *arguments, str(place))
+    bench.mounts.callback(_unmount, place)
+
+
+def _unmount(place: Path) -> None:
+    """At once, or, where a process still has files open, for all who come later."""
+    try:
+        _called("umount", str(place))
+    except VoidTrialError:
+        _called("umount", "--lazy", str(place))
+
+
+def _called(*words: str) -> None:
+    try:
+        subprocess.run(words, capture_output=True, check=True, text=True)
+    except OSError as error:
+        raise VoidTrialError(f"{words[0]}: {error.strerror}") from error
+    except subprocess.CalledProcessError as error:
+        raise VoidTrialError(f"{words[0]}: {error.stderr.strip().splitlines()[0]}") from error
+
+
+def full_disk(bench: ServiceBench) -> int:
+    """The disk is full; the flight is being recorded."""
+    _record(bench)
+    filler = bench.directories.state / "filler"
+    bench.lasting.callback(filler.unlink)
+    t0_ns = time.monotonic_ns()
+    bench.start_lasting(FILLS, str(filler))
+    return t0_ns
+
+
+def read_only_disk(bench: ServiceBench) -> int:
+    """The file system is read-only from now on, for files that are open, too; the flight is being recorded."""
+    _record(bench)
+    t0_ns = time.monotonic_ns()
+    _called("mount", "-o", "remount,abort,errors=remount-ro", str(bench.directories.state))
+    return t0_ns
+
+
+def _record(bench: ServiceBench) -> None:
+    """Record the flight, from the moment that the file is begun. Raises VoidTrialError."""
+    with Client(CELL) as client:
+        client.record()
+        until = time.monotonic() + RECORDS_S
+        while not client.info().recording:
+            if time.monotonic() > until:
+                raise VoidTrialError(f"no recording had begun after {RECORDS_S:g} s")
+            time.sleep(0.02)
+
+
+def records_again(bench: ServiceBench) -> str:
+    """What is wrong with recording now that there is room: the flight ring goes on, a recording that is asked for
+    begins; empty where nothing is.
+    """
+    until = time.monotonic() + GROWS_S
+
+    def ring_grows(client: Client) -> bool:
+        while any(RING in note for note in client.status().notes):
+            if time.monotonic() > until:
+                return False
+            time.sleep(0.05)
+        return True
+
+    if not bench.asked(ring_grows):
+        return f"the flight ring is not written {GROWS_S:g} s after there was room"
+    try:
+        _record(bench)
+        with Client(CELL) as client:
+            file = Path(client.info().recording)
+            client.record(on=False)
+    except VoidTrialError as error:
+        return str(error)
+    return unexpected(bench) if file.is_file() and file.stat().st_size else f"nothing is in {file}"
+
+
+def starts_again(bench: ServiceBench) -> str:
+    """What is wrong with a daemon that ends, and one that starts, on a disk that cannot be written; empty where nothing
+    is.
+    """
+    code = bench.daemon.stop()
+    wrong = [f"the daemon ended with exit code {code}"] if code else []
+    wrong.append(unexpected(bench))
+    bench.ready()
+    wrong.append(unexpected(bench))
+    return "; ".join(filter(None, wrong))
+
+
+def unexpected(bench: ServiceBench) -> str:
+    """Lines of the daemon's log that no disk is a reason for: a process that ended, a traceback; empty without."""
+    words = ("Traceback", "starting again", "Error")
+    return "; ".join(
+        line for line in bench.daemon.output().splitlines() if any(word in line for word in words)
+    )
+
 
 SLOW = 0.03
 """Share of its speed at which the arm moves for longer than a daemon takes to start."""
@@ -163,20 +307,20 @@ FAULTS = (
         act=service_bench.damaged(service_bench.spoil_handled), note="handled.slot", trials_a_daemon=PAUSES,
     ),
     ServiceFault(
-        "disk full", None, ACTIVE, act=disks.full_disk, disk=disks.memory_disk, notes=NOT_RECORDED, reaches=True,
-        check=disks.records_again, speed_scale=FASTER,
+        "disk full", None, ACTIVE, act=full_disk, disk=memory_disk, notes=NOT_RECORDED, reaches=True,
+        check=records_again, speed_scale=FASTER,
     ),
     ServiceFault(
-        "`stereoservo stop`, disk full", COMMAND_MS, ACTIVE, disk=disks.memory_disk, notes=NOT_RECORDED,
-        act=during(disks.full_disk, service_bench.stop_command), check=disks.records_again,
+        "`stereoservo stop`, disk full", COMMAND_MS, ACTIVE, disk=memory_disk, notes=NOT_RECORDED,
+        act=during(full_disk, service_bench.stop_command), check=records_again,
     ),
     ServiceFault(
-        "file system read-only", None, ACTIVE, act=disks.read_only_disk, disk=disks.image_disk, notes=NOT_RECORDED,
-        reaches=True, check=disks.starts_again, trials_a_daemon=1, speed_scale=FASTER,
+        "file system read-only", None, ACTIVE, act=read_only_disk, disk=image_disk, notes=NOT_RECORDED,
+        reaches=True, check=starts_again, trials_a_daemon=1, speed_scale=FASTER,
     ),
     ServiceFault(
-        "`stereoservo stop`, file system read-only", COMMAND_MS, ACTIVE, disk=disks.image_disk, notes=NOT_RECORDED,
-        act=during(disks.read_only_disk, service_bench.stop_command), check=disks.unexpected, trials_a_daemon=1,
+        "`stereoservo stop`, file system read-only", COMMAND_MS, ACTIVE, disk=image_disk, notes=NOT_RECORDED,
+        act=during(read_only_disk, service_bench.stop_command), check=unexpected, trials_a_daemon=1,
     ),
     ServiceFault("gateway without memory", SILENCE_MS, (*ACTIVE, *NO_GATEWAY), act=service_bench.memory_exhausted,
                  may_go_on=True),
