@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -38,7 +37,7 @@ from stereoservo.messages.directories import (
 from stereoservo.messages.wire import PreviewInfo
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.benchmarks.service_bench import directories_in, environment, processes_of, running_daemon
-from stereoservo_sim.benchmarks.timing import stolen_share, stolen_ticks
+from stereoservo_sim.benchmarks.timing import resident_mb, stolen_share, stolen_ticks
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.experiments.experiment import ExperimentError
 from stereoservo_sim.progress import ProgressCall, counted
@@ -299,7 +298,7 @@ def run_idle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
             time.sleep(IDLE_SETTLE_S)
             for _ in counted(progress, "idle", repetitions):
                 segments.append(_segment(processes))
-            resident = {name: _resident_mb(number) for name, number in processes.items()}
+            resident = {name: _resident_mib(number) for name, number in processes.items()}
     medians = {name: np.median([segment[name] for segment in segments], axis=0) for name in processes}
     return {
         "segment_s": IDLE_SEGMENT_S,
@@ -348,9 +347,8 @@ def spent_by(process: int) -> Spent:
     return Spent(sum(int(thread[0]) for thread in threads), sum(int(thread[2]) for thread in threads))
 
 
-def _resident_mb(process: int) -> float:
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
+def _resident_mib(process: int) -> float:
+    return resident_mb(process) * 1e6 / 2**20
 
 
 RATE_HZ, PRIORITY = 250, 80

@@ -612,18 +612,8 @@ def sheet_rows(
     allowed = SHEET if name == "6x6_250" else frozenset({WEBOTS})
     right, false, shown = judged(images, finds, name, [allowed] * len(images), [{}] * len(images))
     return [
-        Row(
-            on,
-            len(images),
-            detector,
-            shown,
-            sum(len(one) for one in each),
-            false[detector],
-            None,
-            "",
-            timed[detector][1],
-        )
-        for detector, each in right.items()
+        Row(on, len(images), detector, shown, found, false[detector], None, "", timed[detector][1])
+        for detector, found in ((detector, sum(map(len, each))) for detector, each in right.items())
     ], why
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import gc
 import os
 import signal
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -44,8 +43,10 @@ from stereoservo_sim.benchmarks.service_bench import (
     running_bench,
     send,
 )
+from stereoservo_sim.benchmarks.timing import resident_mb
 from stereoservo_sim.demonstration.lockstep_operator import TERMINAL, LockstepOperator
 from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.experiments.lockstep_cells import lockstep
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import demo_cell
@@ -121,14 +122,9 @@ def run_soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
     Raises ExperimentError where an event is lost, a goal has no end or two, or the cell cannot be operated again.
     """
     rng = np.random.default_rng(seed)
-    with tempfile.TemporaryDirectory(prefix="sssoak") as name:
-        folder = Path(name)
-        truth = TrueJointHistory.in_memory(len(demo_cell().robot.joints), TRUTH_SAMPLES)
-        services = {"world": truth}
-        with LockstepCell(
-            fake_cell(), cell_dir=folder, runtime_dir=folder, seed=seed, services=services
-        ) as cell:
-            return _Soak(cell, truth, rng).run(repetitions * VIRTUAL_MINUTES * 60.0, progress)
+    truth = TrueJointHistory.in_memory(len(demo_cell().robot.joints), TRUTH_SAMPLES)
+    with lockstep(fake_cell(), seed, truth) as (cell, _):
+        return _Soak(cell, truth, rng).run(repetitions * VIRTUAL_MINUTES * 60.0, progress)
 
 
 def fake_cell() -> CellFile:
@@ -212,7 +208,7 @@ class _Soak:
     def _measure(self, passed_s: float) -> None:
         """Note memory and descriptors; collecting garbage for each goal would take a third of the run's time."""
         gc.collect()
-        self.sizes.append((passed_s / 3600.0, _resident_mb(), float(len(os.listdir("/proc/self/fd")))))
+        self.sizes.append((passed_s / 3600.0, resident_mb(), float(len(os.listdir("/proc/self/fd")))))
 
     def _taught(self, name: str) -> tuple[FeatureTarget, dict[str, float]]:
         """A posture as the cameras see it, and its joints."""
@@ -355,11 +351,6 @@ class _Soak:
                 "difference_in_sigma": float((late.mean() - early.mean()) / deviation),
             },
         }
-
-
-def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 KILLS = 10
@@ -599,8 +590,7 @@ class _LiveSoak:
         for name, pid in self.bench.processes().items():
             if name.startswith("vision-left"):
                 continue
-            pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
-            size = (hours, pages * os.sysconf("SC_PAGE_SIZE") / 1e6, len(os.listdir(f"/proc/{pid}/fd")))
+            size = (hours, resident_mb(pid), len(os.listdir(f"/proc/{pid}/fd")))
             self.sizes.setdefault(f"{name} {pid}", []).append(size)
         files = self.bench.directories.state.rglob("*")
         self.disk_mb.append(sum(path.stat().st_size for path in files if path.is_file()) / 1e6)

@@ -291,17 +291,17 @@ def benchmark_task(where: str) -> AlignmentTask:
 
 def true_path(task: AlignmentTask, profile: Profile = "linear") -> CartesianPath:
     """Cartesian path (7.25) of the plate in the rig's own frame."""
-    A, A_star = HOMOGENEOUS_MARKERS @ task.start.T, HOMOGENEOUS_MARKERS @ task.goal.T
     camera_centres = np.hstack([camera_poses()[:, :3, 3], np.ones((2, 1))])
-    parts = decompose(
-        cartesian_twists(task.start[:3, 3]),
-        A[FACE],
-        A_star[FACE],
-        A.mean(axis=0),
-        A_star.mean(axis=0),
-        camera_centres,
-    )
-    return cartesian_path(parts, profile)
+    A, A_star = (HOMOGENEOUS_MARKERS @ pose.T for pose in (task.start, task.goal))
+    return _path(cartesian_twists(task.start[:3, 3]), A, A_star, camera_centres, profile)
+
+
+def _path(
+    basis: FloatArray, A: FloatArray, A_star: FloatArray, camera_centres: FloatArray, profile: Profile
+) -> CartesianPath:
+    """Of markers from ``A`` (m, 4) to ``A_star`` (m, 4)."""
+    middles = A.mean(axis=0), A_star.mean(axis=0)
+    return cartesian_path(decompose(basis, A[FACE], A_star[FACE], *middles, camera_centres), profile)
 
 
 def known_path(
@@ -314,15 +314,7 @@ def known_path(
     if knowledge.points is None:
         raise ValueError("a model that knows the markers' places on the body is needed")
     A = knowledge.points
-    parts = decompose(
-        knowledge.basis,
-        A[FACE],
-        targets[FACE],
-        A.mean(axis=0),
-        targets.mean(axis=0),
-        knowledge.camera_centres,
-    )
-    return cartesian_path(parts, profile), A
+    return _path(knowledge.basis, A, targets, knowledge.camera_centres, profile), A
 
 
 def placed_rx90(task: AlignmentTask, seed: int, tries: int = 2000) -> SyntheticCell | None:

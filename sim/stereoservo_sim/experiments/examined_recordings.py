@@ -294,21 +294,8 @@ def judged_examination(seed: int) -> ExaminedVerdict:
     seconds = time.process_time() - begin
     true = tuple(one.kind for one in case.faults)
     size = case.faults[0].size if case.faults else 0.0
-    plain = ExaminedVerdict(
-        seed,
-        true,
-        (),
-        (),
-        true,
-        (),
-        (),
-        case.poses,
-        case.imperfect,
-        case.in_trials,
-        case.sigma,
-        size,
-        seconds,
-    )
+    about = case.poses, case.imperfect, case.in_trials, case.sigma, size, seconds
+    plain = ExaminedVerdict(seed, true, (), (), true, (), (), *about)
     if report is None:
         return msgspec.structs.replace(plain, falsely=(refused,))
     return _judged(case, report, plain)

@@ -20,6 +20,7 @@ a quarter of the thesis's own, else it ``agrees``.
 
 from __future__ import annotations
 
+import io
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -198,16 +199,17 @@ class Experiment:
         answer: dict[str, Any] = self._function("report")(result) if not isinstance(result, dict) else result
         return answer
 
+    def figures(self, result: Any) -> dict[str, bytes]:
+        """PNG files by name."""
+        return {f"{name}.png": _png(figure) for name, figure in self._function("draw")(result).items()}
+
     def draw(self, result: Any, folder: Path) -> list[Path]:
         """Write the figures into ``folder``; their paths."""
         folder.mkdir(parents=True, exist_ok=True)
         paths = []
-        for name, figure in self._function("draw")(result).items():
-            paths.append(folder / f"{name}.png")
-            if isinstance(figure, bytes):
-                paths[-1].write_bytes(figure)
-            else:
-                figure.savefig(paths[-1])
+        for name, data in self.figures(result).items():
+            paths.append(folder / name)
+            paths[-1].write_bytes(data)
         return paths
 
     def show(self, answer: dict[str, Any], console: Console) -> None:
@@ -233,6 +235,15 @@ class Experiment:
         if found is None:
             raise AttributeError(f"{module.__name__} has no {what}_{name}")
         return found
+
+
+def _png(figure: Any) -> bytes:
+    """A figure's file; one that is a file already as it is."""
+    if isinstance(figure, bytes):
+        return figure
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    return data.getvalue()
 
 
 def cases(

@@ -512,18 +512,6 @@ def _rms(change: FloatArray) -> float:
     return float(np.sqrt((change**2).sum(axis=-1).mean()))
 
 
-def _drift(
-    cell: LockstepCell, world: SimulatedCell, q: FloatArray, size_px: float, rng: np.random.Generator
-) -> str:
-    return _zero_off(cell, world, q, size_px, rng, DRIFT_NS)
-
-
-def _jump(
-    cell: LockstepCell, world: SimulatedCell, q: FloatArray, size_px: float, rng: np.random.Generator
-) -> str:
-    return _zero_off(cell, world, q, size_px, rng, JUMP_NS)
-
-
 def _zero_off(
     cell: LockstepCell,
     world: SimulatedCell,
@@ -576,8 +564,9 @@ def _slip_marker(
     return str(marker)
 
 
-_DISTURBANCES = {
-    "camera bumped": _bump, "joint zero drifts": _drift, "joint zero jumps": _jump, "marker slipped": _slip_marker,
+_DISTURBANCES: dict[Fault, Callable[..., str]] = {
+    "camera bumped": _bump, "joint zero drifts": partial(_zero_off, over_ns=DRIFT_NS),
+    "joint zero jumps": partial(_zero_off, over_ns=JUMP_NS), "marker slipped": _slip_marker,
 }  # fmt: skip
 """Each does it to a cell, and returns the subject that is to be named."""
 

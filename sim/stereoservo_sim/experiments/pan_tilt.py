@@ -170,15 +170,8 @@ def tracks_of(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> Tr
     pan, tilt = trajectories(cell)
     pan_exact, tilt_exact = cell.pixels(pan), cell.pixels(tilt)
     first = rng.normal(0, SIGMA, pan_exact[:, 0].shape)
-    return Tracks(
-        tracked(pan_exact, noise, rng, first),
-        tracked(tilt_exact, noise, rng, first),
-        pan_exact,
-        tilt_exact,
-        pan,
-        tilt,
-        noise,
-    )
+    panned, tilted = (tracked(exact, noise, rng, first) for exact in (pan_exact, tilt_exact))
+    return Tracks(panned, tilted, pan_exact, tilt_exact, pan, tilt, noise)
 
 
 def trial_data(cell: SyntheticCell, tracks: Tracks, points: int = CALIBRATING_POINTS) -> TrialData:

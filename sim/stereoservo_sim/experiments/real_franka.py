@@ -198,6 +198,12 @@ class HeldOut:
     deviations: FloatArray
     fits: tuple[tuple[int, PoseFit], ...] = ()
 
+    def over(self, other: HeldOut) -> HeldOut:
+        """These, and those of an ``other`` where there are none."""
+        names = ("errors", "squares", "deviations")
+        pairs = ((getattr(self, name), getattr(other, name)) for name in names)
+        return HeldOut(*(np.where(np.isfinite(own), own, others) for own, others in pairs))
+
     @property
     def distances(self) -> FloatArray:
         """Distances (k,) [px] of the corners that were predicted."""
@@ -451,19 +457,7 @@ def cross_validate(views: PoseViews, fold: IntArray, options: FitOptions | None 
             continue
         fits.append((int(number), fitted))
         part = judged(fitted, out)
-        if whole is None:
-            whole = part
-        else:
-            whole = HeldOut(
-                *(
-                    np.where(np.isfinite(own), own, others)
-                    for own, others in (
-                        (part.errors, whole.errors),
-                        (part.squares, whole.squares),
-                        (part.deviations, whole.deviations),
-                    )
-                )
-            )
+        whole = part if whole is None else part.over(whole)
     if whole is None:
         raise few
     return HeldOut(whole.errors, whole.squares, whole.deviations, tuple(fits))

@@ -5,7 +5,6 @@ ours.
 from __future__ import annotations
 
 import base64
-import tempfile
 from collections.abc import Callable, Iterable
 from html import escape
 from pathlib import Path
@@ -38,9 +37,8 @@ def reproduce_all(
         experiment = find_experiment(name)
         result = experiment.run(seed, {"seeds": seeds} if experiment.seeds else {}, progress)
         answer = experiment.report(result)
-        with tempfile.TemporaryDirectory(prefix="stereoservo-figures-") as scratch:
-            drawn = {path.name: path.read_bytes() for path in experiment.draw(result, Path(scratch))}
-        found.append(Reproduction(experiment, answer, experiment.compare(answer), drawn))
+        figures = experiment.figures(result)
+        found.append(Reproduction(experiment, answer, experiment.compare(answer), figures))
         done(found[-1])
     return found
 

@@ -7,10 +7,8 @@ from full speed; afterwards the cause goes, an operator acts, and the arm must r
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -36,6 +34,7 @@ from stereoservo_sim.benchmarks.soak import MOVING, fake_cell
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.demonstration.lockstep_operator import TERMINAL, LockstepOperator
 from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.experiments.lockstep_cells import lockstep
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import demo_cell
@@ -356,15 +355,10 @@ def run_inputs(
     """
     rows = []
     model = exact_simulated_model(demo_cell(), CELL_SEED)
-    with tempfile.TemporaryDirectory(prefix="ssinput") as folder:
-        for fault in faults:
-            place = FAULTS.index(fault)
-            trials = [
-                _Trial(Path(folder), model, fault, np.random.default_rng((seed, place, k))).run()
-                for k in range(repetitions)
-            ]
-            rows.append(_row(fault, trials))
-            tell(rows[-1])
+    for fault in faults:
+        draws = [np.random.default_rng((seed, FAULTS.index(fault), k)) for k in range(repetitions)]
+        rows.append(_row(fault, [_Trial(model, fault, rng).run() for rng in draws]))
+        tell(rows[-1])
     return rows
 
 
@@ -398,20 +392,14 @@ def _is_within(trial: dict[str, Any], bound_ms: float | None) -> bool:
 class _Trial:
     """One fault on a cell of its own."""
 
-    def __init__(self, folder: Path, model: CellModel, fault: InputFault, rng: np.random.Generator) -> None:
-        self.folder, self.model, self.fault, self.rng = folder, model, fault, rng
+    def __init__(self, model: CellModel, fault: InputFault, rng: np.random.Generator) -> None:
+        self.model, self.fault, self.rng = model, fault, rng
         self.truth = TrueJointHistory.in_memory(len(demo_cell().base), 1 << 14)
         self.reasons: set[str] = set()
 
     def run(self) -> dict[str, Any]:
         """What came of it."""
-        with LockstepCell(
-            fake_cell(),
-            cell_dir=self.folder,
-            runtime_dir=self.folder,
-            seed=int(self.rng.integers(1 << 31)),
-            services={"world": self.truth},
-        ) as cell:
+        with lockstep(fake_cell(), int(self.rng.integers(1 << 31)), self.truth) as (cell, _):
             self.cell, self.inputs = cell, Inputs(cell)
             self.operator = LockstepOperator(cell)
             cell.run_for(0.5)
