@@ -145,6 +145,8 @@ def _paced(line: _Transport, cycles: int) -> list[float]:
     return latencies
 
 
+# -- the driver with six drives --------------------------------------------------------------------------------
+
 SPEED = 0.05
 """[rad/s], amplitude of the commands."""
 SWING_S = 2.0
@@ -396,6 +398,8 @@ def fastest_paced(rates_hz: list[float], seconds: float) -> dict[str, Any]:
             held = rate_hz
     return {"held_hz": held, "held_share_of_limit": round(held / limit, 3), "trials": trials}
 
+
+# -- the bench -------------------------------------------------------------------------------------------------
 
 BACK_TO_BACK_S = 0.2
 """For each repetition, of every transport."""

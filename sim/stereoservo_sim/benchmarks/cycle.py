@@ -263,6 +263,8 @@ def large_bodies(count: int, seed: int, progress: ProgressCall) -> list[dict[str
     return rows
 
 
+# -- how a step's cost grows -----------------------------------------------------------------------------------
+
 LAW: LawName = "stereo"
 MARKERS, CAMERAS, JOINTS = (4, 16, 64, 256), (1, 2, 4, 8), (1, 2, 4, 8, 12)
 OTHER_MARKERS, OTHER_CAMERAS = 16, 2

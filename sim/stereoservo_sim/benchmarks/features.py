@@ -209,6 +209,8 @@ def _moved(image: npt.NDArray[np.float32], length: float, angle: float) -> npt.N
     return moved
 
 
+# -- how well dots are found -----------------------------------------------------------------------------------
+
 NEAR = (0.8, 1.2)
 """Distances [m] at which a dot's diameter is 13 to 20 px; 1.6 m: 10 px."""
 TESTED: dict[str, Conditions] = {
@@ -335,6 +337,8 @@ def robustness(
     return table
 
 
+# -- tags ------------------------------------------------------------------------------------------------------
+
 DICTIONARY = "36h11"
 TAG_COLUMNS, TAG_ROWS = 4, 3
 SIDE_PX, TILT_DEG = 80.0, 50.0
@@ -424,6 +428,8 @@ def tags(repetitions: int, seed: int) -> dict[str, Any]:
         "cpu_ms": {name: summary(samples, 1e3) for name, samples in times.items()},
     }
 
+
+# -- how long it takes -----------------------------------------------------------------------------------------
 
 IMAGES = 8
 """Pictures that the repetitions take in turn."""

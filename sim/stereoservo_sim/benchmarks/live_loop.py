@@ -270,6 +270,8 @@ def _running(names: tuple[str, ...]) -> Iterator[None]:
             process.wait()
 
 
+# -- at rest ---------------------------------------------------------------------------------------------------
+
 IDLE_SEGMENT_S = 5.0
 IDLE_SETTLE_S = 3.0
 OF_RENDERED_CAMERAS = re.compile(r"^(detector|noise|blur|background) = .*\n", re.MULTILINE)
@@ -350,6 +352,8 @@ def spent_by(process: int) -> Spent:
 def _resident_mib(process: int) -> float:
     return resident_mb(process) * 1e6 / 2**20
 
+
+# -- pages -----------------------------------------------------------------------------------------------------
 
 RATE_HZ, PRIORITY = 250, 80
 PAGES = 3
@@ -496,6 +500,8 @@ def _read(page: Any, ages: list[float]) -> None:
             info = msgspec.json.decode(message[4 : 4 + size], type=PreviewInfo)
             ages.append(1e3 * (time.time() - info.t_wall))
 
+
+# -- viewers ---------------------------------------------------------------------------------------------------
 
 WATCH_SETTLE_S = 4.0
 """After a start: until its libraries are loaded and it shows the cell."""

@@ -143,6 +143,8 @@ def over(
     return found, float(f"{np.median(times):.3g}")
 
 
+# -- chessboards and corners -----------------------------------------------------------------------------------
+
 COLUMNS, ROWS = 9, 6
 FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 Board = FloatArray | None
@@ -316,6 +318,8 @@ def all_rows(shown: Photographs, repetitions: int) -> list[Row]:
     return rows + (corner_rows(shown.franka, repetitions) if shown.franka else [])
 
 
+# -- dots ------------------------------------------------------------------------------------------------------
+
 FACE = DEFAULT_BODY[0]
 SIZE = (scenes.WIDTH, scenes.HEIGHT)
 GRID = 4
@@ -421,6 +425,8 @@ def plate_rows(shown: Photographs, repetitions: int, seed: int) -> list[Row]:
 Find = tuple[int, FloatArray]
 """A tag's id and its corners (4, 2) [px], clockwise."""
 Finder = Callable[[ImageArray], list[Find]]
+# -- tags ------------------------------------------------------------------------------------------------------
+
 FRANKA: dict[int, frozenset[int]] = {0: frozenset((0, 2, 3)), 1: frozenset((0, 2)), 2: frozenset((0, 2, 3))}
 """Tags that lie on the Franka's table, in each camera whole; the hand has tag 9."""
 HAND = 9
@@ -643,6 +649,9 @@ def tag_rows(shown: Photographs, repetitions: int) -> tuple[list[Row], list[str]
     if shown.others or shown.boards:
         parts.append(tagless_rows(shown.others + shown.boards, repetitions))
     return [row for rows, _ in parts for row in rows], [one for _, why in parts for one in why]
+
+
+# -- the bench -------------------------------------------------------------------------------------------------
 
 
 def run_detectors(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:

@@ -353,6 +353,8 @@ class _Soak:
         }
 
 
+# -- a live daemon ---------------------------------------------------------------------------------------------
+
 KILLS = 10
 """For each repetition that is asked for."""
 MINUTES = 2.0

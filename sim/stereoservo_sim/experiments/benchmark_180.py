@@ -269,6 +269,8 @@ def _images_and_joints(curves: list[Curve]) -> Figure:
     return figure
 
 
+# -- the task and its runs -------------------------------------------------------------------------------------
+
 TILT_DEG, DEPTH_M = 60.0, 1.0
 ASIDE_M = {"centred": 0.0, "aside": 0.15}
 """Of the plate's middle from the roll axis at the goal: to the side that its face looks away from."""

@@ -169,6 +169,8 @@ def draw_edge_parts(answer: dict[str, Any]) -> Figures:
     return {"edge-parts": sorted_values({"aligned": reached}, "error at the goal [px]", LIMIT_PX)}
 
 
+# -- goals carried over ----------------------------------------------------------------------------------------
+
 ALLOWED = 1.5
 """Error by edges over that by markers, rms over all cells."""
 BODY_PX = 0.05

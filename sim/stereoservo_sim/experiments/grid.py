@@ -346,6 +346,8 @@ def draw_grid(answer: dict[str, Any]) -> Figures:
     return {"grid-e_D": figure}
 
 
+# -- the house -------------------------------------------------------------------------------------------------
+
 SIGMAS = (0.3, 0.5, 1.0)
 """[px] of the house's interest points."""
 MOTIONS = (1, 5, 11, 17)

@@ -146,6 +146,8 @@ def flatness(model: CellModel, tags: tuple[int, ...]) -> Flatness:
     return Flatness(float(smallest / np.sqrt(len(points)) * 1e3), None, shared, points)
 
 
+# -- the files -------------------------------------------------------------------------------------------------
+
 POSE_FILE = "ee_poses.csv"
 COLUMNS = ("index", "x", "y", "z", "qx", "qy", "qz", "qw")
 IMAGE_NAME = re.compile(r"pose(\d+)_cam(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)

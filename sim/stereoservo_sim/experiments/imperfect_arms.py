@@ -265,6 +265,8 @@ def notes_imperfect_arms(answer: dict[str, Any]) -> Iterator[str]:
             )
 
 
+# -- a camera that creeps --------------------------------------------------------------------------------------
+
 KINDS = ("exact", "ripple", "play", "sag", "late")
 """What is imperfect in the case of seed k: the one at k modulo their number."""
 CREEP_PX = 0.5
@@ -431,6 +433,8 @@ def notes_creeping_cameras(answer: dict[str, Any]) -> Iterator[str]:
                 + ", ".join(goal["codes"])
             )
 
+
+# -- presets of mechanics --------------------------------------------------------------------------------------
 
 MINUTES = 10.0
 NOISE_PX = 0.05

@@ -288,6 +288,8 @@ FAMILIES: dict[str, ArmFamily] = {
 """By the name in the table."""
 
 
+# -- the experiment --------------------------------------------------------------------------------------------
+
 POSES = 100
 """Poses of each family by default."""
 ARMS = 20

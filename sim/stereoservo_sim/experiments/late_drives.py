@@ -153,6 +153,8 @@ def notes_late_drives(answer: dict[str, Any]) -> Iterator[str]:
     yield from map(str, answer["lost"])
 
 
+# -- damping ---------------------------------------------------------------------------------------------------
+
 DRIVES = {
     "lag 0.1 s": Mechanics(lag_s=0.1), "lag 0.2 s": Mechanics(lag_s=0.2), "0.1 s late": Mechanics(delay_s=0.1),
 }  # fmt: skip
@@ -215,6 +217,8 @@ def run_damped_drives(seeds: int, seed: int = 0, progress: ProgressCall = silent
 draw_damped_drives = drawing_sorted("damped_drives", "overshoots", "overshoot, of the longest way")
 """By drive, gain and damping."""
 
+
+# -- late pictures ---------------------------------------------------------------------------------------------
 
 LATEST_S, JITTER_S = 0.15, 0.02
 """[s] The largest of each."""

@@ -155,6 +155,8 @@ def show_laws(answer: dict[str, Any], console: Console) -> None:
     console.print(f"thesis: {answer['thesis']['roll']}")
 
 
+# -- sketches of goals -----------------------------------------------------------------------------------------
+
 Commanded = Callable[[Scene, float], FloatArray]
 
 DT_S, GAIN, SECONDS = 0.04, 1.0, 8.0
@@ -385,6 +387,8 @@ def streamed(calibration: TaskCalibration) -> Streamed:
     without = world.drive(lambda scene, time_s: command(scene, time_s, False), seconds)
     return Streamed(target[:-1], fed, without)
 
+
+# -- figures ---------------------------------------------------------------------------------------------------
 
 DPI = 100
 COLOURS_KEPT = 160

@@ -230,6 +230,8 @@ def three_parallel(axes: EuclideanAxes, H: FloatArray) -> FloatArray:
     return np.stack(found, axis=1)
 
 
+# -- six revolute joints ---------------------------------------------------------------------------------------
+
 STEPS = 40
 SOLVED = 1e-11
 APART = 1e-5

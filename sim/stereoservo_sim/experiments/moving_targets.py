@@ -355,6 +355,8 @@ def draw_moving_targets(answer: dict[str, Any]) -> Figures:
     return {"moving-targets": figure}
 
 
+# -- faults meanwhile ------------------------------------------------------------------------------------------
+
 Fault = Literal["camera bumped", "joint zero drifts", "joint zero jumps", "marker slipped"]
 FAULTS: dict[Fault, tuple[str, ...]] = {
     "camera bumped": ("camera_moved",), "joint zero drifts": ("joint_zero", "JOINT_NOT_FOLLOWING"),

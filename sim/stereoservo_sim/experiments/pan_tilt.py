@@ -287,6 +287,8 @@ def separate_rotations(trials: TrialData) -> SeenChain:
     return SeenChain(chain, cameras, pinhole_lenses(len(cameras)), ("pan", "tilt"))
 
 
+# -- through rendered pictures ---------------------------------------------------------------------------------
+
 NOISE_GREY = 2.0
 """[grey levels]"""
 ROWS, COLUMNS = 4, 3
@@ -391,6 +393,8 @@ def _picture(
 ) -> ImageArray:
     return body.picture(_camera(cell, c, q), np.zeros(3), rng, NOISE_GREY)
 
+
+# -- the experiment --------------------------------------------------------------------------------------------
 
 POSITIONS, PAIRS = 9, 35
 """General positions, and pairs of them that are predicted (fig. 4.9): one pair of the 36 is left out."""

@@ -157,6 +157,9 @@ def intrinsics_sigmas(case: RandomCase, result: CalibrationFit) -> float:
     return float(np.max(np.abs(np.array(stated) - true) / np.array(deviations)))
 
 
+# -- random rigs -----------------------------------------------------------------------------------------------
+
+
 def run_random_rigs(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
     """Cases ``seed`` to ``seed + seeds - 1``: counts, Wilson's 95 % interval of the success rate, rows over noise, and
     every case that is not a success. Raises ValueError for fewer than one case.
@@ -248,6 +251,8 @@ def notes_random_rigs(answer: dict[str, Any]) -> Iterator[str]:
         yield f"case {case['seed']}: {case['outcome']} {case['code']} {case['message']}"
 
 
+# -- behind lenses ---------------------------------------------------------------------------------------------
+
 BENDS = ((-0.4, -0.2), (-0.2, -0.05), (-0.05, 0.1))
 """Ranges of k1 that the rows are of."""
 
@@ -319,6 +324,8 @@ def notes_random_lenses(answer: dict[str, Any]) -> Iterator[str]:
             f"{case['message']}"
         )
 
+
+# -- shipped arms ----------------------------------------------------------------------------------------------
 
 AROUND = {"revolute": 0.2, "prismatic": 0.05}
 """How far from the cell's base the drawn configuration may be [rad or m]."""
@@ -417,6 +424,8 @@ def notes_shipped_arms(answer: dict[str, Any]) -> Iterator[str]:
     for case in answer["not_successes"]:
         yield f"{case['arm']}, seed {case['seed']}: {case['outcome']} {case['code']} {case['message']}"
 
+
+# -- arms that are not perfect ---------------------------------------------------------------------------------
 
 MECHANICS_NOISES = (0.01, 0.5)
 """[px], log-uniform."""

@@ -550,6 +550,8 @@ def triangulation_errors(
     return [Triangulated(s, np.concatenate(found)) for s, found in errors.items() if found]
 
 
+# -- report and figures ----------------------------------------------------------------------------------------
+
 REFERENCE = {
     "median_px": 0.66,
     "rms_px": 0.86,

@@ -144,6 +144,8 @@ def trial_motions(
     return np.array(positions), np.array(trials, dtype=np.int64)
 
 
+# -- tables ----------------------------------------------------------------------------------------------------
+
 LINK_2 = KnownLength("a", ("j2",), 0.4)
 """The scale, as in table 5.4."""
 
@@ -369,6 +371,8 @@ def simulate(
         sigma,
     )
 
+
+# -- report and figures ----------------------------------------------------------------------------------------
 
 BINS = np.linspace(-4.0, 4.0, 41)
 """Edges of the residual histograms [sigmas]."""

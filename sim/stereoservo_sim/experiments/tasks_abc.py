@@ -147,6 +147,8 @@ def _prior(camera: str, t_ns: int, expected: FloatArray) -> Prior:
     return prior_at(camera, t_ns, ids, pixels, PRIOR_PX**2)
 
 
+# -- the tasks through pictures --------------------------------------------------------------------------------
+
 DETECTED_PX = 0.02
 """[px] an axis, that the fit is told of the markers in the trials' pictures."""
 HARD = ("B", "projective", True)
@@ -290,6 +292,8 @@ def _end(row: dict[str, Any]) -> str:
         else f"fails: {row['reason']}"
     )
 
+
+# -- the experiment --------------------------------------------------------------------------------------------
 
 DRAWN = {"A": (40.0, 0.15), "B": (100.0, 0.10), "C": (60.0, 0.25)}
 """Angle [°] and distance [m] of the tasks; B is the one with the important rotation of the plate."""

@@ -119,6 +119,8 @@ def _box(H: FloatArray, side: int, camera: PinholeCamera) -> tuple[int, int, int
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
+# -- chessboards -----------------------------------------------------------------------------------------------
+
 SQUARES, SIDE = 8, 0.025
 """Squares along a board, and their side [m]."""
 CORNERS = SQUARES - 1
@@ -194,6 +196,8 @@ def upright(grid: FloatArray) -> FloatArray:
         grid = grid[:, ::-1]
     return grid[::-1] if grid[-1, 0, 1] < grid[0, 0, 1] else grid
 
+
+# -- a tracker like the thesis's -------------------------------------------------------------------------------
 
 HALF, BACK_REACH = 7, 4
 """[px] Of a window's side, and how far around where it came from a match is sought back."""
@@ -271,6 +275,8 @@ def _paraboloid() -> FloatArray:
 
 PARABOLOID = _paraboloid()
 
+
+# -- the product's detectors -----------------------------------------------------------------------------------
 
 PERIOD_NS = 33_000_000
 

@@ -256,6 +256,8 @@ def _row(
     }
 
 
+# -- the bench -------------------------------------------------------------------------------------------------
+
 WALL_SHARE = 3
 """For so many trials in bit time one in real time, which takes seconds."""
 

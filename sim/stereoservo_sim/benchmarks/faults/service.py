@@ -180,6 +180,8 @@ def unexpected(bench: ServiceBench) -> str:
     )
 
 
+# -- trials ----------------------------------------------------------------------------------------------------
+
 SLOW = 0.03
 """Share of its speed at which the arm moves for longer than a daemon takes to start."""
 RAMP_MS = 60.0
