@@ -422,11 +422,11 @@ def plate_rows(shown: Photographs, repetitions: int, seed: int) -> list[Row]:
     return sorted(dot_rows(paths, repetitions, seed), key=lambda row: row.shown == 0) if paths else []
 
 
+# -- tags ------------------------------------------------------------------------------------------------------
+
 Find = tuple[int, FloatArray]
 """A tag's id and its corners (4, 2) [px], clockwise."""
 Finder = Callable[[ImageArray], list[Find]]
-# -- tags ------------------------------------------------------------------------------------------------------
-
 FRANKA: dict[int, frozenset[int]] = {0: frozenset((0, 2, 3)), 1: frozenset((0, 2)), 2: frozenset((0, 2, 3))}
 """Tags that lie on the Franka's table, in each camera whole; the hand has tag 9."""
 HAND = 9
