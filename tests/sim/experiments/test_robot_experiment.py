@@ -24,12 +24,13 @@ from stereoservo_sim.experiments.robot import (
     thesis_cell,
     trial_motions,
 )
+from stereoservo_sim.progress import silent
 from stereoservo_sim.world.exact_model import exact_model
 
 
 @pytest.fixture(scope="module")
 def answer():
-    return run_robot(seeds=6, seed=3)
+    return EXPERIMENTS["robot"].run(3, {"seeds": 6}, silent)
 
 
 def rows_of(answer, table):
