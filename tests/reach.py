@@ -29,7 +29,7 @@ PUBLIC = (
     "stereoservo_drivers.contracts", "stereoservo_drivers.kit", "stereoservo.control.contracts", "stereoservo.client",
 )  # fmt: skip
 """What others import: suites that makers of drivers subclass, the goal client. All of it is an entry point."""
-FOUND_BY_NAME = ("run_", "report_", "draw_", "show_", "compare_")
+FOUND_BY_NAME = ("run_", "report_", "draw_", "show_", "notes_", "compare_")
 """Functions that an experiment's declaration finds in the modules that it names."""
 KEPT_HEADING = "## Kept for later work"
 NEUTRAL_DECORATORS = {
@@ -135,6 +135,8 @@ class Scope:
             if (module := self._dotted(node.value)) is not None:
                 result.definitions.add((module, node.attr))
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if f"{self.package}.{node.value}" in self.modules:
+                result.modules.add(f"{self.package}.{node.value}")
             if re.fullmatch(r"[A-Za-z_]\w*", node.value):
                 result.attributes.add(node.value)
                 if node.value in self.names:  # an annotation in quotes
@@ -143,8 +145,6 @@ class Scope:
                 module, _, name = node.value.partition(":")
                 below = f"{self.package}.{module}"
                 result.definitions.add((below if below in self.modules else module, name))
-            elif f"{self.package}.{node.value}" in self.modules:
-                result.modules.add(f"{self.package}.{node.value}")
 
     def _dotted(self, node: ast.expr) -> str | None:
         """The module that ``node`` stands for."""

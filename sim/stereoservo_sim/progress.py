@@ -17,6 +17,18 @@ LINE_EVERY_S = 5.0
 """Between two lines of a stage at least, but for its first and its last one."""
 
 
+def silent(stage: str, done: int, total: int) -> None:
+    """Tells nobody."""
+
+
+def counted(tell: ProgressCall, stage: str, total: int) -> Iterator[int]:
+    """0 to ``total`` - 1; tells how many are done before each, and at the end."""
+    for done in range(total):
+        tell(stage, done, total)
+        yield done
+    tell(stage, total, total)
+
+
 @contextmanager
 def progress_bar() -> Iterator[ProgressCall]:
     """A bar on stderr where that is a terminal, else a line from time to time."""

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90_with_facets
-from stereoservo_sim.benchmarks.cycle import drive
-from stereoservo_sim.benchmarks.scale import JOINTS, MARKERS, exponents, power, with_joints, with_markers
+from stereoservo_sim.benchmarks.cycle import (
+    JOINTS,
+    MARKERS,
+    drive,
+    exponents,
+    power,
+    with_joints,
+    with_markers,
+)
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 

@@ -9,7 +9,7 @@ import pytest
 from stereoservo.calibration.rig_model import expected_pixels, projective_rig
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo_sim.experiments.arms.thesis_robot import thesis_cell, trial_motions
+from stereoservo_sim.experiments.robot import thesis_cell, trial_motions
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.synthetic import FIRST_MARKER, flat_plate, placed, translation, two_faces
 

@@ -22,7 +22,7 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
-from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, judged_mechanics, unseen
+from stereoservo_sim.experiments.random_rigs import driven_stops, judged_mechanics, unseen
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.mechanical_trials import mechanical_trials
 from stereoservo_sim.world.mechanics import preset

@@ -5,8 +5,12 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo_sim.experiments.arms.random_lenses import run_random_lenses
-from stereoservo_sim.experiments.arms.random_rigs import held_out_ratio, judged, run_random_rigs
+from stereoservo_sim.experiments.random_rigs import (
+    held_out_ratio,
+    judged_case,
+    run_random_lenses,
+    run_random_rigs,
+)
 from stereoservo_sim.summaries import wilson
 from stereoservo_sim.world import random_cells
 from stereoservo_sim.world.random_cells import random_case, random_lens_case
@@ -112,11 +116,11 @@ def test_a_thousand_random_rigs_are_calibrated_from_nothing():
 )
 def test_noise_leads_no_axis_astray(seed):
     """The linear start finds no rotation here, and the nominal one creeps along a valley beside the minimum."""
-    verdict = judged(seed)
+    verdict = judged_case(random_case(seed))
     assert verdict.outcome == "success", verdict
 
 
 @pytest.mark.slow
 def test_a_lens_that_no_model_has_is_a_cause_that_fails():
     """A correction that was tried ended in a distortion of -1.8, and the whole fit in a `ModelFileError`."""
-    assert judged(21040).code == "not_identifiable"
+    assert judged_case(random_case(21040)).code == "not_identifiable"

@@ -22,7 +22,7 @@ from stereoservo.calibration.joint_errors.score_tests import (
 from stereoservo.calibration.joint_errors.variance_components import readings, reduced_rows
 from stereoservo.calibration.rig_model import JointNoise
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo_sim.experiments.arms.random_mechanics import WELL, judged_mechanics
+from stereoservo_sim.experiments.random_rigs import WELL, judged_mechanics
 from stereoservo_sim.world import synthetic
 
 

@@ -16,7 +16,7 @@ import pytest
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.cli.examine.folder import read_folder
 from stereoservo.cli.main import invoke
-from stereoservo_sim.experiments.cameras.examined_recordings import examined_case
+from stereoservo_sim.experiments.examined_recordings import examined_case
 
 BUMPED = 5
 """Seed of a case whose camera cam1 is moved before its frame 386."""

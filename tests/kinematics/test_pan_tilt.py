@@ -5,7 +5,7 @@ import numpy as np
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.joint_angles import homing_displacement, homing_problem, joint_zeros
 from stereoservo.kinematics.joint_reprojection import seen_chain
-from stereoservo_sim.experiments.rotations.pan_tilt import feed_forward
+from stereoservo_sim.experiments.pan_tilt import feed_forward
 from stereoservo_sim.world import synthetic
 
 

@@ -29,8 +29,13 @@ from stereoservo.client import Client, ClientError, SessionError
 from stereoservo.daemon.heartbeat import HeartbeatReader
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.kinematics.model import encode_model
-from stereoservo.messages.directories import CellDirectories, cell_directories
-from stereoservo.messages.discovery import DaemonError, DaemonProcess
+from stereoservo.messages.directories import (
+    RUNTIME_VARIABLE,
+    STATE_VARIABLE,
+    CellDirectories,
+    cell_directories,
+)
+from stereoservo.messages.discovery import DaemonError, DaemonInfo, DaemonProcess
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
@@ -290,22 +295,55 @@ def running_bench() -> Iterator[ServiceBench]:
 
     Raises ExperimentError for what a daemon or a client says.
     """
-    names = ("STEREOSERVO_RUNTIME_DIR", "STEREOSERVO_STATE_DIR")
-    before = {name: os.environ.get(name) for name in names}
     with tempfile.TemporaryDirectory(prefix="ssbench") as name:
         folder = Path(name)
-        os.environ.update(dict(zip(names, (str(folder / "r"), str(folder / "s")), strict=True)))
+        with environment(directories_in(folder)):
+            try:
+                with ServiceBench(folder) as bench:
+                    yield bench
+            except (DaemonError, ClientError, SessionError) as error:
+                raise ExperimentError("daemon", str(error)) from error
+
+
+@contextmanager
+def running_daemon(
+    path: Path,
+    folder: Path,
+    options: tuple[str, ...] = (),
+    environ: dict[str, str] | None = None,
+    code: str = "daemon",
+) -> Iterator[DaemonInfo]:
+    """The daemon of a cell file, which is up, with its directories in ``folder``; ``environ``: for its processes.
+
+    Raises ExperimentError ``code`` for what a daemon or a client says.
+    """
+    log = folder / "daemon.log"
+    with environment(directories_in(folder)):
         try:
-            with ServiceBench(folder) as bench:
-                yield bench
-        except (DaemonError, ClientError, SessionError) as error:
-            raise ExperimentError("daemon", str(error)) from error
-        finally:
-            for key, value in before.items():
-                if value is None:
-                    os.environ.pop(key, None)
-                else:
-                    os.environ[key] = value
+            with DaemonProcess(path, options=options, log=log, environment=environ) as daemon:
+                yield daemon.wait_ready()
+        except (ClientError, DaemonError) as error:
+            raise ExperimentError(code, f"{error}; {log.read_text()[-2000:]}") from error
+
+
+def directories_in(folder: Path) -> dict[str, str]:
+    """Variables that put a cell's directories into ``folder``."""
+    return {RUNTIME_VARIABLE: str(folder / "r"), STATE_VARIABLE: str(folder / "s")}
+
+
+@contextmanager
+def environment(variables: dict[str, str]) -> Iterator[None]:
+    """Context manager: environment variables of this process and of those that it starts."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 def send(pid: int, how: signal.Signals) -> None:

@@ -13,8 +13,6 @@ import tempfile
 import time
 import uuid
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 from stereoservo.client import Client, ClientError
-from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
+from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import DaemonError, DaemonProcess
 from stereoservo.messages.goals import Calibrate
 from stereoservo.messages.wire import StateMessage, encode
 from stereoservo.numerics.compilation import LOG_VARIABLE
-from stereoservo_sim.benchmarks.service_bench import processes_of
+from stereoservo_sim.benchmarks.service_bench import directories_in, environment, processes_of
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.experiments.experiment import ExperimentError
@@ -60,8 +58,7 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
     with tempfile.TemporaryDirectory(prefix="stereoservo-startup-") as scratch:
         folder = Path(scratch)
         variables = {
-            RUNTIME_VARIABLE: str(folder / "run"),
-            STATE_VARIABLE: str(folder / "state"),
+            **directories_in(folder),
             "NUMBA_CACHE_DIR": str(folder / "cache"),
         }
         with environment(variables):
@@ -81,21 +78,6 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
         "commands": commands,
         "kernels": kernels,
     }
-
-
-@contextmanager
-def environment(variables: dict[str, str]) -> Iterator[None]:
-    """Context manager: environment variables of this process and of those that it starts."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
@@ -204,11 +186,12 @@ def _commands(repetitions: int, progress: ProgressCall) -> dict[str, Any]:
     return found
 
 
-def show_startup(figures: dict[str, Any], console: Console) -> None:
-    """The table of what compiles."""
+def show_startup(figures: dict[str, Any], console: Console) -> dict[str, Any]:
+    """The table of what compiles; the rest of the figures."""
     table = Table("kernel", "signatures", "seconds", "processes", box=None)
     for row in figures["kernels"]:
         table.add_row(
             row["kernel"], str(row["signatures"]), f"{row['seconds']:.2f}", " ".join(row["processes"])
         )
     console.print(table)
+    return {key: value for key, value in figures.items() if key != "kernels"}

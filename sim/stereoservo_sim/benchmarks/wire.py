@@ -13,14 +13,11 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from stereoservo.client import Client, ClientError
+from stereoservo.client import Client
 from stereoservo.client.events import EventWatch
-from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE
-from stereoservo.messages.discovery import DaemonError, DaemonProcess
 from stereoservo.messages.wire import FeaturesMessage, StateMessage, decode
-from stereoservo_sim.benchmarks.startup import environment
+from stereoservo_sim.benchmarks.service_bench import running_daemon
 from stereoservo_sim.benchmarks.timing import summary
-from stereoservo_sim.experiments.experiment import ExperimentError
 from stereoservo_sim.progress import ProgressCall
 
 LIMITS = "\n".join(
@@ -70,46 +67,41 @@ def run_wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
     """
     calls = repetitions * CALLS
     with tempfile.TemporaryDirectory(prefix="stereoservo-wire-") as scratch:
-        folder = Path(scratch)
-        path, log = folder / "wire.toml", folder / "daemon.log"
+        path = Path(scratch) / "wire.toml"
         path.write_text(CELL)
-        variables = {RUNTIME_VARIABLE: str(folder / "run"), STATE_VARIABLE: str(folder / "state")}
-        try:
-            with (
-                environment(variables),
-                DaemonProcess(path, options=("--seed", str(seed)), log=log) as daemon,
-            ):
-                info = daemon.wait_ready()
-                with Client(info.cell) as client, _echo(info.endpoint):
-                    client.enable()
-                    progress("wire", 0, 4)
-                    query = {
-                        "bare_zenoh": _times(lambda: client.query("bench/echo"), calls),
-                        "status": _times(client.status, calls),
-                    }
-                    progress("wire", 1, 4)
-                    command = {"hold": _times(client.hold, calls)}
-                    client.resume()
-                    put = _times(lambda: client.session.put("bench/unheard", b"{}"), calls)
-                    progress("wire", 2, 4)
-                    features = f"{client.keys.prefix}/features/left"
-                    ways = {
-                        "state": _one_way(client, client.keys.state, _of_state, calls),
-                        "features": _one_way(client, features, _of_features, calls),
-                    }
-                    progress("wire", 3, 4)
-                    goals = _goals(client, repetitions * GOALS)
-                    rate_hz = client.status().loop.rate_hz
-                    progress("wire", 4, 4)
-        except (ClientError, DaemonError) as error:
-            raise ExperimentError("wire", f"{error}; {log.read_text()[-2000:]}") from error
+        daemon = running_daemon(path, Path(scratch), ("--seed", str(seed)), code="wire")
+        with daemon as info, Client(info.cell) as client, _echo(info.endpoint):
+            client.enable()
+            progress("wire", 0, 4)
+            query = {
+                "bare_zenoh": _times(lambda: client.query("bench/echo"), calls),
+                "status": _times(client.status, calls),
+            }
+            progress("wire", 1, 4)
+            command = {"hold": _times(client.hold, calls)}
+            client.resume()
+            put = _times(lambda: client.session.put("bench/unheard", b"{}"), calls)
+            progress("wire", 2, 4)
+            features = f"{client.keys.prefix}/features/left"
+            ways = {
+                "state": _one_way(client, client.keys.state, _of_state, calls),
+                "features": _one_way(client, features, _of_features, calls),
+            }
+            progress("wire", 3, 4)
+            goals = _goals(client, repetitions * GOALS)
+            rate_hz = client.status().loop.rate_hz
+            progress("wire", 4, 4)
+
+    def of_each(samples: dict[str, list[float]]) -> dict[str, Any]:
+        return {name: summary(seconds, 1e6) for name, seconds in samples.items()}
+
     return {
         "rate_hz": rate_hz,
-        "query_us": {name: summary(samples, 1e6) for name, samples in query.items()},
-        "command_us": {name: summary(samples, 1e6) for name, samples in command.items()},
+        "query_us": of_each(query),
+        "command_us": of_each(command),
         "put_us": summary(put, 1e6),
-        "one_way_us": {name: summary(samples, 1e6) for name, samples in ways.items()},
-        "goal_us": {name: summary(samples, 1e6) for name, samples in goals.items()},
+        "one_way_us": of_each(ways),
+        "goal_us": of_each(goals),
     }
 
 

@@ -6,146 +6,42 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from stereoservo_sim.experiments.experiment import ExperimentError
-from stereoservo_sim.progress import ProgressCall, progress_bar
+from stereoservo_sim.progress import progress_bar
 
-Bench = Callable[[int, int, ProgressCall], dict[str, Any]]
-
-
-def _calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.calibration import run_calibration
-
-    return run_calibration(repetitions, seed, progress)
-
-
-def _can(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.can import run_can
-
-    return run_can(repetitions, seed, progress)
-
-
-def _cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.cycle import run_cycle
-
-    return run_cycle(repetitions, seed, progress)
-
-
-def _detectors(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.photographs.table import run_detectors
-
-    return run_detectors(repetitions, seed, progress)
-
-
-def _faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.faults.bench import run_faults
-
-    return run_faults(repetitions, seed, progress)
-
-
-def _features(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.features import run_features
-
-    return run_features(repetitions, seed, progress)
-
-
-def _idle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.live_loop.idle import run_idle
-
-    return run_idle(repetitions, seed, progress)
-
-
-def _ik(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.experiments.arms.learnt_postures import run_ik
-
-    return run_ik(repetitions, seed, progress)
-
-
-def _loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.live_loop.loop import run_loop
-
-    return run_loop(repetitions, seed, progress)
-
-
-def _page(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.live_loop.page import run_page
-
-    return run_page(repetitions, seed, progress)
-
-
-def _recording(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.recording import run_recording
-
-    return run_recording(repetitions, seed, progress)
-
-
-def _scale(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.scale import run_scale
-
-    return run_scale(repetitions, seed, progress)
-
-
-def _soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.soak import run_soak
-
-    return run_soak(repetitions, seed, progress)
-
-
-def _kills(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.service_soak import run_kills
-
-    return run_kills(repetitions, seed, progress)
-
-
-def _soak_live(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.service_soak import run_soak_live
-
-    return run_soak_live(repetitions, seed, progress)
-
-
-def _startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.startup import run_startup
-
-    return run_startup(repetitions, seed, progress)
-
-
-def _watch(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.live_loop.watch import run_watch
-
-    return run_watch(repetitions, seed, progress)
-
-
-def _wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    from stereoservo_sim.benchmarks.wire import run_wire
-
-    return run_wire(repetitions, seed, progress)
-
-
-BENCHES: dict[str, Bench] = {
-    "calibration": _calibration,
-    "can": _can,
-    "cycle": _cycle,
-    "detectors": _detectors,
-    "faults": _faults,
-    "features": _features,
-    "idle": _idle,
-    "ik": _ik,
-    "kills": _kills,
-    "loop": _loop,
-    "page": _page,
-    "recording": _recording,
-    "scale": _scale,
-    "soak": _soak,
-    "soak-live": _soak_live,
-    "startup": _startup,
-    "watch": _watch,
-    "wire": _wire,
+BENCHES = {
+    "calibration": "stereoservo_sim.benchmarks.calibration:run_calibration",
+    "can": "stereoservo_sim.benchmarks.can:run_can",
+    "cycle": "stereoservo_sim.benchmarks.cycle:run_cycle",
+    "detectors": "stereoservo_sim.benchmarks.photographs:run_detectors",
+    "faults": "stereoservo_sim.benchmarks.faults.bench:run_faults",
+    "features": "stereoservo_sim.benchmarks.features:run_features",
+    "idle": "stereoservo_sim.benchmarks.live_loop:run_idle",
+    "ik": "stereoservo_sim.experiments.learnt_postures:run_ik",
+    "kills": "stereoservo_sim.benchmarks.soak:run_kills",
+    "loop": "stereoservo_sim.benchmarks.live_loop:run_loop",
+    "page": "stereoservo_sim.benchmarks.live_loop:run_page",
+    "recording": "stereoservo_sim.benchmarks.recording:run_recording",
+    "scale": "stereoservo_sim.benchmarks.cycle:run_scale",
+    "soak": "stereoservo_sim.benchmarks.soak:run_soak",
+    "soak-live": "stereoservo_sim.benchmarks.soak:run_soak_live",
+    "startup": "stereoservo_sim.benchmarks.startup:run_startup",
+    "watch": "stereoservo_sim.benchmarks.live_loop:run_watch",
+    "wire": "stereoservo_sim.benchmarks.wire:run_wire",
 }
-"""By the name given on the command line."""
+"""By the name given on the command line: ``(repetitions, seed, progress)`` to the figures, loaded when it runs."""
+SHOWN = {
+    "detectors": "stereoservo_sim.benchmarks.photographs:show_detectors",
+    "faults": "stereoservo_sim.benchmarks.faults.bench:show_faults",
+    "startup": "stereoservo_sim.benchmarks.startup:show_startup",
+}
+"""What prints some of an answer in its own way, and gives the rest."""
 
 
 def bench(
@@ -164,9 +60,12 @@ def bench(
 ) -> None:
     """Time one part on this machine, beside a baseline. Nothing is judged: machines are shared and stall."""
     try:
-        run = _find(what)
+        if what not in BENCHES:
+            known = sorted(BENCHES)
+            raise ExperimentError("bench", f"no bench {what!r}; known: {', '.join(known)}", known=known)
         # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        run = _loaded(BENCHES[what])
         from stereoservo_sim.benchmarks.timing import machine, stolen_share, stolen_ticks
 
         before = stolen_ticks()
@@ -186,32 +85,17 @@ def bench(
         _show(answer, Console(markup=False, highlight=False))
 
 
-def _find(what: str) -> Bench:
-    if what not in BENCHES:
-        known = sorted(BENCHES)
-        raise ExperimentError("bench", f"no bench {what!r}; known: {', '.join(known)}", known=known)
-    return BENCHES[what]
+def _loaded(name: str) -> Callable[..., Any]:
+    """A function by its module and name."""
+    module, _, function = name.partition(":")
+    found: Callable[..., Any] = getattr(import_module(module), function)
+    return found
 
 
 def _show(answer: dict[str, Any], console: Console) -> None:
-    """Print one line a figure, nested names joined by points; tables of faults and of what a start compiles."""
-    if answer["bench"] == "detectors":
-        from stereoservo_sim.benchmarks.photographs.table import show_detectors
-
-        show_detectors(answer, console)
-        answer = {key: value for key, value in answer.items() if key not in ("rows", "left_out")}
-    if answer["bench"] == "faults":
-        from stereoservo_sim.benchmarks.faults.bench import show_faults
-
-        show_faults(answer, console)
-        answer = {
-            key: value for key, value in answer.items() if key not in ("rows", "wall", "service", "inputs")
-        }
-    if answer["bench"] == "startup":
-        from stereoservo_sim.benchmarks.startup import show_startup
-
-        show_startup(answer, console)
-        answer = {key: value for key, value in answer.items() if key != "kernels"}
+    """Print one line a figure, nested names joined by points; what a bench shows in its own way before."""
+    if answer["bench"] in SHOWN:
+        answer = _loaded(SHOWN[answer["bench"]])(answer, console)
     for name, value in _flat(answer, ""):
         console.print(f"{name:<44} {f'{value:.4g}' if isinstance(value, float) else value}", soft_wrap=True)
 

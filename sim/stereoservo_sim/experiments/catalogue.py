@@ -1,10 +1,74 @@
-"""Catalogue of all experiments of ``stereoservo reproduce``, by name."""
+"""Catalogue of all experiments of ``stereoservo reproduce``, by name, and the tables and figures of the thesis: which
+experiment reproduces each, which are drawings.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
-from stereoservo_sim.experiments.experiment import Experiment, ExperimentError, Option, repetitions
+from stereoservo_sim.experiments.experiment import Experiment, ExperimentError, Option
+
+REPRODUCED = (
+    "gripper",
+    "grid",
+    "house",
+    "pan-tilt",
+    "homing",
+    "robot",
+    "inverse-kinematics",
+    "tasks-abc",
+    "benchmark-180",
+    "projective-vs-euclidean",
+    "mobile-cameras",
+)
+"""Experiments of the thesis, in its order: what ``reproduce all`` runs."""
+
+
+class ThesisItem(NamedTuple):
+    """Tables or figures by ``number``, what they show, and the ``experiment`` that has them, or why none has
+    (``instead``)."""
+
+    number: str
+    shows: str
+    experiment: str = ""
+    instead: str = ""
+
+
+DRAWN = "a drawing or a photograph: nothing to measure"
+CONTENTS = (
+    ThesisItem("figs 1.1 to 2.16", "hand-eye coordination, cameras, frames, displacements", instead=DRAWN),
+    ThesisItem("figs 3.1 to 3.4", "geometry of translations; the set-ups", instead=DRAWN),
+    ThesisItem("fig. 3.5", "gripper: error over noise and number of motions", "gripper"),
+    ThesisItem("fig. 3.6", "grid: single and cumulative estimates", "grid"),
+    ThesisItem("fig. 3.7", "house: motion field, rectification of the grid", "house"),
+    ThesisItem(
+        "figs 4.1 to 4.7", "geometry of rotations; set-up, trajectories in a photograph", instead=DRAWN
+    ),
+    ThesisItem("table 4.1", "image errors in calibration and prediction", "pan-tilt"),
+    ThesisItem("fig. 4.8", "histograms of the calibration errors", "pan-tilt"),
+    ThesisItem("fig. 4.9", "feed-forward prediction over 35 trials", "pan-tilt"),
+    ThesisItem("fig. 4.10", "homing by one point over 35 trials", "homing"),
+    ThesisItem("figs 5.1 to 5.13", "kinematics, joint operators, trial motions", instead=DRAWN),
+    ThesisItem("figs 5.14, 5.15", "distribution and tracks of the markers in the images", "robot"),
+    ThesisItem("fig. 5.16", "16 points from four positions of the plate", instead=DRAWN),
+    ThesisItem("table 5.1", "image errors with fixed and free points", "robot"),
+    ThesisItem("table 5.2", "intrinsic parameters", "robot"),
+    ThesisItem("table 5.3", "angles between axes", "robot"),
+    ThesisItem("table 5.4", "link lengths", "robot"),
+    ThesisItem(
+        "figs 6.1 to 6.7", "inverse kinematics: drawings; its solutions are counted", "inverse-kinematics"
+    ),
+    ThesisItem("figs 7.1 to 7.13", "tasks, Cartesian motions, visibility", instead=DRAWN),
+    ThesisItem(
+        "table 8.1, figs 8.1 to 8.5", "hand-eye beside base-eye, block schemas, set-points", instead=DRAWN
+    ),
+    ThesisItem("figs 8.6 to 8.12", "tasks A, B, C: decay, image and joint motion", "tasks-abc"),
+    ThesisItem("figs 8.13 to 8.22", "the benchmark of half a turn", "benchmark-180"),
+    ThesisItem("8.7, 9.3", "projective beside Euclidean modelling", "projective-vs-euclidean"),
+    ThesisItem("fig. 9.1", "several, mobile cameras before one tool (further work)", "mobile-cameras"),
+)
+"""In the thesis's order."""
 
 
 def parse_tags(text: str) -> tuple[int, ...]:
@@ -15,7 +79,7 @@ def parse_tags(text: str) -> tuple[int, ...]:
         raise ExperimentError("option", f"--table-tags {text!r}; needed: ids by commas, like 0,2,3") from None
 
 
-REAL_FRANKA_OPTIONS = (
+REAL_FRANKA = (
     Option(
         "data", Path, "folder with ee_poses.csv and images", argument="directory",
         required="--data DIR, a folder with ee_poses.csv and images",
@@ -25,203 +89,81 @@ REAL_FRANKA_OPTIONS = (
     Option("few_sets", int, "how many training sets of 12 poses predict the rest [default: 10]"),
 )  # fmt: skip
 
-EXPERIMENTS: dict[str, Experiment] = {
-    experiment.name: experiment
-    for experiment in (
-        Experiment(
-            "real-franka",
-            "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
-            "real.real_franka",
-            REAL_FRANKA_OPTIONS,
-            "real.real_franka_report",
-            "report_real_franka",
-        ),
-        Experiment(
-            "gripper",
-            "fig. 3.5: affine calibration from small translations of a gripper, over noise and number of motions",
-            "translations.gripper",
-            (repetitions(20),),
-        ),
-        Experiment(
-            "grid",
-            "fig. 3.6: affine calibration before a grid, single motions beside cumulative estimates",
-            "translations.grid",
-            (repetitions(20),),
-        ),
-        Experiment(
-            "pan-tilt",
-            "table 4.1, figs 4.8, 4.9: a pan-tilt head calibrates itself and predicts the image after a motion",
-            "rotations.pan_tilt",
-            (repetitions(20),),
-        ),
-        Experiment(
-            "homing",
-            "fig. 4.10: a pan-tilt head finds home from one point, its errors beside the Cramer-Rao bound",
-            "rotations.homing",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "house",
-            "fig. 3.7: affine calibration from interest points of an unknown object, judged on the grid",
-            "translations.house",
-            (repetitions(50),),
-        ),
-        Experiment(
-            "robot",
-            "tables 5.1 to 5.4: self-calibration of a 6R arm from a turned plate; images, axes, links, intrinsics",
-            "arms.robot_report",
-            (repetitions(30),),
-        ),
-        Experiment(
-            "random-rigs",
-            "self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds",
-            "arms.random_rigs",
-            (repetitions(12),),
-        ),
-        Experiment(
-            "shipped-arms",
-            "self-calibration of the shipped arms (panda, iiwa, xarm, scara, gantry, pan_tilt, rx90), near their bases",
-            "arms.shipped_arms",
-            (repetitions(5), Option("cell", str, "one of these arms alone")),
-        ),
-        Experiment(
-            "random-lenses",
-            "the random rigs behind lenses with k1, k2 and tangential terms: usable, wrong, refused by cause",
-            "arms.random_lenses",
-            (repetitions(12),),
-        ),
-        Experiment(
-            "random-mechanics",
-            "the random rigs with ripple, coarse encoders, play, sag or coupling: usable, refused, what ellipses hold",
-            "arms.random_mechanics",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "imperfect-arms",
-            "goals of arms with play, sag, ripple, friction and shifted zeros: reached, and true errors of those",
-            "arms.imperfect_arms",
-            (
-                repetitions(10),
-                Option("model", str, "self (learnt by the arm) or exact (the true one, stating its errors)"),
-            ),
-        ),
-        Experiment(
-            "creeping-cameras",
-            "a camera creeps by 0.5 px a minute: goals called reached beside their place, and goals held for nothing",
-            "arms.creeping_cameras",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "late-drives",
-            "drives 100 to 200 ms late with friction, unstated: goals with the learnt model and with the true one",
-            "arms.late_drives",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "damped-drives",
-            "thesis 9.3: drives that lag or obey late, goals with and without damping: time and overshoot",
-            "arms.damped_drives",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "preset-verdicts",
-            "every preset of mechanics at work for ten virtual minutes: what the watch says where nothing has happened",
-            "arms.preset_verdicts",
-            (repetitions(1),),
-        ),
-        Experiment(
-            "inverse-kinematics",
-            "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver",
-            "arms.inverse_kinematics",
-            (repetitions(100),),
-        ),
-        Experiment(
-            "tasks-abc",
-            "figs 8.6 to 8.12: three alignments by image-based stereo control, projective and coarse calibration",
-            "laws.tasks_abc",
-            (repetitions(12),),
-        ),
-        Experiment(
-            "benchmark-180",
-            "figs 8.13 to 8.22: half a turn of a tilted face by the classical and the Cartesian laws",
-            "laws.benchmark_180",
-            figures="laws.benchmark_figures",
-        ),
-        Experiment(
-            "projective-vs-euclidean",
-            "thesis 9.3: the same tasks with a projective model and with metric ones of growing errors",
-            "laws.projective_vs_euclidean",
-            (repetitions(50),),
-        ),
-        Experiment(
-            "unsynchronised",
-            "cameras without a trigger beside the same with one: 15 ms skew, 40 ms latency, and a latency told wrongly",
-            "cameras.unsynchronised",
-            (repetitions(3),),
-        ),
-        Experiment(
-            "late-pictures",
-            "pictures that are later than their stamps tell: learnt in the trial motions, applied, goals with it",
-            "cameras.late_pictures",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "examined-recordings",
-            "recordings with a bumped camera, drifted zero, late stamps, dropped frames or nothing: what examine tells",
-            "cameras.examined_recordings",
-            (repetitions(12),),
-        ),
-        Experiment(
-            "mobile-cameras",
-            "fig. 9.1: four cameras before one tool, two of them carried about: every pair, all, and all on the move",
-            "cameras.mobile_cameras",
-            (repetitions(3),),
-        ),
-        Experiment(
-            "moving-targets",
-            "targets that slide and swing, followed by cameras on the arm and before cameras that stand",
-            "laws.moving_targets",
-            (repetitions(3),),
-        ),
-        Experiment(
-            "moving-faults",
-            "cameras bumped, joint zeros off, markers slipped while moving targets are followed: what the watch names",
-            "laws.moving_faults",
-            (repetitions(3),),
-        ),
-        Experiment(
-            "edge-parts",
-            "a part without markers aligned by its edges, in rendered cells of other lights, lenses and distances",
-            "laws.edge_parts",
-            (repetitions(10),),
-        ),
-        Experiment(
-            "changing-light",
-            "detectors, their covariances and goals while light and exposure change: shadows, lamps, flicker, clipping",
-            "pictures.changing_light",
-            (repetitions(20),),
-        ),
-        Experiment(
-            "edge-transfer",
-            "goals carried over to a moved workpiece by its edges, beside the same by markers, from rendered pictures",
-            "laws.edge_transfer",
-            (repetitions(20),),
-        ),
-        Experiment(
-            "singularities",
-            "goals from wrist, elbow and shoulder singularities by every law: reached, refused, time-outs",
-            "laws.singularities",
-            (repetitions(12),),
-        ),
-        Experiment(
-            "laws",
-            "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md",
-            "laws.laws_compared",
-            figures="laws.laws_figures",
-            reported_by="report_laws",
-        ),
-    )
-}
+DECLARED = (
+    Experiment("real-franka", 0, "real_franka",
+        "a real arm before uncalibrated cameras: held-out poses predicted from recorded displacements",
+        own=REAL_FRANKA),
+    Experiment("gripper", 20, "gripper",
+        "fig. 3.5: affine calibration from small translations of a gripper, over noise and number of motions"),
+    Experiment("grid", 20, "grid",
+        "fig. 3.6: affine calibration before a grid, single motions beside cumulative estimates"),
+    Experiment("pan-tilt", 20, "pan_tilt",
+        "table 4.1, figs 4.8, 4.9: a pan-tilt head calibrates itself and predicts the image after a motion"),
+    Experiment("homing", 10, "homing",
+        "fig. 4.10: a pan-tilt head finds home from one point, its errors beside the Cramer-Rao bound"),
+    Experiment("house", 50, "grid",
+        "fig. 3.7: affine calibration from interest points of an unknown object, judged on the grid"),
+    Experiment("robot", 30, "robot",
+        "tables 5.1 to 5.4: self-calibration of a 6R arm from a turned plate; images, axes, links, intrinsics"),
+    Experiment("random-rigs", 12, "random_rigs",
+        "self-calibration from nothing on random rigs, arms, bodies and noise: how often it succeeds"),
+    Experiment("shipped-arms", 5, "random_rigs",
+        "self-calibration of the shipped arms (panda, iiwa, xarm, scara, gantry, pan_tilt, rx90), near their bases",
+        own=(Option("cell", str, "one of these arms alone"),)),
+    Experiment("random-lenses", 12, "random_rigs",
+        "the random rigs behind lenses with k1, k2 and tangential terms: usable, wrong, refused by cause"),
+    Experiment("random-mechanics", 10, "random_rigs",
+        "the random rigs with ripple, coarse encoders, play, sag or coupling: usable, refused, what ellipses hold"),
+    Experiment("imperfect-arms", 10, "imperfect_arms",
+        "goals of arms with play, sag, ripple, friction and shifted zeros: reached, and true errors of those",
+        own=(Option("model", str, "self (learnt by the arm) or exact (the true one, stating its errors)"),),
+        timed=True),
+    Experiment("creeping-cameras", 10, "imperfect_arms",
+        "a camera creeps by 0.5 px a minute: goals called reached beside their place, and goals held for nothing"),
+    Experiment("late-drives", 10, "late_drives",
+        "drives 100 to 200 ms late with friction, unstated: goals with the learnt model and with the true one",
+        timed=True),
+    Experiment("damped-drives", 10, "late_drives",
+        "thesis 9.3: drives that lag or obey late, goals with and without damping: time and overshoot",
+        timed=True),
+    Experiment("preset-verdicts", 1, "imperfect_arms",
+        "every preset of mechanics at work for ten virtual minutes: what the watch says where nothing has happened",
+        timed=True),
+    Experiment("inverse-kinematics", 100, "inverse_kinematics",
+        "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver"),
+    Experiment("tasks-abc", 12, "tasks_abc",
+        "figs 8.6 to 8.12: three alignments by image-based stereo control, projective and coarse calibration"),
+    Experiment("benchmark-180", 0, "benchmark_180",
+        "figs 8.13 to 8.22: half a turn of a tilted face by the classical and the Cartesian laws"),
+    Experiment("projective-vs-euclidean", 50, "projective_vs_euclidean",
+        "thesis 9.3: the same tasks with a projective model and with metric ones of growing errors"),
+    Experiment("unsynchronised", 3, "unsynchronised",
+        "cameras without a trigger beside the same with one: 15 ms skew, 40 ms latency, and a latency told wrongly"),
+    Experiment("late-pictures", 10, "late_drives",
+        "pictures that are later than their stamps tell: learnt in the trial motions, applied, goals with it",
+        timed=True),
+    Experiment("examined-recordings", 12, "examined_recordings",
+        "recordings with a bumped camera, drifted zero, late stamps, dropped frames or nothing: what examine tells"),
+    Experiment("mobile-cameras", 3, "mobile_cameras",
+        "fig. 9.1: four cameras before one tool, two of them carried about: every pair, all, and all on the move"),
+    Experiment("moving-targets", 3, "moving_targets",
+        "targets that slide and swing, followed by cameras on the arm and before cameras that stand"),
+    Experiment("moving-faults", 3, "moving_targets",
+        "cameras bumped, joint zeros off, markers slipped while moving targets are followed: what the watch names"),
+    Experiment("edge-parts", 10, "edge_parts",
+        "a part without markers aligned by its edges, in rendered cells of other lights, lenses and distances"),
+    Experiment("changing-light", 20, "changing_light",
+        "detectors, their covariances and goals while light and exposure change: shadows, lamps, flicker, clipping"),
+    Experiment("edge-transfer", 20, "edge_parts",
+        "goals carried over to a moved workpiece by its edges, beside the same by markers, from rendered pictures"),
+    Experiment("singularities", 12, "singularities",
+        "goals from wrist, elbow and shoulder singularities by every law: reached, refused, time-outs",
+        timed=True),
+    Experiment("laws", 0, "laws_compared",
+        "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md"),
+)  # fmt: skip
+EXPERIMENTS = {experiment.name: experiment for experiment in DECLARED}
+"""By name."""
 
 
 def find_experiment(name: str) -> Experiment:

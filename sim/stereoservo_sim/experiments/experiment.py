@@ -1,32 +1,113 @@
-"""Base class of the experiments: options, run, JSON report, figures, printed table, comparison with the thesis.
+"""Base of the experiments: what each declares, how it is run, and how its answer is shown and compared with the thesis.
 
 An experiment is declared once in :mod:`stereoservo_sim.experiments.catalogue`; what it computes is in the module that
-the declaration names, loaded when it runs. With NAME the experiment's name in snake case, that module (or the module of
-its figures) holds
+the declaration names, loaded when it runs. With NAME the experiment's name in snake case, that module holds
 
-- ``run_NAME(*, seed, progress, **options)``: the result,
-- ``draw_NAME(result, folder)``: writes the figures, gives their paths,
+- ``run_NAME(*, seed, progress, **options)``: what is found, plain JSON types; or an object,
+- ``report_NAME(result)``: the JSON answer of such an object,
+- ``draw_NAME(result)``: the figures by name, those of matplotlib or PNG files' bytes,
 - ``compare_NAME(answer)``: the thesis's figures beside ours, each with a verdict; left out where it gives none,
-- ``show_NAME(answer, console)``: prints the answer for people; left out where :func:`show_rows` serves.
+- ``notes_NAME(answer)``: lines below the rows, for people; or ``show_NAME(answer, console)``, where `show_rows` does
+  not serve.
 
-Where the result is not the JSON answer itself, ``reported_by`` of the declaration names the function that makes it.
-Every answer has ``experiment``, ``seed``, ``rows`` and, where the thesis gives values, ``thesis``.
+Every answer has ``experiment``, ``seed``, ``seeds`` where it takes ``--seeds``, ``rows`` and, where the thesis gives
+values, ``thesis``.
+
+A comparison is a figure of ours beside the thesis's, in one verdict word. Our error stands against the thesis's, never
+the bound of an error; a bound is a reason where no estimator can do better. An error is ``better`` or ``worse`` beyond
+a quarter of the thesis's own, else it ``agrees``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import io
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from stereoservo_sim.experiments.comparison import Comparison, tally
 from stereoservo_sim.progress import ProgressCall
+
+Case = TypeVar("Case")
+Condition = TypeVar("Condition")
+Verdict = Literal["agrees", "better", "worse", "not comparable", "not reproduced"]
+MEANINGS: dict[Verdict, str] = {
+    "agrees": "an error within a quarter of the thesis's, within a limit that it states, or what it saw is seen again",
+    "better": "an error of ours at least a fifth smaller than the thesis's",
+    "worse": "an error of ours more than a quarter larger than the thesis's, or above a limit that it states",
+    "not comparable": "the thesis gives a value of another thing, or too little to compare with",
+    "not reproduced": "what the thesis saw is not what is seen here",
+}
+MARGIN = 1.25
+"""Of a ratio of errors, to either side, that still agrees."""
+
+
+class Comparison(NamedTuple):
+    """A row: ``item`` of the thesis (table, figure, section), ``what`` is compared, both values as text, the verdict
+    and why it is so."""
+
+    item: str
+    what: str
+    thesis: str
+    ours: str
+    verdict: Verdict
+    why: str = ""
+
+
+def of_error(
+    item: str, what: str, thesis: float | None, ours: float | None, unit: str, why: str = "", lost: str = ""
+) -> Comparison:
+    """Comparison of two errors [unit]; ``why`` is said where ours is not ``better``, ``lost`` where there is none."""
+    if thesis is None or ours is None:
+        return Comparison(item, what, _text(thesis, unit), _text(ours, unit), "not comparable", lost)
+    verdict: Verdict = "agrees"
+    if ours > MARGIN * thesis:
+        verdict = "worse"
+    elif MARGIN * ours < thesis:
+        verdict = "better"
+    return Comparison(
+        item, what, _text(thesis, unit), _text(ours, unit), verdict, why if verdict == "worse" else ""
+    )
+
+
+def of_limit(
+    item: str, what: str, limit: float, ours: float | None, unit: str, why: str = "", said: str = "below"
+) -> Comparison:
+    """Comparison of an error of ours [unit] with the limit that the thesis states; ``why`` is said above it."""
+    if ours is None:
+        return Comparison(item, what, f"{said} {_text(limit, unit)}".strip(), "-", "not reproduced", why)
+    held = ours <= limit
+    return Comparison(
+        item,
+        what,
+        f"{said} {_text(limit, unit)}".strip(),
+        _text(ours, unit),
+        "agrees" if held else "worse",
+        "" if held else why,
+    )
+
+
+def of_statement(item: str, what: str, thesis: str, ours: str, seen: bool, why: str = "") -> Comparison:
+    """Comparison of what the thesis saw with what is ``seen`` here; ``why`` is said where it is not."""
+    return Comparison(item, what, thesis, ours, "agrees" if seen else "not reproduced", "" if seen else why)
+
+
+def tally(comparisons: Iterable[Comparison]) -> dict[str, int]:
+    """How many rows have each verdict, in the order of their meanings."""
+    counts = Counter(row.verdict for row in comparisons)
+    return {verdict: counts[verdict] for verdict in MEANINGS}
+
+
+def _text(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.4g} {unit}".strip()
+
 
 LISTED, WIDEST = 200, 400
 """Rows of a table that a person still reads; its characters across at most."""
@@ -71,23 +152,24 @@ class Option:
         return f"--{self.name.replace('_', '-')}"
 
 
-def repetitions(default: int) -> Option:
-    """``--seeds``: how many repetitions, each with a seed of its own."""
-    return Option("seeds", int, "how many repetitions", default=default, least=1)
-
-
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment by its ``name`` on the command line. ``module``, ``figures``: below ``experiments``; ``figures`` is
-    given where the figures are not drawn in ``module``. ``reported_by``: the function that makes the JSON answer of the
-    result; empty where the result is the answer."""
+    """An experiment by its ``name`` on the command line. ``seeds``: how many repetitions, each with a seed of its own,
+    by default; 0: it takes no ``--seeds``. ``module``: below ``experiments``. ``own``: its options beside these.
+    ``timed``: the answer has the processor time, ``cpu_s``."""
 
     name: str
-    summary: str
+    seeds: int
     module: str
-    options: tuple[Option, ...] = ()
-    figures: str = ""
-    reported_by: str = ""
+    summary: str
+    own: tuple[Option, ...] = ()
+    timed: bool = False
+
+    @property
+    def options(self) -> tuple[Option, ...]:
+        """All that it takes."""
+        repetitions = Option("seeds", int, "how many repetitions", default=self.seeds, least=1)
+        return (repetitions, *self.own) if self.seeds else self.own
 
     def run(self, seed: int, given: Mapping[str, Any], progress: ProgressCall) -> Any:
         """Run with the options that were ``given`` (None: not given). Raises ExperimentError."""
@@ -104,21 +186,37 @@ class Experiment:
                 arguments[option.argument or option.name] = option.parse(value)
             elif option.default is not None:
                 arguments[option.argument or option.name] = option.default
-        return self._function(self._named("run"))(seed=seed, progress=progress, **arguments)
+        started = time.process_time()
+        found = self._function("run")(seed=seed, progress=progress, **arguments)
+        if not isinstance(found, dict):
+            return found
+        repeated = {"seeds": arguments["seeds"]} if self.seeds else {}
+        timed = {"cpu_s": round(time.process_time() - started, 1)} if self.timed else {}
+        return {"experiment": self.name, "seed": seed, **repeated, **found, **timed}
 
     def report(self, result: Any) -> dict[str, Any]:
         """The answer as a JSON object."""
-        answer: dict[str, Any] = self._function(self.reported_by)(result) if self.reported_by else result
+        answer: dict[str, Any] = self._function("report")(result) if not isinstance(result, dict) else result
         return answer
+
+    def figures(self, result: Any) -> dict[str, bytes]:
+        """PNG files by name."""
+        return {f"{name}.png": _png(figure) for name, figure in self._function("draw")(result).items()}
 
     def draw(self, result: Any, folder: Path) -> list[Path]:
         """Write the figures into ``folder``; their paths."""
-        paths: list[Path] = self._function(self._named("draw"))(result, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = []
+        for name, data in self.figures(result).items():
+            paths.append(folder / name)
+            paths[-1].write_bytes(data)
         return paths
 
     def show(self, answer: dict[str, Any], console: Console) -> None:
         """Print the report, then assumptions and written files."""
-        (self._optional(self._named("show")) or show_rows)(answer, console)
+        self._function("show", show_rows)(answer, console)
+        for note in self._function("notes", lambda answer: ())(answer):
+            console.print(note)
         for assumption in answer.get("assumptions", []):
             console.print(f"assumed: {assumption}")
         for path in answer.get("plots", []):
@@ -126,26 +224,55 @@ class Experiment:
 
     def compare(self, answer: dict[str, Any]) -> list[Comparison]:
         """The thesis's figures beside those of the answer, a verdict each; empty where it has none."""
-        compared = self._optional(self._named("compare"))
-        found: list[Comparison] = [] if compared is None else compared(answer)
+        found: list[Comparison] = self._function("compare", lambda answer: [])(answer)
         return found
 
-    def _named(self, what: str) -> str:
-        return f"{what}_{self.name.replace('-', '_')}"
-
-    def _optional(self, function: str) -> Callable[..., Any] | None:
-        """A function of the experiment's modules, which are imported now; None where none has it."""
-        for module in filter(None, (self.module, self.figures)):
-            found = getattr(import_module(f"stereoservo_sim.experiments.{module}"), function, None)
-            if found is not None:
-                return found
-        return None
-
-    def _function(self, function: str) -> Callable[..., Any]:
-        found = self._optional(function)
+    def _function(self, what: str, otherwise: Callable[..., Any] | None = None) -> Callable[..., Any]:
+        """A function of the experiment's module, which is imported now. Raises AttributeError."""
+        name = self.name.replace("-", "_")
+        module = import_module(f"stereoservo_sim.experiments.{self.module}")
+        found: Callable[..., Any] | None = getattr(module, f"{what}_{name}", otherwise)
         if found is None:
-            raise AttributeError(f"experiments.{self.module} has no {function}")
+            raise AttributeError(f"{module.__name__} has no {what}_{name}")
         return found
+
+
+def _png(figure: Any) -> bytes:
+    """A figure's file; one that is a file already as it is."""
+    if isinstance(figure, bytes):
+        return figure
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    return data.getvalue()
+
+
+def cases(
+    judge: Callable[[int], Case], seeds: int, seed: int, progress: ProgressCall, stage: str = "cases"
+) -> list[Case]:
+    """What ``judge`` finds of seeds ``seed`` to ``seed + seeds - 1``. Raises ValueError for fewer than one."""
+    return crossed(lambda _, k: judge(k), (None,), seeds, seed, progress, stage)[0]
+
+
+def crossed(
+    judge: Callable[[Condition, int], Case],
+    conditions: Sequence[Condition],
+    seeds: int,
+    seed: int,
+    progress: ProgressCall,
+    stage: str = "conditions and seeds",
+) -> list[list[Case]]:
+    """What ``judge`` finds of each of the ``conditions`` and of seeds ``seed`` to ``seed + seeds - 1``: a list for each
+    condition. Raises ValueError for fewer than one seed.
+    """
+    if seeds < 1:
+        raise ValueError(f"{seeds} cases; at least 1 is needed")
+    found: list[list[Case]] = []
+    for condition in conditions:
+        found.append([])
+        for k in range(seeds):
+            found[-1].append(judge(condition, seed + k))
+            progress(stage, (len(found) - 1) * seeds + k + 1, len(conditions) * seeds)
+    return found
 
 
 def show_rows(answer: dict[str, Any], console: Console) -> None:
@@ -210,40 +337,15 @@ def show_comparisons(compared: list[Comparison], console: Console) -> None:
 
 
 def cell_text(value: Any) -> str:
-    """A value of a row as text; a spread (median, p16, p84) as ``median (p16 to p84)``."""
+    """A value of a row as text; a spread (median, p16, p84) as ``median (p16 to p84)``, counts as ``name count``."""
+    if isinstance(value, dict) and "median" not in value:
+        return ", ".join(f"{name} {cell_text(count)}" for name, count in value.items())
     if isinstance(value, dict):
-        return (
-            "-"
-            if value["median"] is None
-            else f"{value['median']:.4g} ({value['p16']:.4g} to {value['p84']:.4g})"
-        )
+        if value["median"] is None:
+            return "-"
+        return f"{value['median']:.4g} ({value['p16']:.4g} to {value['p84']:.4g})"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):
         return " to ".join(cell_text(item) for item in value)
     return "-" if value is None else str(value)
-
-
-def draw_sorted(
-    curves: Mapping[str, list[float]], quantity: str, path: Path, limit: float | None = None
-) -> list[Path]:
-    """Draw what share of the cases has at most so much of a ``quantity``, a curve for each list of values; the path of
-    the figure. Raises OSError.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    for name, values in curves.items():
-        axes.ecdf(values or [0.0], label=f"{name} ({len(values)})")
-    if limit is not None:
-        axes.axvline(limit, color="0.5", linestyle="--")
-    axes.set_xlabel(quantity)
-    axes.set_ylabel("share of the cases")
-    axes.legend()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return [path]

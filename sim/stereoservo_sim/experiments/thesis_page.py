@@ -5,16 +5,13 @@ ours.
 from __future__ import annotations
 
 import base64
-import tempfile
 from collections.abc import Callable, Iterable
 from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stereoservo_sim.experiments.catalogue import find_experiment
-from stereoservo_sim.experiments.comparison import MEANINGS, Comparison, tally
-from stereoservo_sim.experiments.experiment import Experiment, cell_text
-from stereoservo_sim.experiments.thesis_contents import CONTENTS, REPRODUCED
+from stereoservo_sim.experiments.catalogue import CONTENTS, REPRODUCED, find_experiment
+from stereoservo_sim.experiments.experiment import MEANINGS, Comparison, Experiment, cell_text, tally
 from stereoservo_sim.progress import ProgressCall
 
 
@@ -38,12 +35,10 @@ def reproduce_all(
     found = []
     for name in names:
         experiment = find_experiment(name)
-        repeats = any(option.name == "seeds" for option in experiment.options)
-        result = experiment.run(seed, {"seeds": seeds} if repeats else {}, progress)
+        result = experiment.run(seed, {"seeds": seeds} if experiment.seeds else {}, progress)
         answer = experiment.report(result)
-        with tempfile.TemporaryDirectory(prefix="stereoservo-figures-") as scratch:
-            drawn = {path.name: path.read_bytes() for path in experiment.draw(result, Path(scratch))}
-        found.append(Reproduction(experiment, answer, experiment.compare(answer), drawn))
+        figures = experiment.figures(result)
+        found.append(Reproduction(experiment, answer, experiment.compare(answer), figures))
         done(found[-1])
     return found
 

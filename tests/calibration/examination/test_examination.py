@@ -18,7 +18,7 @@ from stereoservo.calibration.examination.reference_model import frame_noise, lea
 from stereoservo.calibration.examination.stamp_offsets import course
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
-from stereoservo_sim.experiments.cameras.examined_recordings import (
+from stereoservo_sim.experiments.examined_recordings import (
     examined_case,
     judged_examination,
     run_examined_recordings,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from stereoservo_sim.experiments.pictures.changing_light import detector_row
+from stereoservo_sim.experiments.changing_light import detector_row
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from stereoservo_sim.experiments.pictures.textured import Face, texture
+from stereoservo_sim.experiments.textured import Face, texture
 
 
 def rotation(x=0.0, y=0.0, z=0.0) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereoservo_sim.experiments.arms.inverse_kinematics import hide
+from stereoservo_sim.experiments.inverse_kinematics import hide
 
 
 @pytest.fixture

@@ -11,15 +11,17 @@ from stereoservo.kinematics.inverse.recognition import chain_of, recognise
 from stereoservo.kinematics.inverse.self_motion import null_directions
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo_sim.experiments.arms import arm_families
-from stereoservo_sim.experiments.arms.arm_families import PUMA_ROWS, aligned_wrist, from_rows
-from stereoservo_sim.experiments.arms.euclidean_inverse import crossing, three_parallel
-from stereoservo_sim.experiments.arms.inverse_kinematics import (
+from stereoservo_sim.experiments import inverse_kinematics as families
+from stereoservo_sim.experiments.inverse_kinematics import (
+    PUMA_ROWS,
+    aligned_wrist,
     differences,
+    from_rows,
     hide,
     kept_along,
     singular_handled,
 )
+from stereoservo_sim.experiments.metric_inverse import crossing, three_parallel
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SEVEN_ROWS
@@ -170,8 +172,8 @@ STRETCHED_AND_NEARLY_ALIGNED = np.array(
 
 
 def at_stretched_elbow(puma, q):
-    q = arm_families.stretched(puma.axes, crossing(puma.axes, 3, 4), 1, q, 1.0)
-    return arm_families.SingularPose(q, None, None), puma.axes.displacements(q[None])[0]
+    q = families.stretched(puma.axes, crossing(puma.axes, 3, 4), 1, q, 1.0)
+    return families.SingularPose(q, None, None), puma.axes.displacements(q[None])[0]
 
 
 def test_a_stretched_elbow_behind_a_wrist_that_is_nearly_aligned_is_a_continuum_to_within_the_tolerance(puma):
@@ -197,7 +199,7 @@ def test_a_stretched_elbow_is_no_continuum_and_the_judge_takes_none_for_it(puma)
 
 def test_out_of_reach_says_which_joint_and_by_how_much():
     """Two links of 0.4 and 0.3 m, asked to 1.4 m: ``cosθ₂ = (1.4² - 0.25) / 0.24 = 7.125``."""
-    axes = arm_families.joined(from_rows(((0.4, 0, 0),)), from_rows(((0.3, 0, 0),)))
+    axes = families.joined(from_rows(((0.4, 0, 0),)), from_rows(((0.3, 0, 0),)))
     axes.points[1, 0] = 0.4
     arm = hide(axes, np.random.default_rng(0))
     points, targets = np.array([[0.7, 0, 0, 1.0]]), np.array([[0, 1.4, 0, 1.0]])
@@ -210,7 +212,7 @@ def test_out_of_reach_says_which_joint_and_by_how_much():
 
 
 def test_just_out_of_reach_is_reached_within_the_tolerance():
-    axes = arm_families.joined(from_rows(((0.4, 0, 0),)), from_rows(((0.3, 0, 0),)))
+    axes = families.joined(from_rows(((0.4, 0, 0),)), from_rows(((0.3, 0, 0),)))
     axes.points[1, 0] = 0.4
     arm = hide(axes, np.random.default_rng(0))
     points, targets = np.array([[0.7, 0, 0, 1.0]]), np.array([[0, 0.7001, 0, 1.0]])
@@ -311,7 +313,7 @@ def test_a_point_at_infinity_is_refused(puma):
 
 def test_heights_need_no_luck_where_a_pencil_of_planes_stays_fixed():
     """Parallel axes: whatever plane of the pencil a point lies on, another one tells its height."""
-    arm = hide(arm_families.parallel_pair(np.random.default_rng(3)), np.random.default_rng(4))
+    arm = hide(families.parallel_pair(np.random.default_rng(3)), np.random.default_rng(4))
     planes = fixed_planes(arm.chain.generators)
     assert planes.shape == (2, 4)
     q = np.array([0.5, 1.0])
@@ -324,7 +326,7 @@ def test_heights_need_no_luck_where_a_pencil_of_planes_stays_fixed():
 
 
 def test_two_points_off_the_centre_tell_a_wrist():
-    arm = hide(arm_families.square_wrist(np.random.default_rng(3)), np.random.default_rng(4))
+    arm = hide(families.square_wrist(np.random.default_rng(3)), np.random.default_rng(4))
     q = np.array([0.5, 1.0, -0.7])
     points = np.array([[0.5, 0.1, 0.3, 1], [-0.2, 0.6, 0.1, 1]]) @ arm.frame.T
     targets = points @ arm.chain.displacement(arm.chain.zero + q).T
@@ -342,8 +344,8 @@ def test_pan_and_tilt_with_the_cameras_on_it():
 
 
 def test_prismatic_joints_without_closed_form_need_limits():
-    axes = arm_families.joined(
-        arm_families.one(np.random.default_rng(0)), arm_families.sliding(1)(np.random.default_rng(1))
+    axes = families.joined(
+        families.one(np.random.default_rng(0)), families.sliding(1)(np.random.default_rng(1))
     )
     arm = hide(axes, np.random.default_rng(2))
     q = np.array([0.4, 0.2])

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from stereoservo_sim.experiments.arms import euclidean_inverse as metric
-from stereoservo_sim.experiments.arms import euclidean_search
-from stereoservo_sim.experiments.arms.arm_families import FAMILIES, PUMA_ROWS, from_rows, offset
-from stereoservo_sim.experiments.arms.inverse_kinematics import (
-    differences,
-    draw_inverse_kinematics,
-    family_row,
-    hide,
-)
+from stereoservo_sim.experiments import metric_inverse as metric
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.inverse_kinematics import (
+    FAMILIES,
+    PUMA_ROWS,
+    differences,
+    family_row,
+    from_rows,
+    hide,
+    offset,
+)
 from stereoservo_sim.world.synthetic import OFFSET_ROWS, RX90_ROWS
 
 SEARCHED = ("offset wrist", "six revolute, general", "seven revolute")
@@ -84,7 +85,7 @@ def test_sixteen_solutions():
     rng = np.random.default_rng(0)
     arm = hide(axes, rng)
     found = arm.solve(goal, None)
-    metric_ones = euclidean_search.all_solutions(axes, goal, 2000, rng)
+    metric_ones = metric.all_solutions(axes, goal, 2000, rng)
     assert len(found.joints) == len(metric_ones) == 16
     assert differences(axes, metric_ones, found.joints - arm.chain.zero).max() < CLOSE
 
@@ -102,7 +103,7 @@ def test_reproduce_prints_one_finite_json_object_and_the_same_for_the_same_seed(
     assert answer["seed"] == 5
     for row in answer["rows"]:
         check(row, 2)
-    (picture,) = draw_inverse_kinematics(answer, tmp_path)
+    (picture,) = EXPERIMENTS["inverse-kinematics"].draw(answer, tmp_path)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

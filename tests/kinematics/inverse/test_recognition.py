@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.inverse.recognition import chain_of, examined, recognise, structure
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo_sim.experiments.arms import arm_families
-from stereoservo_sim.experiments.arms.inverse_kinematics import hide
+from stereoservo_sim.experiments import inverse_kinematics as families
+from stereoservo_sim.experiments.inverse_kinematics import hide
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 
@@ -37,14 +37,14 @@ def test_exact_cells_are_what_they_are(name):
 @pytest.mark.parametrize(
     ("make", "case"),
     [
-        (arm_families.one, "revolute"),
-        (arm_families.two, "two_revolute"),
-        (arm_families.parallel_pair, "two_parallel"),
-        (arm_families.shoulder_and_elbow, "arm"),
-        (arm_families.square_wrist, "wrist"),
-        (arm_families.concurrent, "wrist"),
-        (arm_families.sliding(2), "prismatic"),
-        (arm_families.general, "numerical"),
+        (families.one, "revolute"),
+        (families.two, "two_revolute"),
+        (families.parallel_pair, "two_parallel"),
+        (families.shoulder_and_elbow, "arm"),
+        (families.square_wrist, "wrist"),
+        (families.concurrent, "wrist"),
+        (families.sliding(2), "prismatic"),
+        (families.general, "numerical"),
     ],
 )
 def test_random_arms_are_recognised_in_any_frame(make, case):
@@ -54,8 +54,8 @@ def test_random_arms_are_recognised_in_any_frame(make, case):
 
 
 def test_dependent_slides_are_no_gantry():
-    axes = arm_families.sliding(2)(np.random.default_rng(0))
-    chain = hide(arm_families.joined(axes, axes.part(slice(0, 1))), np.random.default_rng(1)).chain
+    axes = families.sliding(2)(np.random.default_rng(0))
+    chain = hide(families.joined(axes, axes.part(slice(0, 1))), np.random.default_rng(1)).chain
     assert recognise(chain).case == "numerical"
 
 

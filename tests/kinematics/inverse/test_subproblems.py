@@ -18,8 +18,8 @@ from stereoservo.kinematics.inverse.closed_forms import (
     two_parallel,
     wrist,
 )
-from stereoservo_sim.experiments.arms import arm_families
-from stereoservo_sim.experiments.arms.inverse_kinematics import hide
+from stereoservo_sim.experiments import inverse_kinematics as families
+from stereoservo_sim.experiments.inverse_kinematics import hide
 
 SEEDS = st.integers(0, 10**6)
 COUNT = settings(max_examples=25, deadline=None)
@@ -39,7 +39,7 @@ def near(angles, wanted, tolerance=1e-9):
 @given(SEEDS, st.floats(-3, 3))
 def test_circle_meets_plane_in_both_roots(seed, theta):
     """(6.8) through the point at a known angle: that root is found, and both lie in the plane."""
-    arm_, rng = drawn(arm_families.one, seed)
+    arm_, rng = drawn(families.one, seed)
     G = arm_.chain.generators[0]
     A = arm_.frame @ np.append(rng.uniform(-1, 1, 3), 1)
     moved = exp_rotation(G, theta) @ A
@@ -78,7 +78,7 @@ def test_circle_in_its_own_plane_is_free_and_parallel_to_it_is_out_of_reach():
 @COUNT
 @given(SEEDS, st.floats(-3.1, 3.1))
 def test_one_revolute_joint_brings_a_point_to_its_target(seed, theta):
-    arm_, rng = drawn(arm_families.one, seed)
+    arm_, rng = drawn(families.one, seed)
     G = arm_.chain.generators[0]
     A = arm_.frame @ np.append(rng.uniform(-1, 1, 3), 1)
     found = turn_between(G, A, exp_rotation(G, theta) @ A)
@@ -90,7 +90,7 @@ def test_one_revolute_joint_brings_a_point_to_its_target(seed, theta):
 @given(SEEDS)
 def test_off_the_circle_the_nearest_angle_is_that_of_the_axial_plane(seed):
     """Errata to (6.11): the plane of the target and the axis, which is the Euclidean nearest point's, too."""
-    arm_, rng = drawn(arm_families.one, seed)
+    arm_, rng = drawn(families.one, seed)
     w, c = arm_.axes.directions[0], arm_.axes.points[0]
     point, goal = rng.uniform(-1, 1, (2, 3))
     angles = np.linspace(-np.pi, np.pi, 20001)
@@ -110,7 +110,7 @@ def test_off_the_circle_the_nearest_angle_is_that_of_the_axial_plane(seed):
 @given(SEEDS)
 def test_planes_across_and_points_on_an_axis(seed):
     """Across: holds the whole circle, as (6.23) wants; a point on the axis has its plane, too."""
-    arm_, rng = drawn(arm_families.one, seed)
+    arm_, rng = drawn(families.one, seed)
     G = arm_.chain.generators[0]
     on_axis = axis_points(G).T @ rng.normal(size=2)
     assert np.abs(G @ on_axis).max() < 1e-12
@@ -123,7 +123,7 @@ def test_planes_across_and_points_on_an_axis(seed):
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_prismatic_joints_need_no_heights(count):
-    arm_, rng = drawn(arm_families.sliding(count), count)
+    arm_, rng = drawn(families.sliding(count), count)
     tau = rng.uniform(-0.5, 0.5, count)
     A = arm_.frame @ np.append(rng.uniform(-1, 1, 3), 1)
     target = -3.7 * (np.eye(4) + np.tensordot(tau, arm_.chain.generators, axes=1)) @ A
@@ -131,7 +131,7 @@ def test_prismatic_joints_need_no_heights(count):
 
 
 def test_prismatic_joints_in_one_direction_share_the_way_and_are_free():
-    arm_, rng = drawn(arm_families.sliding(2), 4)
+    arm_, rng = drawn(families.sliding(2), 4)
     G = arm_.chain.generators
     G = np.array([G[0], 2.0 * G[0], G[1]])
     A = arm_.frame @ np.append(rng.uniform(-1, 1, 3), 1)
@@ -145,9 +145,9 @@ def test_prismatic_joints_in_one_direction_share_the_way_and_are_free():
 @given(SEEDS)
 def test_two_joints_and_the_arm_find_what_they_were_moved_by(seed):
     for make, solver, n in (
-        (arm_families.two, two_general, 2),
-        (arm_families.parallel_pair, two_parallel, 2),
-        (arm_families.shoulder_and_elbow, arm, 3),
+        (families.two, two_general, 2),
+        (families.parallel_pair, two_parallel, 2),
+        (families.shoulder_and_elbow, arm, 3),
     ):
         arm_, rng = drawn(make, seed)
         q = rng.uniform(-np.pi, np.pi, n)
@@ -160,7 +160,7 @@ def test_two_joints_and_the_arm_find_what_they_were_moved_by(seed):
 @COUNT
 @given(SEEDS)
 def test_wrist_finds_the_rotation_and_its_flip(seed):
-    arm_, rng = drawn(arm_families.square_wrist, seed)
+    arm_, rng = drawn(families.square_wrist, seed)
     q = rng.uniform(-np.pi, np.pi, 3)
     H = arm_.chain.displacement(arm_.chain.zero + q)
     found = wrist(arm_.chain.generators, H, np.zeros(3))
@@ -171,7 +171,7 @@ def test_wrist_finds_the_rotation_and_its_flip(seed):
 
 
 def test_common_point_is_the_centre():
-    arm_, _ = drawn(arm_families.square_wrist, 5)
+    arm_, _ = drawn(families.square_wrist, 5)
     centre = np.linalg.inv(arm_.frame) @ common_point(arm_.chain.generators)
     for w, c in zip(arm_.axes.directions, arm_.axes.points, strict=True):
         assert np.cross(centre[:3] / centre[3] - c, w) == pytest.approx(np.zeros(3), abs=1e-9)

@@ -11,7 +11,7 @@ from stereoservo_sim.benchmarks import calibration, cycle
 from stereoservo_sim.benchmarks.calibration import run_calibration, thesis_sized
 from stereoservo_sim.benchmarks.features import run_features
 from stereoservo_sim.benchmarks.timing import machine, stolen_share, summary, timed
-from stereoservo_sim.experiments.arms.learnt_postures import family
+from stereoservo_sim.experiments.learnt_postures import family
 from stereoservo_sim.world import synthetic
 
 

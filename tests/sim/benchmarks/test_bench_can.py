@@ -5,10 +5,16 @@ import itertools
 import pytest
 
 from stereoservo_drivers.can.load import cycle_load
-from stereoservo_sim.benchmarks import can_drives, can_peer
-from stereoservo_sim.benchmarks.can_drives import LENGTHS, bench_options, fastest_paced, run_drives, saturate
+from stereoservo_sim.benchmarks import can, can_peer
+from stereoservo_sim.benchmarks.can import (
+    LENGTHS,
+    bench_options,
+    fastest_paced,
+    run_drives,
+    saturate,
+    time_transport,
+)
 from stereoservo_sim.benchmarks.can_peer import ANSWERS, COMMANDS, SYNC, empty_loop, peer
-from stereoservo_sim.benchmarks.can_transports import time_transport
 
 
 def test_the_cycle_is_the_one_of_the_bus_limit():
@@ -81,7 +87,7 @@ def test_the_fastest_rate_is_the_highest_that_was_held(monkeypatch):
             {"fault": {"code": "bus_silent", "message": ""}, "seconds": 0.0},
         ]
     )
-    monkeypatch.setattr(can_drives, "run_drives", lambda rate_hz, seconds, bit_time: dict(next(trials)))
+    monkeypatch.setattr(can, "run_drives", lambda rate_hz, seconds, bit_time: dict(next(trials)))
     found = fastest_paced([400.0, 450.0, 460.0, 470.0], 1.0)
     assert found["held_hz"] == 450.0
     assert found["held_share_of_limit"] == pytest.approx(0.902, abs=0.001)

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
+from stereoservo_sim.benchmarks.faults import bench, inputs, service
+from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.benchmarks.faults import bench, disks, inputs, service, wall
-from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 
@@ -151,12 +151,12 @@ def test_the_page_has_a_row_for_each_fault_of_the_service():
     ]
 
 
-@pytest.mark.parametrize("disk", [disks.memory_disk, disks.image_disk])
+@pytest.mark.parametrize("disk", [service.memory_disk, service.image_disk])
 def test_where_nothing_may_be_mounted_the_trials_are_void_with_the_reason(tmp_path, monkeypatch, disk):
     def refused(words, **_):
         raise subprocess.CalledProcessError(32, words, stderr="must be superuser to use mount.\n")
 
-    monkeypatch.setattr(disks.subprocess, "run", refused)
+    monkeypatch.setattr(service.subprocess, "run", refused)
     with ExitStack() as mounts:
         bench = SimpleNamespace(
             folder=tmp_path, directories=SimpleNamespace(state=tmp_path / "s"), mounts=mounts, lasting=ExitStack(),
@@ -236,9 +236,9 @@ def test_faults_of_the_inputs(names):
 
 @pytest.mark.slow
 def test_a_fault_in_real_time_is_measured(one_case, monkeypatch, capsys):
-    ordered = [case for case in wall.ORDERED if case[0] == "node silent"]
-    monkeypatch.setattr(wall, "ORDERED", tuple(ordered))
-    monkeypatch.setattr(wall, "DONE_TO_THE_MASTER", ("master killed",))
+    ordered = [case for case in bench.ORDERED if case[0] == "node silent"]
+    monkeypatch.setattr(bench, "ORDERED", tuple(ordered))
+    monkeypatch.setattr(bench, "DONE_TO_THE_MASTER", ("master killed",))
     monkeypatch.setattr(bench, "run_service", lambda repetitions, tell: [])
     monkeypatch.setattr(bench, "run_inputs", lambda repetitions, seed, tell: [])
     assert cli.invoke(["bench", "faults", "--repetitions", "1", "--json"]) == 0

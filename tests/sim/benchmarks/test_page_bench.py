@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stereoservo_sim.benchmarks.live_loop.page import ratios
+from stereoservo_sim.benchmarks.live_loop import ratios
 
 
 def test_what_a_machine_does_to_both_of_a_pair_widens_no_interval_and_what_it_does_to_one_does() -> None:

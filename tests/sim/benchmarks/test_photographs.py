@@ -8,18 +8,24 @@ import numpy as np
 import pytest
 
 from stereoservo_drivers.detectors.tag_registration import tag_cells
-from stereoservo_sim.benchmarks import features_tags
-from stereoservo_sim.benchmarks.photographs.boards import board_rows, corner_rows
-from stereoservo_sim.benchmarks.photographs.pictures import photographs
-from stereoservo_sim.benchmarks.photographs.plates import dot_rows
-from stereoservo_sim.benchmarks.photographs.tags import finders, franka_rows, judged, reads
+from stereoservo_sim.benchmarks import features
+from stereoservo_sim.benchmarks.photographs import (
+    board_rows,
+    corner_rows,
+    dot_rows,
+    finders,
+    franka_rows,
+    judged,
+    photographs,
+    reads,
+)
 
 ROOT = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[4] / "shared" / "data"))
 HERE = photographs(ROOT)
 
 
 def test_finds_are_judged_by_their_cells_their_ids_and_their_places():
-    image, corners = features_tags.picture(np.random.default_rng(5))
+    image, corners = features.tag_picture(np.random.default_rng(5))
     truth = corners.reshape(12, 4, 2)
     assert all(reads(image, truth[k], tag_cells("36h11", k)) for k in range(12))
     assert not any(reads(image, truth[k], tag_cells("36h11", (k + 1) % 12)) for k in range(12))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from stereoservo_sim.experiments.pictures.changing_light import LIMIT_PX, goal_run
+from stereoservo_sim.experiments.changing_light import LIMIT_PX, goal_run
 
 
 @pytest.mark.parametrize("light", ["all of it", "the same, automatic exposure", "dark for a second"])

@@ -7,20 +7,19 @@ import pytest
 from rich.console import Console
 
 from oracles.thesis_verdicts import KNOWN, changed
-from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.laws import projective_vs_euclidean as compared
-from stereoservo_sim.experiments.laws import tasks_abc
-from stereoservo_sim.experiments.laws.benchmark_180 import (
+from stereoservo_sim.experiments import projective_vs_euclidean as compared
+from stereoservo_sim.experiments import tasks_abc
+from stereoservo_sim.experiments.benchmark_180 import (
     CARTESIAN,
     CLASSICAL,
     COMPARED,
     BenchmarkRun,
     benchmark_task,
-    draw_benchmark_180,
     placed_rx90,
     run_benchmark_180,
 )
-from stereoservo_sim.experiments.laws.driven_tasks import decay, path_ratio
+from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.driven_tasks import decay, path_ratio
 from stereoservo_sim.tasks.arms import rx90_reach
 from stereoservo_sim.tasks.ground_truth import sight
 
@@ -127,7 +126,9 @@ def test_benchmark_figures_and_tables(half_turn, tmp_path):
     console = Console(record=True, width=300)
     EXPERIMENTS["benchmark-180"].show(half_turn, console)
     json.dumps(half_turn, allow_nan=False)
-    assert all(path.stat().st_size > 10_000 for path in draw_benchmark_180(half_turn, tmp_path))
+    assert all(
+        path.stat().st_size > 10_000 for path in EXPERIMENTS["benchmark-180"].draw(half_turn, tmp_path)
+    )
 
 
 def test_verdicts_of_the_benchmark_are_the_known_ones(half_turn):
@@ -205,7 +206,7 @@ def test_verdicts_of_the_tasks_are_the_known_ones(abc):
 
 
 def test_abc_figures(abc, tmp_path):
-    assert all(path.stat().st_size > 10_000 for path in tasks_abc.draw_tasks_abc(abc, tmp_path))
+    assert all(path.stat().st_size > 10_000 for path in EXPERIMENTS["tasks-abc"].draw(abc, tmp_path))
     json.dumps(abc, allow_nan=False)
 
 
@@ -229,15 +230,16 @@ def check_comparison(answer):
 
 
 def test_metric_models_leave_the_line_more_the_worse_they_are(tmp_path):
-    answer = compared.run_projective_vs_euclidean(
+    answer = {"seeds": 2} | compared.run_projective_vs_euclidean(
         seeds=2, seed=1, progress=silent, levels=((0.0, 0.0), (0.1, 5.0)), jobs=1
     )
     check_comparison(answer)
-    (path,) = compared.draw_projective_vs_euclidean(answer, tmp_path)
+    (path,) = EXPERIMENTS["projective-vs-euclidean"].draw(answer, tmp_path)
     assert path.stat().st_size > 10_000
     json.dumps(answer, allow_nan=False)
 
 
 @pytest.mark.slow
 def test_fifty_tasks_in_parallel():
-    check_comparison(compared.run_projective_vs_euclidean(seeds=50, seed=0, progress=silent, jobs=2))
+    found = compared.run_projective_vs_euclidean(seeds=50, seed=0, progress=silent, jobs=2)
+    check_comparison({"seeds": 50} | found)

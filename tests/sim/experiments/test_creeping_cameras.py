@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereoservo_sim.experiments.arms.creeping_cameras import FALSE, judged_creep, run_creeping_cameras
+from stereoservo_sim.experiments.imperfect_arms import CREEP_FALSE, judged_creep, run_creeping_cameras
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX
 
 
@@ -21,7 +21,7 @@ def test_a_goal_beside_its_place_is_held_and_the_reason_says_why(seed: int) -> N
 def test_a_healthy_cell_reaches_its_goals(seed: int) -> None:
     for goal in judged_creep(seed, creeps=False, goals=2):
         assert goal.outcome == "reached", goal
-        assert goal.error_px <= FALSE * TOLERANCE_PX, goal
+        assert goal.error_px <= CREEP_FALSE * TOLERANCE_PX, goal
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from stereoservo_sim.experiments.arms.damped_drives import LAW, damped_goal
+from stereoservo_sim.experiments.late_drives import LAW, damped_goal
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.5])

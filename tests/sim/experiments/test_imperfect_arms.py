@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereoservo_sim.experiments.arms.imperfect_arms import FALSE, judged_case, run_imperfect_arms
+from stereoservo_sim.experiments.imperfect_arms import FALSE, judged_case, run_imperfect_arms
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX
 
 

@@ -10,16 +10,15 @@ from rich.console import Console
 
 from stereoservo.core.model_arrays import with_unit_height
 from stereoservo.kinematics.kernels import triangulate
+from stereoservo_sim.experiments import laws_compared
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.laws import goal_sketches
-from stereoservo_sim.experiments.laws.laws_compared import (
+from stereoservo_sim.experiments.laws_compared import (
     CURRENT,
     compared_tasks,
     report_laws,
     run_laws,
     show_laws,
 )
-from stereoservo_sim.experiments.laws.laws_figures import draw_laws
 from stereoservo_sim.tasks.calibrations import calibrate
 from stereoservo_sim.tasks.ground_truth import sight
 
@@ -70,20 +69,20 @@ def test_it_is_shown_and_drawn_small_enough_to_keep(comparison, tmp_path):
     text = StringIO()
     show_laws(report_laws(comparison), Console(file=text))
     assert "cartesian3" in text.getvalue()
-    paths = draw_laws(comparison, tmp_path)
+    paths = EXPERIMENTS["laws"].draw(comparison, tmp_path)
     assert len(paths) == 6
     assert all(1_000 < path.stat().st_size <= LARGEST_PICTURE for path in paths)
     assert "laws" in EXPERIMENTS
 
 
 def test_goals_that_are_shown_are_reached(exact):
-    goal = sight(goal_sketches.goal_pose()).pixels
+    goal = sight(laws_compared.goal_pose()).pixels
     for law in ("stereo", "cartesian3"):
-        assert np.abs(goal_sketches.shown(exact, law).pixels[-1] - goal).max() < 0.5
+        assert np.abs(laws_compared.shown(exact, law).pixels[-1] - goal).max() < 0.5
 
 
 def test_a_displacement_counts_from_where_the_body_is(exact):
-    first, second = goal_sketches.displaced_twice(exact)
+    first, second = laws_compared.displaced_twice(exact)
     # in the rig, both are the same motion of the body
     moves = [drive.poses[-1] @ np.linalg.inv(drive.poses[0]) for drive in (first, second)]
     assert np.allclose(first.poses[-1], second.poses[0], atol=2e-3)
@@ -92,10 +91,10 @@ def test_a_displacement_counts_from_where_the_body_is(exact):
 
 
 def test_a_carried_goal_stands_to_the_workpiece_as_taught(exact):
-    carried = goal_sketches.carried_over(exact)
+    carried = laws_compared.carried_over(exact)
     assert np.abs(carried.drive.pixels[-1] - carried.set_points).max() < 0.5
     # all points of the workpiece and the plate have moved by one motion of space
-    world = goal_sketches.World(exact, goal_sketches.start_pose())
+    world = laws_compared.World(exact, laws_compared.start_pose())
     matrices = world.knowledge.matrices
     assert np.abs(carried.taught - carried.set_points).max() > 10.0
 
@@ -112,7 +111,7 @@ def test_a_carried_goal_stands_to_the_workpiece_as_taught(exact):
 
 
 def test_the_marker_comes_onto_the_line(exact):
-    on_line = goal_sketches.point_on_line(exact)
+    on_line = laws_compared.point_on_line(exact)
     for camera in range(2):
         a, b = on_line.line[camera]
         normal = np.array([a[1] - b[1], b[0] - a[0]]) / np.linalg.norm(b - a)
@@ -125,7 +124,7 @@ def test_the_marker_comes_onto_the_line(exact):
 
 
 def test_feed_forward_takes_the_lag_away(exact):
-    streamed = goal_sketches.streamed(exact)
+    streamed = laws_compared.streamed(exact)
     lag = [
         np.abs(drive.pixels[-50:] - streamed.target[-50:]).max()
         for drive in (streamed.fed_forward, streamed.without)

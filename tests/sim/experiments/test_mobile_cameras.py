@@ -10,7 +10,7 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.recording.replay import replay
-from stereoservo_sim.experiments.cameras.mobile_cameras import (
+from stereoservo_sim.experiments.mobile_cameras import (
     ALL,
     CONDITIONS,
     GOAL,

@@ -6,8 +6,14 @@ from __future__ import annotations
 
 import pytest
 
-from stereoservo_sim.experiments.laws.moving_faults import FAULTS, Fault, disturb, run_moving_faults
-from stereoservo_sim.experiments.laws.moving_targets import CELLS, STANDING
+from stereoservo_sim.experiments.moving_targets import (
+    CELLS,
+    FAULTS,
+    STANDING,
+    Fault,
+    disturb,
+    run_moving_faults,
+)
 
 UNSEEN: Fault = "joint zero drifts"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stereoservo_sim.experiments.arms.preset_verdicts import watched_preset
+from stereoservo_sim.experiments.imperfect_arms import watched_preset
 from stereoservo_sim.world.mechanics import PRESETS
 
 

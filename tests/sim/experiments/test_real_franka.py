@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from stereoservo_sim.commands.reproduce import reproduce
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.real.tags import (
+from stereoservo_sim.experiments.hand_eye_data import (
     find_tags,
     register_tag,
     tag_cells,

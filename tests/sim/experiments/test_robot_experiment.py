@@ -9,23 +9,28 @@ import pytest
 from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo.cli import main as cli
 from stereoservo.kinematics.axes import framed
-from stereoservo_sim.experiments.arms.robot import QUANTITIES, cramer_rao, mean_length, tables, tables_of
-from stereoservo_sim.experiments.arms.robot_report import draw_robot, run_robot
-from stereoservo_sim.experiments.arms.thesis_robot import (
+from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.robot import (
     IMPLIED_BASELINE,
     IMPLIED_SIGMA,
+    QUANTITIES,
     SIGMA,
     THESIS,
+    cramer_rao,
+    mean_length,
+    run_robot,
+    tables,
+    tables_of,
     thesis_cell,
     trial_motions,
 )
-from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.progress import silent
 from stereoservo_sim.world.exact_model import exact_model
 
 
 @pytest.fixture(scope="module")
 def answer():
-    return run_robot(seeds=6, seed=3)
+    return EXPERIMENTS["robot"].run(3, {"seeds": 6}, silent)
 
 
 def rows_of(answer, table):
@@ -146,7 +151,7 @@ def test_answer_is_finite_json_and_is_drawn(answer, tmp_path):
     assert {"experiment", "seed", "seeds", "rows", "thesis", "trial_motions"} <= answer.keys()
     assert answer["thesis"]["5.4"]["link 3"] == [800.0, 800.5457]
     assert sum(answer["histograms"]["axes"][0]) > 7600
-    paths = draw_robot(answer, tmp_path / "new")
+    paths = EXPERIMENTS["robot"].draw(answer, tmp_path / "new")
     assert [path.name for path in paths] == ["robot-tracks.png", "robot-residuals.png", "robot-errors.png"]
     assert all(path.stat().st_size > 10_000 for path in paths)
 

@@ -11,33 +11,29 @@ from typer.testing import CliRunner
 
 from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.pictures.correlation import follow
-from stereoservo_sim.experiments.pictures.textured import texture
-from stereoservo_sim.experiments.rotations.homing import draw_homing, run_homing
-from stereoservo_sim.experiments.rotations.pan_tilt import (
-    CONDITIONS,
-    MEASURES,
-    draw_pan_tilt,
-    feed_forward,
-    measures,
-    run_pan_tilt,
-    step_pairs,
-    trial,
-)
-from stereoservo_sim.experiments.rotations.thesis_head import (
+from stereoservo_sim.experiments.homing import run_homing
+from stereoservo_sim.experiments.pan_tilt import (
     BASELINE,
+    CONDITIONS,
     DISTANCE,
+    MEASURES,
     PAN_USED,
     POINTS,
     SIGMA,
     calibrated,
+    feed_forward,
     general_positions,
     head,
+    measures,
+    run_pan_tilt,
+    step_pairs,
     tracked,
     tracks_of,
     trajectories,
+    trial,
     trial_data,
 )
+from stereoservo_sim.experiments.textured import follow, texture
 
 
 def silent(stage, done, total):
@@ -181,7 +177,9 @@ def test_pan_tilt_answers_and_draws(tmp_path):
     for row in answer["rows"]:
         # Two rotations by themselves, as in the thesis, do as well on their own trajectories; more noise is common.
         assert row["separate_rotations_delta_lr"]["median"] < 1.5 * row["delta_lr"]["median"]
-    assert all(path.stat().st_size > 10_000 for path in draw_pan_tilt(answer, tmp_path / "new"))
+    assert all(
+        path.stat().st_size > 10_000 for path in EXPERIMENTS["pan-tilt"].draw(answer, tmp_path / "new")
+    )
     assert len(answer["example"]["feed-forward"]["pairs"]) == 35
     for row in answer["rendered"]:
         assert row["points"] > 80
@@ -210,7 +208,7 @@ def test_homing_stands_at_the_bound(tmp_path, seeds):
         assert row["rms_deg"] < row["thesis_better_than_deg"]
     assert all(math.isfinite(value) for value in numbers(answer))
     assert changed("homing", EXPERIMENTS["homing"].compare(answer)) == []
-    assert draw_homing(answer, tmp_path)[0].stat().st_size > 10_000
+    assert EXPERIMENTS["homing"].draw(answer, tmp_path)[0].stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("name", ["pan-tilt", "homing"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo_sim.experiments.laws.singularities import judged_singular, run_singularities, singular_case
+from stereoservo_sim.experiments.singularities import judged_singular, run_singularities, singular_case
 from stereoservo_sim.world.exact_model import twists
 
 STOOD_STILL = (0, 2, 8, 12)

@@ -8,9 +8,8 @@ from typer.testing import CliRunner
 
 from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo.cli.dispatch import app
-from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.comparison import MEANINGS, of_error, of_limit, of_statement
-from stereoservo_sim.experiments.thesis_contents import CONTENTS, REPRODUCED
+from stereoservo_sim.experiments.catalogue import CONTENTS, EXPERIMENTS, REPRODUCED
+from stereoservo_sim.experiments.experiment import MEANINGS, cell_text, of_error, of_limit, of_statement
 from stereoservo_sim.experiments.thesis_page import page, reproduce_all
 
 
@@ -27,6 +26,13 @@ def test_verdict_words():
     assert of_limit("t", "w", 0.5, 0.5, "mm").verdict == "agrees"
     assert of_limit("t", "w", 0.5, 0.51, "mm").verdict == "worse"
     assert of_statement("t", "w", "fails", "does not", False, "why").verdict == "not reproduced"
+
+
+def test_values_of_rows_as_text():
+    assert cell_text({"median": 0.5, "p16": 0.25, "p84": 1.0, "mean": 0.6}) == "0.5 (0.25 to 1)"
+    assert cell_text({"median": None, "p16": None, "p84": None, "mean": None}) == cell_text(None) == "-"
+    assert cell_text({"metric": 3, "projective": 1}) == "metric 3, projective 1"
+    assert cell_text([0.25, 1.0]) == "0.25 to 1"
 
 
 def test_every_table_and_figure_has_an_experiment_or_says_why_none():

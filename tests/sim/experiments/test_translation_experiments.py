@@ -9,9 +9,7 @@ from typer.testing import CliRunner
 from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo.cli.dispatch import app
 from stereoservo.geometry.cameras import triangulate
-from stereoservo_sim.experiments.catalogue import EXPERIMENTS
-from stereoservo_sim.experiments.comparison import Comparison
-from stereoservo_sim.experiments.translations.affine_measures import (
+from stereoservo_sim.experiments.affine_measures import (
     collinear_triplets,
     converging_rig,
     cramer_rao,
@@ -25,15 +23,15 @@ from stereoservo_sim.experiments.translations.affine_measures import (
     ratio_error,
     upgrade,
 )
-from stereoservo_sim.experiments.translations.grid import grid_points, run_grid, scene_shifts
-from stereoservo_sim.experiments.translations.gripper import (
+from stereoservo_sim.experiments.catalogue import EXPERIMENTS
+from stereoservo_sim.experiments.experiment import Comparison
+from stereoservo_sim.experiments.grid import grid_points, house_points, run_grid, run_house, scene_shifts
+from stereoservo_sim.experiments.gripper import (
     ESTIMATED,
-    draw_gripper,
     markers,
     random_shifts,
     run_gripper,
 )
-from stereoservo_sim.experiments.translations.house import house_points, run_house
 
 
 def silent(stage, done, total):
@@ -174,7 +172,7 @@ def test_gripper_non_linear_is_better_than_linear_and_motions_help(gripper):
 
 
 def test_gripper_draws_both_measures(gripper, tmp_path):
-    paths = draw_gripper(gripper, tmp_path)
+    paths = EXPERIMENTS["gripper"].draw(gripper, tmp_path)
     assert [p.name for p in paths] == ["gripper-e_D.png", "gripper-e_Q.png"]
     assert all(p.stat().st_size > 10_000 for p in paths)
 

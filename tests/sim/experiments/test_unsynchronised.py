@@ -7,7 +7,7 @@ import json
 import pytest
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.experiments.cameras.unsynchronised import CONDITIONS, SKEW_S, WRONG_S, cell_of
+from stereoservo_sim.experiments.unsynchronised import CONDITIONS, SKEW_S, WRONG_S, cell_of
 
 
 def test_the_conditions_differ_in_shutters_and_stamps_alone() -> None:

@@ -16,8 +16,7 @@ from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.fake import FakeCameraDriver, FakeJointDriver
 from stereoservo_sim.cells import ARMS, shipped_cell_path
 from stereoservo_sim.demonstration.truth import true_cell
-from stereoservo_sim.experiments.arms.random_rigs import judged_case
-from stereoservo_sim.experiments.arms.shipped_arms import arm_case, twin
+from stereoservo_sim.experiments.random_rigs import arm_case, judged_case, twin
 from stereoservo_sim.world.arms.arm_cell import ArmPlace, body_jacobian, cell_of, seen_by_all
 from stereoservo_sim.world.arms.arm_goals import goals_of, goes_straight, straight_way
 from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf, urdf_path
