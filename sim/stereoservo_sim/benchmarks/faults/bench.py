@@ -1,0 +1,422 @@
+"""``bench faults``: injects every fault of the CAN arm, of the service and of its inputs, and measures the time to
+detection and to rest.
+
+In real time, driver and emulated drives are two processes over serial-line CAN on TCP. From the order (or the signal)
+to the last axis's rest, by the emulator's events; both are CLOCK_MONOTONIC. Machines are shared: a fault that comes
+before it was ordered is a stall's, is counted and tried again; beside the times stand how late the emulator's loop
+came.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from stereoservo.messages.cell_file import load_cell_file
+from stereoservo_drivers.canopen.options import CanOptions
+from stereoservo_sim.benchmarks.faults.inputs import run_inputs
+from stereoservo_sim.benchmarks.faults.service import run_service
+from stereoservo_sim.benchmarks.timing import summary
+from stereoservo_sim.cells import shipped_cell_path
+from stereoservo_sim.emulators.bus.factory import drives_of_cell
+from stereoservo_sim.emulators.bus.fault_cases import CASES
+from stereoservo_sim.emulators.bus.fault_table import run_row
+from stereoservo_sim.emulators.bus.fault_trials import (
+    AXES,
+    RAMP_COUNTS_S2,
+    RATE_HZ,
+    SPEED_COUNTS_S,
+    TrialError,
+)
+from stereoservo_sim.emulators.emulator_process import EmulatorProcess
+from stereoservo_sim.experiments.experiment import ExperimentError
+from stereoservo_sim.progress import ProgressCall
+
+CELL = "hil-can"
+SPEED = 0.125
+"""[rad/s]; at the cell's quick-stop deceleration a ramp of 12.5 ms."""
+STRICT = {
+    "heartbeat_timeout_ms": 100,
+    "rpdo_deadline_ms": 0,
+    "max_missed_cycles": 3,
+    "command_timeout_s": 0.1,
+    "loop_timeout_ms": 100,
+}
+"""The table's settings: the options' defaults; the drives' own watch is on the heartbeat alone."""
+TRIES = 4
+REST_LIMIT_S = 2.0
+RUN_ON_S = 0.5
+TOLD_LIMIT_S = 2.0
+START_LIMIT_S = 60.0
+
+ORDERED = (
+    ("drive fault with emergency", "fault 3 0x3210", "", 40.0),
+    ("node silent", "silence 4", "speak 4", 60.0),
+    ("node reboots", "reboot 5", "", 60.0),
+    ("TPDOs late by 6 ms", "late 2 6ms", "late 2 0", 150.0),
+    ("duplicate node id running", "duplicate 2 running", "duplicate 2 off", 60.0),
+    ("mapping changed", "remap 3", "", 40.0),
+    ("bus cable out", "cable out", "cable in", 150.0),
+    ("SYNC lost", "drop-sync", "pass-sync", 60.0),
+    ("NMT stop by a stranger", "nmt stop", "nmt start", 60.0),
+    ("babbling node", "flood 1", "calm 1", 60.0),
+    ("adapter gone", "adapter out", "adapter in", 150.0),
+)
+"""Fault, order, what ends it, bound [ms] in bit time."""
+DONE_TO_THE_MASTER = ("master killed", "master process hangs", "servo loop hangs")
+MASTER_BOUND_MS = 150.0
+
+
+class StalledError(Exception):
+    """The trial is void: the machine stalled, and a fault occurred before one was injected."""
+
+
+class _Master:
+    """The driver's process."""
+
+    def __init__(self, options: CanOptions, speed: float) -> None:
+        command = [sys.executable, "-m", "stereoservo_sim.benchmarks.faults.master"]
+        settings = json.dumps(msgspec.to_builtins(options))
+        self.process = subprocess.Popen(
+            [*command, settings, repr(speed)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self.lines: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, name="master-lines", daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(json.loads(line))
+        self.lines.put({"event": "ended"})
+
+    def expect(self, event: str, limit_s: float) -> dict[str, Any]:
+        """The next line, which must be ``event``. Raises StalledError with what came instead."""
+        try:
+            line = self.lines.get(timeout=limit_s)
+        except queue.Empty:
+            raise StalledError(f"no {event!r} within {limit_s:g} s") from None
+        if line["event"] != event:
+            raise StalledError(f"{line.get('code', line['event'])}: {line.get('message', '')}")
+        return line
+
+    def fault(self) -> dict[str, Any] | None:
+        """The first fault that it reported, if any."""
+        while not self.lines.empty():
+            line = self.lines.get()
+            if line["event"] == "fault":
+                return line
+        return None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(START_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join()
+
+
+def _strike(emulator: EmulatorProcess, master: _Master, fault: str, order: str) -> int:
+    """Inject the fault; returns the time [ns]."""
+    if order:
+        asked_ns = time.monotonic_ns()
+        emulator.order(order)
+        until = time.monotonic() + TOLD_LIMIT_S
+        while not (done := _events(emulator, asked_ns, "order")):
+            if time.monotonic() > until:
+                raise StalledError(f"the emulator told nothing of {order!r} within {TOLD_LIMIT_S:g} s")
+            time.sleep(0.001)
+        return int(done[0]["t_ns"])
+    if fault == "servo loop hangs":
+        assert master.process.stdin is not None
+        master.process.stdin.write("hang\n")
+        master.process.stdin.flush()
+        return int(master.expect("hangs", 1.0)["t_ns"])
+    now = time.monotonic_ns()
+    master.process.send_signal(signal.SIGKILL if fault == "master killed" else signal.SIGSTOP)
+    return now
+
+
+def _events(emulator: EmulatorProcess, since_ns: int, *kinds: str) -> list[dict[str, Any]]:
+    return [e for e in list(emulator.events) if e.get("event") in kinds and e["t_ns"] >= since_ns]
+
+
+def _trial(
+    emulator: EmulatorProcess, options: CanOptions, speed: float, fault: str, order: str
+) -> dict[str, Any]:
+    """One trial. Raises StalledError."""
+    with _Master(options, speed) as master:
+        master.expect("moving", START_LIMIT_S)
+        t0 = _strike(emulator, master, fault, order)
+        until = time.monotonic() + REST_LIMIT_S
+        while not (rests := _events(emulator, t0, "all_rest")) and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(RUN_ON_S)
+        told = master.fault()
+        if told is not None and told["t_ns"] < t0:
+            raise StalledError(f"{told['code']}: {told['message']}")
+        restarted = bool(rests and _events(emulator, rests[0]["t_ns"], "moves", "power_on"))
+    return {
+        "rest_ms": (rests[0]["t_ns"] - t0) * 1e-6 if rests else None,
+        "detected_ms": (told["t_ns"] - t0) * 1e-6 if told is not None else None,
+        "code": told["code"] if told is not None else "",
+        "restarted": restarted,
+    }
+
+
+def _settle(emulator: EmulatorProcess, cure: str) -> None:
+    """Remove the cause, and wait until the drives are at rest."""
+    if cure:
+        emulator.order(cure)
+    time.sleep(0.2)
+
+
+def run_wall(repetitions: int, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Rows of all faults, ``repetitions`` trials each, and how steadily the emulator's loop ran.
+
+    Raises ExperimentError where the emulated drives end.
+    """
+    cases = [*ORDERED, *((fault, "", "", MASTER_BOUND_MS) for fault in DONE_TO_THE_MASTER)]
+    options, _ = drives_of_cell(load_cell_file(shipped_cell_path(CELL)))
+    with tempfile.TemporaryDirectory() as folder:
+        text = shipped_cell_path(CELL).read_text(encoding="utf-8")
+        cell = Path(folder) / f"{CELL}.toml"
+        cell.write_text(text.replace('plant = "pybullet"', 'plant = "ideal"'), encoding="utf-8")
+        directories = {"STEREOSERVO_RUNTIME_DIR": folder, "STEREOSERVO_STATE_DIR": folder}
+        channel = ("--channel", "socket://127.0.0.1:0", "--bit-time")
+        with EmulatorProcess(
+            cell, options=channel, environment=directories, log=Path(folder) / "log"
+        ) as emulator:
+            options = msgspec.structs.replace(options, channel=emulator.wait_ready(), **STRICT)
+            rows = []
+            for k, (fault, order, cure, bound_ms) in enumerate(cases):
+                rows.append(_row(emulator, options, fault, order, cure, bound_ms, repetitions))
+                progress(k + 1, len(cases))
+        stalls = [event for event in emulator.events if event.get("event") == "end"]
+    loop = {key: value for key, value in stalls[-1].items() if key != "event"} if stalls else None
+    return {"rows": rows, "emulator_loop": loop, "load": list(os.getloadavg())}
+
+
+def _row(
+    emulator: EmulatorProcess,
+    options: CanOptions,
+    fault: str,
+    order: str,
+    cure: str,
+    bound_ms: float,
+    repetitions: int,
+) -> dict[str, Any]:
+    trials: list[dict[str, Any]] = []
+    stalled: list[str] = []
+    while len(trials) < repetitions and len(stalled) < TRIES:
+        speed = SPEED if (len(trials) + len(stalled)) % 2 else -SPEED
+        try:
+            trials.append(_trial(emulator, options, speed, fault, order))
+        except StalledError as error:
+            stalled.append(str(error))
+        if emulator.process.poll() is not None:
+            raise ExperimentError("emulator", f"{fault}: the emulated drives ended: {emulator.output()}")
+        _settle(emulator, cure)
+    rests = [trial["rest_ms"] for trial in trials if trial["rest_ms"] is not None]
+    seen = [trial["detected_ms"] for trial in trials if trial["detected_ms"] is not None]
+    return {
+        "fault": fault,
+        "rest_ms": summary(rests) if rests else None,
+        "detected_ms": summary(seen) if seen and order else None,
+        "bound_ms_in_bit_time": bound_ms,
+        "never_at_rest": len(trials) - len(rests),
+        "codes": sorted({trial["code"] for trial in trials if trial["code"]}),
+        "restarts": sum(trial["restarted"] for trial in trials),
+        "stalled": stalled,
+    }
+
+
+# -- the bench -------------------------------------------------------------------------------------------------
+
+WALL_SHARE = 3
+"""For so many trials in bit time one in real time, which takes seconds."""
+
+
+def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
+    """``rows``: of the drives in the emulator's bit time, ``repetitions`` trials a fault, alike for one seed. ``wall``:
+    of the drives in real time. ``service``: of the whole daemon in real time. ``inputs``: of joint samples, camera
+    frames and the clock in virtual time, ``repetitions`` trials a fault, alike for one seed.
+
+    Raises ExperimentError where a trial cannot begin, or the emulated drives or a daemon end.
+    """
+    cases = [(protocol, case) for protocol, those in CASES.items() for case in those]
+    rows = []
+    for k, (protocol, case) in enumerate(cases):
+        try:
+            rows.append(run_row(case, protocol, repetitions, seed))
+        except TrialError as error:
+            raise ExperimentError("fault_trial", f"{protocol}, {case.name}: {error}") from error
+        progress("faults in bit time", k + 1, len(cases))
+    wall = run_wall(
+        max(repetitions // WALL_SHARE, 1), lambda done, total: progress("faults in real time", done, total)
+    )
+    inputs = run_inputs(repetitions, seed, _tell_input)
+    service = run_service(max(repetitions // WALL_SHARE, 1), _tell_row)
+    return {
+        "axes": AXES,
+        "rate_hz": RATE_HZ,
+        "ramp_ms": SPEED_COUNTS_S / RAMP_COUNTS_S2 * 1e3,
+        "ok": all(row.ok for row in rows),
+        "rows": [msgspec.to_builtins(row) for row in rows],
+        "wall": wall,
+        "service": service,
+        "inputs": inputs,
+    }
+
+
+def _tell_row(row: dict[str, Any]) -> None:
+    """One row of the service as it comes, on stderr."""
+    print(
+        f"{row['fault']}: rest {_summary(row['rest_ms'])} ms of {row['bound_ms']}, within {row['within']} of "
+        f"{row['trials']}, after {', '.join(row['after'])}; a trial takes {_summary(row['trial_s'])} s",
+        file=sys.stderr,
+    )
+
+
+def _tell_input(row: dict[str, Any]) -> None:
+    """One row of the inputs as it comes, on stderr."""
+    print(
+        f"{row['input']}, {row['fault']}, goal by {row['goal']}: rest {_summary(row['rest_ms'])} ms of "
+        f"{row['bound_ms']}, within {row['within']} of {row['trials']}, works again {row['works_again']}",
+        file=sys.stderr,
+    )
+
+
+def show_faults(figures: dict[str, Any], console: Console) -> dict[str, Any]:
+    """The tables; what is left of the figures."""
+    rows, wall = figures["rows"], figures["wall"]
+    title = (
+        f"{figures['axes']} axes at {figures['rate_hz']:g} Hz, ramps of {figures['ramp_ms']:g} ms, "
+        f"in the emulator's bit time; {rows[0]['trials']} trials each; [ms] after the fault, median / max"
+    )
+    console.print(_table(title, [drive_cells(row) for row in rows], ("cycles", "bound", "restarts")))
+    for row in rows:
+        for problem in row["problems"]:
+            console.print(f"{row['protocol']}, {row['fault']}: {problem}")
+    title = "real time, two processes, slcan over TCP; [ms], median / max"
+    console.print(_table(title, [_wall_cells(row) for row in wall["rows"]]))
+    title = "the whole service in real time: emulated drives on slcan, a joint goal; [ms], median / max"
+    console.print(_table(title, [service_cells(row) for row in figures["service"]]))
+    title = "inputs of the core in virtual time, fake arm and cameras in lockstep; [ms], median / max"
+    console.print(_table(title, [input_cells(row) for row in figures["inputs"]]))
+    loop = wall["emulator_loop"]
+    if loop is not None:
+        console.print(
+            f"the emulator's loop came {loop['latest_ns'] * 1e-6:.2f} ms late at most, "
+            f"{loop['stalls']} stalls in {loop['turns']} turns"
+        )
+    shown = ("rows", "wall", "service", "inputs")
+    return {key: value for key, value in figures.items() if key not in shown}
+
+
+def _table(title: str, rows: list[dict[str, str]], right: tuple[str, ...] = ()) -> Table:
+    """A table of rows of text by column."""
+    table = Table(title=title, title_justify="left")
+    for name in rows[0] if rows else ():
+        table.add_column(name, justify="right" if name in right else "left")
+    for row in rows:
+        table.add_row(*row.values())
+    return table
+
+
+def drive_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
+    """A row of the drives in bit time as text, by column; ``digits`` of times [ms]."""
+    return {
+        "protocol": row["protocol"],
+        "fault": row["fault"],
+        "known": _pair(row["detected_ms_median"], row["detected_ms_max"], digits),
+        "cycles": "-" if row["detected_cycles"] is None else str(row["detected_cycles"]),
+        "all at rest": _pair(row["rest_ms_median"], row["rest_ms_max"], digits),
+        "bound": _bound(row),
+        "by": row["by"],
+        "latched": ", ".join(f"{code} {count}" for code, count in row["codes"].items()) or "-",
+        "restarts": str(row["restarts"]),
+        "ok": "yes" if row["ok"] else "NO",
+    }
+
+
+def _wall_cells(row: dict[str, Any]) -> dict[str, str]:
+    return {
+        "fault": row["fault"],
+        "known": _summary(row["detected_ms"]),
+        "all at rest": _summary(row["rest_ms"])
+        + (f" ({row['never_at_rest']} never)" if row["never_at_rest"] else ""),
+        "bound in bit time": f"{row['bound_ms_in_bit_time']:g}",
+        "latched": ", ".join(row["codes"]) or "-",
+        "restarts": str(row["restarts"]),
+        "stalled before": str(len(row["stalled"])),
+    }
+
+
+def service_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
+    """A row of the service likewise."""
+    return {
+        "fault": row["fault"],
+        "all at rest": _summary(row["rest_ms"], digits) if row["rest_ms"] else "goes on",
+        "bound": _bound(row),
+        "within": f"{row['within']} of {row['trials']}",
+        "after": ", ".join(row["after"]),
+        "status right": f"{row['status_right']} of {row['trials']}",
+        "status says": " | ".join(row["status_says"]),
+        "ends of the goal": ", ".join("-" if count < 0 else str(count) for count in row["terminal_events"]),
+        "void": str(len(row["void"])),
+    }
+
+
+def input_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
+    """A row of the inputs likewise."""
+    return {
+        "input": row["input"],
+        "fault": row["fault"],
+        "goal by": row["goal"],
+        "at rest": _summary(row["rest_ms"], digits) if row["rest_ms"] else "goes on",
+        "bound": _bound(row),
+        "within": f"{row['within']} of {row['trials']}",
+        "after": ", ".join(row["after"]),
+        "told": ", ".join(row["reasons"]) or "-",
+        "goal": ", ".join(row["outcomes"]),
+        "ends": ", ".join(str(count) for count in row["terminal_events"]),
+        "works again": f"{row['works_again']} of {row['trials']}",
+    }
+
+
+def _bound(row: dict[str, Any]) -> str:
+    return "-" if row["bound_ms"] is None else f"{row['bound_ms']:g}"
+
+
+def _pair(median: float | None, largest: float | None, digits: int = 1) -> str:
+    return "-" if median is None or largest is None else f"{median:.{digits}f} / {largest:.{digits}f}"
+
+
+def _summary(figures: dict[str, Any] | None, digits: int = 1) -> str:
+    return "-" if figures is None else _pair(figures["median"], figures["max"], digits)
