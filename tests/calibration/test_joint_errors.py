@@ -99,7 +99,10 @@ def test_bundle_with_joint_noise_is_generalised_least_squares():
     P = np.linalg.inv(V) - np.linalg.solve(V, X) @ np.linalg.solve(information, np.linalg.solve(V, X).T)
     assert solution.cost == pytest.approx(y @ P @ y, rel=1e-9)
     assert np.allclose(
-        solution.triangle.T @ solution.triangle, information, rtol=1e-6, atol=1e-9 * information.max()
+        solution.determined.triangle.T @ solution.determined.triangle,
+        information,
+        rtol=1e-6,
+        atol=1e-9 * information.max(),
     )
     expected = expected_squares(solution.rig, solution.charts, solution.data)
     assert np.allclose(expected, np.diag(P).reshape(-1, 2).sum(axis=1), atol=1e-8)

@@ -8,9 +8,9 @@ import pytest
 
 from stereoservo.calibration import self_calibration, stratum_selection
 from stereoservo.calibration.bundle_adjustment import solve
-from stereoservo.calibration.bundle_statistics import chi2_within
 from stereoservo.calibration.calibration_result import intrinsics
 from stereoservo.calibration.diagnosis.joint_scales import model_scales
+from stereoservo.calibration.least_squares import chi2_within
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     epipolar_lenses,

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.joint_errors.joint_noise import stop_rows
+from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.lens_estimation import straightened
 from stereoservo.calibration.lens_significance import FREE_LENS, lens_test, lens_wanted
 from stereoservo.calibration.normal_equations import by_stop

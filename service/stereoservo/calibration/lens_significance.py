@@ -10,7 +10,6 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom, variance_factor
 from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
 from stereoservo.calibration.rig_model import predicted, residuals
 from stereoservo.geometry.distortion import terms_jacobian
@@ -71,7 +70,7 @@ def lens_test(solution: Solution) -> LensTest:
 def terms_test(solution: Solution) -> LensTest:
     """Chi-square, to first order, of the second radial and both tangential terms of all lenses that lack them."""
     gain, terms = _gain(solution, _distortion_columns(solution))
-    freedom = max(1, degrees_of_freedom(solution) - terms)
+    freedom = max(1, solution.determined.freedom - terms)
     factor = max(1.0, (solution.cost - gain) / freedom)
     return LensTest(gain / factor, terms, float(chi2_distribution.isf(LENS_TAIL, terms)))
 
@@ -106,7 +105,7 @@ def _evidence(solution: Solution) -> tuple[float, float]:
     found = []
     for columns in (_distortion_columns(solution), scale_columns(solution, joints)):
         gain, count = _gain(solution, columns)
-        found.append(gain / max(1.0, variance_factor(solution)) - count * float(np.log(solution.rows)))
+        found.append(gain / max(1.0, solution.determined.variance) - count * float(np.log(solution.rows)))
     return found[0], found[1]
 
 

@@ -13,13 +13,12 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_inliers import (
     projective_bundle,
     refine_to_convergence,
     with_whole_stops,
 )
-from stereoservo.calibration.bundle_statistics import chi2_within, degrees_of_freedom
 from stereoservo.calibration.calibration_result import (
     CalibrationFit,
     FitHistory,
@@ -50,6 +49,7 @@ from stereoservo.calibration.joint_errors.variance_components import (
     reduced_rows,
 )
 from stereoservo.calibration.known_arm.known_arm_fit import fit_with_known_arm
+from stereoservo.calibration.least_squares import RobustLoss, chi2_within
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     implausible_lens,
@@ -372,7 +372,7 @@ def _fit(
                 refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
-            elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
+            elif chi2_within(bundles.final.cost, bundles.final.determined.freedom):
                 components, chance = likely_errors(rows)
     report_progress("report", 0.95)
     result = build_fit(
@@ -382,7 +382,7 @@ def _fit(
         bundles.inliers,
         ModelFrame(start.zero, bundles.raised.plane),
         FitHistory(
-            (bundles.projective.cost, degrees_of_freedom(bundles.projective)),
+            (bundles.projective.cost, bundles.projective.determined.freedom),
             bundles.raised.notes,
             start.markers_left_out,
         ),
@@ -493,7 +493,7 @@ def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponen
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
-    if chi2_within(free.cost, degrees_of_freedom(free)):
+    if chi2_within(free.cost, free.determined.freedom):
         return None
     # Wrong pixels would be taken for errors of the joints; those of a stop as a whole would not be seen.
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)

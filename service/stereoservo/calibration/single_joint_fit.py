@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, solve
+from stereoservo.calibration.bundle_adjustment import solve
 from stereoservo.calibration.generator_initialization import (
     common_points,
     linear_generator,
     nominal_generator,
     turned_generators,
 )
+from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.displacements import exp_generator

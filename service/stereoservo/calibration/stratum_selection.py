@@ -13,13 +13,8 @@ from scipy.stats import f as f_distribution
 
 from stereoservo.calibration import stratum_upgrade
 from stereoservo.calibration.alternative_axes import with_other_axes
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
-from stereoservo.calibration.bundle_statistics import (
-    covariance_root,
-    generator_noise,
-    rank_of,
-    variance_factor,
-)
+from stereoservo.calibration.bundle_adjustment import Solution, generator_noise, solve
+from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.lens_significance import lens_wanted
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError
@@ -94,7 +89,7 @@ class StratumSelector:
         if problem:
             self._note(solution, problem)
             # A good fit that leaves directions wide open, converged along them or not: so will any other.
-            open_ones = rank_of(solution) < solution.charts.size
+            open_ones = solution.determined.rank < solution.charts.size
             wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_SPREAD
             done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
             self.hopeless = self._close(solution) and (wide or done)
@@ -157,12 +152,14 @@ class StratumSelector:
         Its covariance is large; predictions are as good as the trials allow.
         """
         projective = solve(self.projective.rig, data, "projective", lenses=self.projective.lenses)
-        if projective.converged and rank_of(projective) == projective.charts.size:
+        if projective.converged and projective.determined.rank == projective.charts.size:
             return None
         for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _solve_to_convergence(solution, data)
             deviation = (
-                max(_relative_deviations(final).values()) if rank_of(final) == final.charts.size else np.inf
+                max(_relative_deviations(final).values())
+                if final.determined.rank == final.charts.size
+                else np.inf
             )
             if (
                 final.converged
@@ -207,14 +204,14 @@ class StratumSelector:
         else:
             stops, joints = solution.data.offsets.shape
             allowed = fewer * float(f_distribution.isf(tail, fewer, max(stops // joints - 3, 1)))
-        return solution.cost - beside.cost > allowed * max(1.0, variance_factor(beside))
+        return solution.cost - beside.cost > allowed * max(1.0, beside.determined.variance)
 
     def _close(self, solution: Solution) -> bool:
-        beside = max(1.0, variance_factor(self.projective))
-        return variance_factor(solution) <= self.options.metric_loss * beside
+        beside = max(1.0, self.projective.determined.variance)
+        return solution.determined.variance <= self.options.metric_loss * beside
 
     def _unidentified(self, solution: Solution) -> str:
-        rank = rank_of(solution)
+        rank = solution.determined.rank
         if rank < solution.charts.size:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
         limit = self.options.max_spread
@@ -245,8 +242,8 @@ def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:
 
 def _relative_deviations(solution: Solution) -> dict[str, float]:
     """Largest relative standard deviation of depths and, in the metric stratum, of focal lengths."""
-    factor = max(1.0, variance_factor(solution))
-    deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
+    factor = max(1.0, solution.determined.variance)
+    deviations = np.sqrt((solution.determined.root**2).sum(axis=1) * factor)
     m = len(solution.rig.points)
     scale = np.array([basis[2, 2] for basis in solution.charts.points])
     depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])

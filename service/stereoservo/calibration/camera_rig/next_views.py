@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.camera_rig.rig_bundle import RigFit
 from stereoservo.calibration.camera_rig.rig_calibration import RigCalibration
 from stereoservo.calibration.joint_errors.joint_noise import stop_rows
+from stereoservo.calibration.least_squares import deviation, with_rows
 from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import Measurements, predicted
 from stereoservo.geometry.strata import decompose_camera, intrinsics_and_slopes
@@ -52,14 +53,14 @@ def next_views(fit: RigFit, result: RigCalibration) -> list[ViewAdvice]:
     """
     worst = max(result.cameras, key=lambda camera: camera.deviations["fx"] / camera.focal[0])
     k = [camera.name for camera in result.cameras].index(worst.name)
-    information = fit.solution.triangle.T @ fit.solution.triangle / fit.variance
+    known, scale = fit.solution.determined.triangle, float(np.sqrt(fit.variance))
     row = _focal_slope(fit, k)
-    now = _deviation(information, row)
+    now = scale * deviation(known, row)
     found = []
     for (place, u, v), (tilt, x, y), (distance, share) in product(PLACES, TILTS, DISTANCES):
-        more = _information(fit, result, k, (u, v), (x, y), share)
+        more = _rows(fit, result, k, (u, v), (x, y), share)
         if more is not None:
-            would = _deviation(information + more / fit.variance, row)
+            would = scale * deviation(with_rows(known, more), row)
             where = f"{distance}, {place} of {worst.name}, {tilt}"
             found.append(
                 ViewAdvice(
@@ -68,13 +69,6 @@ def next_views(fit: RigFit, result: RigCalibration) -> list[ViewAdvice]:
                 )
             )  # fmt: skip
     return sorted(found, key=lambda one: one.would_be_px)
-
-
-def _deviation(information: FloatArray, row: FloatArray) -> float:
-    sizes = np.sqrt(np.diag(information))
-    sizes[sizes == 0.0] = 1.0
-    half = np.linalg.solve(information / np.outer(sizes, sizes), row / sizes)
-    return float(np.sqrt(max(float((row / sizes) @ half), 0.0)))
 
 
 def _focal_slope(fit: RigFit, k: int) -> FloatArray:
@@ -86,7 +80,7 @@ def _focal_slope(fit: RigFit, k: int) -> FloatArray:
     return row
 
 
-def _information(
+def _rows(
     fit: RigFit,
     result: RigCalibration,
     k: int,
@@ -94,7 +88,7 @@ def _information(
     tilt: tuple[float, float],
     share: float,
 ) -> FloatArray | None:
-    """Information (p, p) that one more view adds, its own pose eliminated; None where it does not show the body."""
+    """Rows (2 k, p) of one more view, its own pose eliminated; None where it does not show the body."""
     camera = result.cameras[k]
     motions = np.array([np.array(one.motion) for one in result.cameras])
     depths = fit.poses[:, 2, 3]
@@ -128,8 +122,7 @@ def _information(
     kept = replace(one, pixels=pixels).select(inside)
     rows = next(iter(stop_rows(fit.rig, fit.solution.charts, by_stop(kept)[0])))
     A, (Q, _) = rows.rows[:, :-1], np.linalg.qr(rows.joints)
-    A = A - Q @ (Q.T @ A)
-    return np.asarray(A.T @ A)
+    return np.asarray(A - Q @ (Q.T @ A))
 
 
 def _facing(fit: RigFit, k: int) -> FloatArray:

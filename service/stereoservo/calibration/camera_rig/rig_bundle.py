@@ -18,6 +18,7 @@ from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.camera_rig.initialization import RigStart
 from stereoservo.calibration.camera_rig.views import RigViews
 from stereoservo.calibration.joint_errors.joint_noise import joint_columns
+from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.calibration.rig_model import (
     JointNoise,
     Measurements,
@@ -47,7 +48,8 @@ ASPECT_GAIN = 25.0
 """Chi-square that pixels which are not square must gain to be believed, beside 2 for each camera."""
 ASPECT_ROUNDS = 3
 EVALUATIONS = 150
-POSE_STEPS = 30
+POSE = Limits(evaluations=40, tolerance=1e-6)
+"""Of the fit of one pose."""
 FRAMES = 60
 """Frames of the body among which the one is taken in which its middle angle stays farthest from a quarter turn."""
 
@@ -110,9 +112,7 @@ class RigFit(RigProblem):
     @cached_property
     def root(self) -> FloatArray:
         """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance that residuals show."""
-        sizes = self.solution.sizes
-        inverse = np.linalg.inv(self.solution.triangle / sizes) / sizes[:, None]
-        return np.asarray(inverse * np.sqrt(self.variance))
+        return np.asarray(self.solution.determined.root * np.sqrt(self.variance))
 
     def moved(self, x: FloatArray) -> RigModel:
         """The model at chart coordinates ``x`` (p,)."""
@@ -213,38 +213,23 @@ def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeT
 
 
 def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
-    """The measurements with the hand's readings at the least residuals of each stop, cameras and body as they are:
-    Levenberg-Marquardt of each stop on its own, for the bundle does not damp the hand's errors.
+    """The measurements with the hand's readings at the least residuals of each stop, cameras and body as they are: each
+    stop on its own, for the bundle does not damp the hand's errors.
     """
-    s = len(data.offsets)
-    damping = np.full(s, 1e-3)
+    offsets = data.offsets.copy()
+    for stop in np.unique(data.stop):
+        mine = data.select(data.stop == stop)
+        offsets[stop] = _settled_pose(rig, replace(mine, stop=np.zeros_like(mine.stop)), offsets[stop])
+    return replace(data, offsets=offsets)
 
-    def squares(error: FloatArray) -> FloatArray:
-        found = np.bincount(data.stop, (error.reshape(-1, 2) ** 2).sum(axis=1), s)
-        return np.where(np.isfinite(found), found, np.inf)
 
-    error = residuals(rig, data)
-    cost = squares(error)
-    for _ in range(POSE_STEPS):
-        J = joint_columns(rig, data)
-        stop = np.repeat(data.stop, 2)
-        normal, gradient = np.zeros((s, 6, 6)), np.zeros((s, 6))
-        np.add.at(normal, stop, J[:, :, None] * J[:, None, :])
-        np.add.at(gradient, stop, J * error[:, None])
-        scale = np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-12)
-        damped = normal + np.eye(6) * (damping[:, None] * scale)[:, None, :]
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial = replace(data, offsets=data.offsets - step)
-        there = residuals(rig, trial)
-        found = squares(there)
-        better = found < cost
-        done = cost - found <= 1e-6 * cost
-        data = replace(data, offsets=np.where(better[:, None], trial.offsets, data.offsets))
-        error = np.where(better[stop], there, error)
-        cost, damping = np.where(better, found, cost), damping * np.where(better, 0.1, 10.0)
-        if done.all():
-            break
-    return data
+def _settled_pose(rig: RigModel, data: Measurements, reading: FloatArray) -> FloatArray:
+    fit = DenseFit[FloatArray](
+        lambda q: residuals(rig, replace(data, offsets=q[None]))[:, None],
+        lambda q: joint_columns(rig, replace(data, offsets=q[None]))[:, None],
+        np.add,
+    )
+    return minimise(fit, reading, POSE).state
 
 
 def _rig(start: RigStart, body_frame: FloatArray) -> RigModel:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom, rank_of, variance_factor
 from stereoservo.calibration.rig_model import Measurements
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
@@ -42,7 +41,7 @@ def refuse_poor_fit(
                 maximum=options.max_trial_outliers,
             )
     data = every.select(inliers)
-    if degrees_of_freedom(solution) <= 0:
+    if solution.determined.freedom <= 0:
         raise CalibrationError(
             "too_few_stops",
             f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or "
@@ -50,7 +49,7 @@ def refuse_poor_fit(
             measurements=solution.rows,
             parameters=solution.charts.size,
         )
-    factor = float(np.sqrt(variance_factor(solution)))
+    factor = float(np.sqrt(solution.determined.variance))
     if factor > options.max_sigma_factor:
         squares = (solution.residuals.reshape(-1, 2) ** 2).sum(axis=1)
         of_stop = trials.trials[data.stop]
@@ -72,7 +71,7 @@ def refuse_poor_fit(
 
 def refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
     """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
-    rank = rank_of(solution)
+    rank = solution.determined.rank
     because = f" ({'; '.join(notes)})" if notes else ""
     if rank < solution.charts.size:
         raise CalibrationError(
@@ -85,7 +84,7 @@ def refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
         )
     if solution.converged:
         return
-    factor = variance_factor(solution)
+    factor = solution.determined.variance
     if factor < VALLEY_VARIANCE:
         raise CalibrationError(
             "not_identifiable",

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.stats import t as student
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.bundle_statistics import variance_factor
 from stereoservo.calibration.diagnosis.joint_scales import LEAST_FACTOR
 from stereoservo.calibration.diagnosis.marker_tracks import find_step
 from stereoservo.calibration.joint_errors.variance_components import (
@@ -60,7 +59,7 @@ def explains(
     return (
         components is not None
         and components.significant
-        and variance_factor(solution) <= EXPLAINED**2
+        and solution.determined.variance <= EXPLAINED**2
         and float((~inliers).mean()) <= MOST_OUTLIERS
     )
 

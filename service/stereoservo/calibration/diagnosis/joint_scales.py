@@ -16,10 +16,10 @@ import numpy.typing as npt
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
-from stereoservo.calibration.bundle_statistics import variance_factor
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
+from stereoservo.calibration.least_squares import RobustLoss, estimate_beside
 from stereoservo.calibration.lens_significance import scale_columns
 from stereoservo.calibration.rig_model import Measurements, RigModel
 from stereoservo.calibration.single_joint_fit import (
@@ -39,6 +39,7 @@ ABOVE_FLOOR = 1.25
 """How far above the residuals of the other joints' trials one may stay with its factor."""
 SIGNIFICANT = 5.0
 """Deviations from 1 at which a factor is one."""
+LOSS = RobustLoss("soft_l1", 2.0)
 LEAST_FACTOR = 2e-3
 """Relative error of a scale below which it is not worth a refusal."""
 
@@ -115,12 +116,10 @@ def _best_factor(
             observations.pixels[observations.usable].reshape(-1, 2),
             noise * observations.sigmas[observations.usable].ravel(),
         )
-        return solve(
-            rig, data, "projective", cameras=False, loss=RobustLoss("soft_l1", 2.0), max_evaluations=40
-        ).residuals
+        return solve(rig, data, "projective", cameras=False, loss=LOSS, max_evaluations=40).residuals
 
     def cost(log_factor: float, rig: RigModel) -> float:
-        return float(8.0 * (np.sqrt(1.0 + solved(log_factor, rig) ** 2 / 4.0) - 1.0).sum())
+        return LOSS.cost(solved(log_factor, rig) ** 2)
 
     log = float(np.log(start))
     found = minimize_scalar(
@@ -168,15 +167,11 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     factor = orthogonal_factor(solution.rig, solution.charts, solution.data, scale_columns(solution, joints))
     # What the other parameters can imitate of a factor is theirs.
     at = solution.charts.start(3)
-    moments, rest = factor.core[at:, at:-1], factor.core[at:, -1]
-    information = moments.T @ moments
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-10) / np.outer(size, size)
-    logs = -covariance @ (moments.T @ rest)
-    deviations = np.sqrt(np.diag(covariance) * max(1.0, variance_factor(solution)))
+    found = estimate_beside(factor.core[at:, at:])
+    deviations = np.sqrt(np.diag(found.covariance) * max(1.0, solution.determined.variance))
     return tuple(
         JointScaleEstimate(joint, float(np.exp(log)), float(np.exp(log) * deviation))
-        for joint, log, deviation in zip(joints, logs, deviations, strict=True)
+        for joint, log, deviation in zip(joints, found.x, deviations, strict=True)
     )
 
 
@@ -190,8 +185,7 @@ def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointS
     if result.model.stratum != "metric" or len(joints) < 2:
         return ()
     lengths = np.linalg.norm(solution.rig.generators[:, :3, 3], axis=1)
-    roots = np.linalg.inv(solution.triangle / solution.sizes) / solution.sizes[:, None]
-    roots = roots * np.sqrt(max(1.0, variance_factor(solution)))
+    roots = solution.determined.root * np.sqrt(max(1.0, solution.determined.variance))
     starts = np.cumsum([0, *(len(basis) for basis in solution.charts.generators)])
 
     def log_slope(joint: int) -> FloatArray:

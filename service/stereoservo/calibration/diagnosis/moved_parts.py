@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
+from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 
-LOSS_SIGMAS = 2.0
+LOSS = RobustLoss("soft_l1", 2.0)
 """Residual from which a pixel weighs less: stops of an onset that is found a little late, wrong pixels."""
 EVALUATIONS = 60
 TAIL = 1e-4
@@ -38,7 +38,7 @@ def moved_part(trials: TrialData, start: Solution, stop: int) -> CalibrationErro
     except np.linalg.LinAlgError:
         return camera_or_body_moved(trials, stop)
     least = _robust_cost(everything)
-    noise = max(1.0, least / max(1, degrees_of_freedom(everything)))
+    noise = max(1.0, least / max(1, everything.determined.freedom))
     lost = np.array([(_robust_cost(one) - least) / noise for one in alone])
     freedom = max(1, everything.charts.size - alone[0].charts.size)
     limit = float(chi2_distribution.isf(TAIL, freedom))
@@ -123,12 +123,11 @@ def _solved_with_moved(start: Solution, moved: Sequence[int], stop: int) -> Solu
         replace(data, camera=camera),
         "projective",
         lenses=start.lenses,
-        loss=RobustLoss("soft_l1", LOSS_SIGMAS),
+        loss=LOSS,
         max_evaluations=EVALUATIONS,
         tolerance=1e-6,
     )
 
 
 def _robust_cost(solution: Solution) -> float:
-    squares = (solution.residuals / LOSS_SIGMAS) ** 2
-    return float(2.0 * LOSS_SIGMAS**2 * (np.sqrt(1.0 + squares) - 1.0).sum())
+    return LOSS.cost(solution.residuals**2)

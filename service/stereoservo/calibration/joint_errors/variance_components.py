@@ -18,6 +18,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.joint_errors.joint_noise import stop_rows
+from stereoservo.calibration.least_squares import estimate_beside
 from stereoservo.calibration.normal_equations import by_stop, prior_rows
 from stereoservo.calibration.rig_model import JointNoise
 from stereoservo.kinematics.joint_accuracy import JointAccuracy, posture_correlation
@@ -496,8 +497,5 @@ def _scale_estimates(best: _Likelihood, reduced: ReducedRows) -> tuple[FloatArra
     white = solve_triangular(best.root, rows, lower=True)
     at = reduced.X.shape[1]
     triangle = np.asarray(np.linalg.qr(white, mode="r"))
-    moments, rest = triangle[at:, at:-1], triangle[at:, -1]
-    information = moments.T @ moments
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-10) / np.outer(size, size)
-    return -covariance @ (moments.T @ rest), np.sqrt(np.diag(covariance))
+    found = estimate_beside(triangle[at:, at:])
+    return found.x, np.sqrt(np.diag(found.covariance))

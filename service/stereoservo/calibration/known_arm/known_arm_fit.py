@@ -15,9 +15,8 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_inliers import refine_to_convergence, with_whole_stops
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom, variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit, FitHistory, ModelFrame, build_fit
 from stereoservo.calibration.diagnosis.fit_refusal import refuse_undetermined
 from stereoservo.calibration.joint_errors.joint_noise import StopFactor, orthogonal_factor
@@ -29,6 +28,7 @@ from stereoservo.calibration.joint_errors.variance_components import (
     readings,
     reduced_rows,
 )
+from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.lens_estimation import (
     prior_of_lenses,
     starting_lenses,
@@ -111,7 +111,7 @@ def fit_with_known_arm(
         every,
         found.inliers,
         ModelFrame(np.zeros(len(trials.joint_names)), NOMINAL_PLANE),
-        FitHistory((found.solution.cost, degrees_of_freedom(found.solution)), _notes(factor)),
+        FitHistory((found.solution.cost, found.solution.determined.freedom), _notes(factor)),
         epoch=epoch,
         created=created,
         components=found.components,
@@ -179,7 +179,7 @@ def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _Erro
         before, lenses = components, solution.lenses
         components = estimate_components(reduced_rows(solution, at), scales=False, near=before)
         if components is None or not components.significant:
-            components, factor, every = None, variance_factor(solution), every.with_joint_noise(None)
+            components, factor, every = None, solution.determined.variance, every.with_joint_noise(None)
         else:
             factor, every = components.pixels, every.with_joint_noise(components.noise(at))
             inliers = with_whole_stops(every, inliers) if before is None else inliers
@@ -205,12 +205,12 @@ def _simpler_lenses(
     """A bundle of fewer lens terms where those of ``open_one`` stay open and explain next to nothing: the first that
     converges; ``open_one`` with its ``inliers`` (k,) where there is none.
     """
-    most = AS_GOOD * variance_factor(open_one)
+    most = AS_GOOD * open_one.determined.variance
     simpler: tuple[LensModel, ...] = ("radial_centre", "radial", "none")
     for lenses in simpler[simpler.index(open_one.lenses) + 1 if open_one.lenses in simpler else 0 :]:
         rig = straightened(open_one.rig, every)
         found, kept = refine_to_convergence(rig, every, "metric", options, lenses)
-        if found.converged and variance_factor(found) <= most:
+        if found.converged and found.determined.variance <= most:
             return found, kept
     return open_one, inliers
 

@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.bundle_statistics import covariance_root
 from stereoservo.calibration.generator_initialization import common_points, linear_generator
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.rig_model import Measurements, RigModel, rig_at
@@ -200,7 +199,7 @@ class HeadCalibration:
         """
         charts = self.solution.charts
         size = charts.size - 3 * len(self.solution.rig.points)
-        rows = covariance_root(self.solution)[:size]
+        rows = self.solution.determined.root[:size]
         for column in np.linalg.cholesky(rows @ rows.T).T:
             x = np.concatenate([column, np.zeros(charts.size - size)])
             yield tuple(_seen(rig_at(self.solution.rig, charts, sign * x), self.zero) for sign in (1, -1))  # type: ignore[misc]
