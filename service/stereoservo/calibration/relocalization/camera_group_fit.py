@@ -4,18 +4,20 @@ matrices, inliers, covariance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
+from stereoservo.calibration.least_squares import Limits, minimise
 from stereoservo.calibration.relocalization.camera_resection import (
     Correspondences,
     FreeMatrix,
     MatrixChange,
     RigidMotion,
     fit_with_outliers,
-    parameter_jacobian,
+    matrix_fit,
     predicted,
 )
 from stereoservo.calibration.relocalization.moved_camera_covariance import (
@@ -52,13 +54,12 @@ MAX_SIGMA_FACTOR = 1.5
 SPARE = 2
 """Equations that must be left over: what exactly fits proves nothing."""
 RESECTION_POINTS, RIG_POINTS = 6, 5
-ROUNDS, GAUSS_NEWTON = 6, 12
+ROUNDS, WEIGHED = 6, 2
+"""Times that outliers are told, and that pixels are weighted by what the matrices make of the model's covariance."""
 SETTLED = 1e-4
 """Length of a step [standard deviations] at which the least squares have converged."""
 FAR_PX = 1e6
 """Error of a point that is predicted behind its camera."""
-RANK = 1e-9
-"""Least pivot of the weighted equations, columns of length 1, below which a direction is open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,59 +282,45 @@ def _least_squares(
     views: Correspondences,
     offsets: FloatArray,
 ) -> CameraGroup:
-    """Gauss-Newton in the joint covariance of all pixels, with that of the model and of static points."""
-    k = len(views.camera)
-    p = parameters_of(model)
+    """Least squares in the joint covariance of all pixels, with that of the model and of static points."""
+    k, p = len(views.camera), parameters_of(model)
     sigma = np.zeros((0, 0)) if model.covariance is None else model.covariance.covariance
-    for _ in range(GAUSS_NEWTON):
+    names = [model.cameras[c].name for c in group]
+    for _ in range(WEIGHED):
         motion = _motion(model, start, matrices, family)
         F = model_jacobian(model, group, matrices, motion, views, offsets).reshape(2 * k, p)
         static = static_roots(model, matrices, lenses, views).reshape(2 * k, -1)
         noise = static @ static.T
         for i in range(k):
             noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += views.covariances[i]
-        triangle = np.linalg.cholesky(noise + F @ sigma @ F.T)
-        J = parameter_jacobian(family, matrices, lenses, views).reshape(2 * k, family.size)
-        rows = np.linalg.solve(triangle, J)
-        error = np.linalg.solve(triangle, (predicted(matrices, lenses, views) - views.pixels).ravel())
-        sizes = np.linalg.norm(rows, axis=0)
-        q, r = np.linalg.qr(rows / sizes)
-        if not float(np.abs(np.diag(r)).min()) > RANK:
-            raise points_coplanar([model.cameras[c].name for c in group], k, len(np.unique(views.ids)))
-        gain = np.asarray(np.linalg.solve(r, q.T)) / sizes[:, None]
-        x = -gain @ error
-        before, directions = matrices, family.directions(matrices)
-        matrices = family.step(matrices, x)
-        if not np.isfinite(predicted(matrices, lenses, views)).all():
+        white = np.linalg.inv(np.linalg.cholesky(noise + F @ sigma @ F.T))
+        fit = matrix_fit(family, lenses, views, _jointly(white))
+        found = minimise(fit, matrices, Limits(settled=SETTLED**2))
+        if not np.isfinite(found.cost):
             wrong = tuple(int(i) for i in np.unique(views.ids))
-            raise not_explained(
-                [model.cameras[c].name for c in group], np.inf, np.inf, 0, wrong, 1.0, MAX_OUTLIERS
-            )
-        if float(np.linalg.norm(rows @ x)) < SETTLED:
-            break
-    gain = gain @ np.linalg.inv(triangle)
-    entries = directions.transpose(0, 2, 3, 1).reshape(12 * len(group), family.size)
-    chi2 = float(error @ error - (q.T @ error) @ (q.T @ error))
-    # Where the residuals are larger than stated, so was the noise.
-    factor = max(1.0, chi2 / (2 * k - family.size))
+            raise not_explained(names, np.inf, np.inf, 0, wrong, 1.0, MAX_OUTLIERS)
+        matrices = found.state
+        determined = fit.determined(matrices)
+        if determined.rank < family.size:
+            raise points_coplanar(names, k, len(np.unique(views.ids)))
+    gain = determined.root @ determined.root.T @ fit.rows(matrices)[:, :-1].T @ white
+    entries = family.directions(matrices).transpose(0, 2, 3, 1).reshape(12 * len(group), family.size)
+    motion = _motion(model, start, matrices, family)
     own = entries @ gain
+    # Where the residuals are larger than stated, so was the noise.
     errors = CameraErrors(
         group,
-        inherited_errors(model, group, _motion(model, start, before, family)) - own @ F,
-        factor * own @ noise @ own.T,
+        inherited_errors(model, group, motion) - own @ F,
+        max(1.0, determined.variance) * own @ noise @ own.T,
     )
     return CameraGroup(
-        group,
-        matrices,
-        _motion(model, start, matrices, family),
-        "moved",
-        views,
-        chi2,
-        2 * k - family.size,
-        errors,
-        (),
-        (),
+        group, matrices, motion, "moved", views, determined.cost, determined.freedom, errors, (), ()
     )
+
+
+def _jointly(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Whitening of rows (k, 2, q) by the inverse root (2 k, 2 k) of the covariance of all pixels together."""
+    return lambda rows: (white @ rows.reshape(len(white), -1)).reshape(rows.shape)
 
 
 def _resected(views: Correspondences, lenses: FloatArray) -> list[FloatArray]:

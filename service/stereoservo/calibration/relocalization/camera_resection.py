@@ -6,29 +6,28 @@ frame, where the stratum has no displacements (2.19); or one whole matrix. Pixel
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from stereoservo.calibration.least_squares import DenseFit, Limits, Minimum, RobustLoss, minimise
 from stereoservo.geometry.distortion import bends, distort, distortion_jacobian
 from stereoservo.kinematics.kernels import exp_twist
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-ROUNDS = 60
+EVALUATIONS = 100
 SETTLED = 1e-4
 """Length of a step [standard deviations of the parameters] at which a fit has converged."""
-FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e8
-SUBSETS, OF_SUBSET, SUBSET_ROUNDS = 30, 4, 15
-"""Random starts, ids of each and iterations, that are tried where a fit to everything leaves outliers: of 30 % wrong
+SUBSETS, OF_SUBSET, SUBSET_EVALUATIONS = 30, 4, 20
+"""Random starts, ids of each and evaluations, that are tried where a fit to everything leaves outliers: of 30 % wrong
 ids one in a thousand searches finds no clean start."""
 NOISY, FEW = 4.0, 0.25
 """Variance of the pixels over the stated one, and share of outliers, at which a search for better starts ends."""
 OUTSTANDING = 25.0
 """Squared distance, in the noise of the median, above which a pixel is an outlier: two degrees of freedom."""
-ROBUST_SIGMAS = 3.0
-"""Scale of Cauchy's loss [sigmas]."""
+LOSS = RobustLoss("cauchy", 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,49 +150,32 @@ def whitening(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
 
 
-def fit_matrices(
+def matrix_fit(
     family: MatrixChange,
-    start: FloatArray,
     lenses: FloatArray,
     views: Correspondences,
-    *,
-    robust: bool,
-    rounds: int = ROUNDS,
-) -> tuple[FloatArray, float]:
-    """Matrices (c, 3, 4) of least squared residuals, or of least Cauchy loss, from ``start`` by
-    Levenberg-Marquardt, and that loss; infinite where points lie behind a camera at the start.
+    whiten: Callable[[FloatArray], FloatArray],
+    loss: RobustLoss | None = None,
+) -> DenseFit[FloatArray]:
+    """The fit of matrices (c, 3, 4); ``whiten`` takes rows (k, 2, q) [px] to sigmas."""
+    return DenseFit(
+        lambda matrices: whiten((predicted(matrices, lenses, views) - views.pixels)[..., None])[..., 0],
+        lambda matrices: whiten(parameter_jacobian(family, matrices, lenses, views)),
+        family.step,
+        loss,
+    )
+
+
+def fit_matrices(
+    family: MatrixChange, start: FloatArray, lenses: FloatArray, views: Correspondences,
+    *, loss: RobustLoss | None, evaluations: int = EVALUATIONS,
+) -> Minimum[FloatArray]:  # fmt: skip
+    """Matrices (c, 3, 4) of least squared residuals, or of least ``loss``, from ``start``; the cost is infinite where
+    points lie behind a camera at the start.
     """
     roots = whitening(views.covariances)
-    matrices, damping = start, FIRST_DAMPING
-    error = _whitened(matrices, lenses, views, roots)
-    loss = _loss(error, robust)
-    if not np.isfinite(loss):
-        return start, np.inf
-    for _ in range(rounds):
-        weights = _weights(error, robust)
-        J = (roots @ parameter_jacobian(family, matrices, lenses, views)) * weights[:, None, None]
-        rows, right = J.reshape(-1, family.size), (error * weights[:, None]).ravel()
-        sizes = np.linalg.norm(rows, axis=0)
-        sizes = np.where(sizes > 0.0, sizes, 1.0)
-        rows = rows / sizes
-        settled = False
-        while damping < MOST_DAMPING:
-            padded = np.vstack([rows, np.sqrt(damping) * np.eye(family.size)])
-            x = np.linalg.lstsq(padded, -np.append(right, np.zeros(family.size)), rcond=None)[0]
-            tried = family.step(matrices, x / sizes)
-            there = _whitened(tried, lenses, views, roots)
-            least = _loss(there, robust)
-            settled = float(np.linalg.norm(rows @ x)) < SETTLED
-            if least <= loss:
-                matrices, error, loss = tried, there, least
-                damping = max(0.1 * damping, 1e-12)
-                break
-            if settled:
-                break
-            damping = 10.0 * damping
-        if settled or damping >= MOST_DAMPING:
-            break
-    return matrices, loss
+    fit = matrix_fit(family, lenses, views, lambda rows: roots @ rows, loss)
+    return minimise(fit, start, Limits(evaluations, 0.0, SETTLED**2))
 
 
 def fit_with_outliers(
@@ -201,22 +183,20 @@ def fit_with_outliers(
 ) -> tuple[FloatArray, float]:
     """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids."""
     best = min(
-        (fit_matrices(family, start, lenses, views, robust=True) for start in starts), key=lambda one: one[1]
+        (fit_matrices(family, start, lenses, views, loss=LOSS) for start in starts), key=lambda one: one.cost
     )
     roots = whitening(views.covariances)
-    if _clean(_whitened(best[0], lenses, views, roots)):
-        return best
+    if _clean(_whitened(best.state, lenses, views, roots)):
+        return best.state, best.cost
     for subset in _subsets(views, family):
+        some = views.select(subset)
         for start in starts:
-            part, _ = fit_matrices(
-                family, start, lenses, views.select(subset), robust=False, rounds=SUBSET_ROUNDS
-            )
-            found = fit_matrices(family, part, lenses, views, robust=True)
-            if found[1] < best[1]:
-                best = found
-        if _is_good_enough(_whitened(best[0], lenses, views, roots)):
+            part = fit_matrices(family, start, lenses, some, loss=None, evaluations=SUBSET_EVALUATIONS)
+            found = fit_matrices(family, part.state, lenses, views, loss=LOSS)
+            best = found if found.cost < best.cost else best
+        if _is_good_enough(_whitened(best.state, lenses, views, roots)):
             break
-    return best
+    return best.state, best.cost
 
 
 def _clean(error: FloatArray) -> bool:
@@ -252,16 +232,3 @@ def _whitened(
 ) -> FloatArray:
     error: FloatArray = (roots @ (predicted(matrices, lenses, views) - views.pixels)[..., None])[..., 0]
     return error
-
-
-def _loss(error: FloatArray, robust: bool) -> float:
-    squares = (error**2).sum(axis=1)
-    loss = float((ROBUST_SIGMAS**2 * np.log1p(squares / ROBUST_SIGMAS**2) if robust else squares).sum())
-    return loss if np.isfinite(loss) else np.inf
-
-
-def _weights(error: FloatArray, robust: bool) -> FloatArray:
-    """Square roots (k,) of the IRLS weights of the loss."""
-    if not robust:
-        return np.ones(len(error))
-    return np.asarray(1.0 / np.sqrt(1.0 + (error**2).sum(axis=1) / ROBUST_SIGMAS**2))
