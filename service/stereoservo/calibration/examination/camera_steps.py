@@ -21,10 +21,11 @@ from stereoservo.calibration.examination.recorded_views import (
     single_joint_motions,
     stop_positions,
 )
+from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-SETTLED, HALVINGS, DAMPING = 12, 6, 1e-4
-"""Steps of a course's least squares, times that a step is damped more, and its damping at first."""
+COURSE = Limits(evaluations=30, tolerance=0.0, settled=1e-6)
+"""Of a course's least squares."""
 ROUNDS = 6
 """Times that the onset is estimated again."""
 LASTING = 3
@@ -193,27 +194,19 @@ def _course(track: _MarkerTrack, pixels: FloatArray) -> _Course:
     terms = np.hstack([np.ones((k, 1)), track.forms])
     none = np.zeros_like(terms)
     x = np.append(np.linalg.lstsq(weight * terms, weight * seen, rcond=None)[0].T.ravel(), np.zeros(r))
-    here, depths = _predicted(terms, x)
-    damping = DAMPING
-    for _ in range(SETTLED):
-        slopes = _slopes(terms, none, here, depths) * np.vstack([weight, weight])
-        left = (weight * (seen - here)).T.ravel()
-        normal, moment = slopes.T @ slopes, slopes.T @ left
-        for _ in range(HALVINGS):
-            damped = normal + damping * np.diag(np.diag(normal) + 1e-12)
-            tried = x + np.linalg.solve(damped, moment)
-            there, far = _predicted(terms, tried)
-            if far.min() > LEAST_DEPTH and ((weight * (seen - there)) ** 2).sum() <= left @ left:
-                damping *= 0.1
-                x, here, depths = tried, there, far
-                break
-            damping *= 10.0
-        else:
-            break
-    slopes = _slopes(terms, none, here, depths) * np.vstack([weight, weight])
+    weights = np.vstack([weight, weight])
+
+    def errors(x: FloatArray) -> FloatArray:
+        here, depths = _predicted(terms, x)
+        return np.where(depths.min() > LEAST_DEPTH, (weight * (here - seen)).T.reshape(-1, 1), np.inf)
+
+    def changes(x: FloatArray) -> FloatArray:
+        return (weights * _slopes(terms, none, *_predicted(terms, x)))[:, None]
+
+    x = minimise(DenseFit(errors, changes, np.add), x, COURSE).state
+    slopes, predicted = changes(x)[:, 0], _predicted(terms, x)[0] * size + middle
     basis, values, _ = np.linalg.svd(slopes, full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]].reshape(2, k, -1).transpose(1, 0, 2).reshape(2 * k, -1)
-    predicted = here * size + middle
     return _Course(predicted, _warps(predicted, track.half, track.together), basis)
 
 
@@ -251,10 +244,10 @@ def _profile(
         apart = (track.pixels - course.predicted).ravel() * weight
         apart = apart - Q @ (Q.T @ apart)
         begin = 2 * np.searchsorted(track.frames, onsets)
-        moment += _later(W * apart[:, None], begin)
-        whole += _later(W * W, begin)
-        information += _later(np.einsum("ki,kj->kij", W, W), begin)
-        shared = _later(np.einsum("ki,kj->kij", Q, W), begin)
+        moment += sums_from(W * apart[:, None], begin)
+        whole += sums_from(W * W, begin)
+        information += sums_from(np.einsum("ki,kj->kij", W, W), begin)
+        shared = sums_from(np.einsum("ki,kj->kij", Q, W), begin)
         information -= np.einsum("bki,bkj->bij", shared, shared)
         left += float(apart @ apart)
         freedom += len(apart) - Q.shape[1]
@@ -265,7 +258,7 @@ def _profile(
     return (y * moment / scale).sum(axis=1), y / scale, left, max(freedom, 1)
 
 
-def _later(rows: FloatArray, begin: IntArray) -> FloatArray:
+def sums_from(rows: FloatArray, begin: IntArray) -> FloatArray:
     """Sums (b, ...) of ``rows`` (k, ...) from each of ``begin`` (b,) on."""
     none = np.zeros((1, *rows.shape[1:]))
     return np.asarray(np.concatenate([np.cumsum(rows[::-1], axis=0)[::-1], none])[begin])

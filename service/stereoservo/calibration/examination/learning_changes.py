@@ -16,7 +16,12 @@ from stereoservo.calibration.change.model_changes import (
     estimate_changes,
     start_state,
 )
-from stereoservo.calibration.examination.camera_steps import moved_camera, step_of_camera, without_step
+from stereoservo.calibration.examination.camera_steps import (
+    moved_camera,
+    step_of_camera,
+    sums_from,
+    without_step,
+)
 from stereoservo.calibration.examination.change_points import LASTING, ChangePoint, change_effect, change_of
 from stereoservo.calibration.examination.examined_frames import (
     ExaminedFrames,
@@ -36,7 +41,6 @@ from stereoservo.calibration.examination.reference_model import (
 )
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
-from stereoservo.numerics.arrays import FloatArray, IntArray
 
 PUT_BACK = 2
 """Times that the pixels of a camera that moved are put back by a model, and it is learnt again."""
@@ -177,9 +181,9 @@ def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset:
         return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
     B = problem.uncertainty
     begin = np.searchsorted(np.repeat(problem.data.stop, 2), onsets)
-    shared = _later(slope[:, None] * B, begin)
-    moment = _later((slope * here)[:, None], begin)[:, 0] - shared @ (B.T @ here)
-    whole = _later((slope * slope)[:, None], begin)[:, 0]
+    shared = sums_from(slope[:, None] * B, begin)
+    moment = sums_from((slope * here)[:, None], begin)[:, 0] - shared @ (B.T @ here)
+    whole = sums_from((slope * slope)[:, None], begin)[:, 0]
     information = whole - (shared**2).sum(axis=1)
     known = information > 1e-9 * np.maximum(whole, 1e-300)
     gain = np.where(known, moment**2 / np.where(known, information, 1.0), 0.0)
@@ -192,12 +196,6 @@ def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset:
         one, int(onsets[best]), (int(onsets[first]), int(onsets[last])), float(-moment[best] / information[best]),
         float(np.sqrt(level / information[best])), float(gain[best]) / max(chi2, 1e-300),
     )  # fmt: skip
-
-
-def _later(rows: FloatArray, begin: IntArray) -> FloatArray:
-    """Sums (b, q) of ``rows`` (2 k, q) from each of ``begin`` (b,) on."""
-    sums = np.vstack([np.cumsum(rows[::-1], axis=0)[::-1], np.zeros((1, rows.shape[1]))])
-    return np.asarray(sums[begin])
 
 
 def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> ChangePoint:
