@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import cv2
 import msgspec
 import numpy as np
-from scipy.optimize import least_squares
 
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
+from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_slopes
 from stereoservo.calibration.lens_significance import FREE_LENS
 from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
@@ -152,6 +152,8 @@ CENTRE_BOUND = 2.0
 """Largest offset of a centre in the search, in those standard deviations."""
 START_GAIN = 100.0
 """Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
+SEARCH = Limits(evaluations=60, tolerance=1e-8)
+"""Of a search for a lens."""
 MOST_MATCHES = 20_000
 """Matches of two cameras at most, evenly spread, that the search for a lens looks at."""
 
@@ -311,7 +313,6 @@ def _refined(
     start = np.linalg.inv(normalisers[1]).T @ F @ np.linalg.inv(normalisers[0])
     start = start / np.linalg.norm(start)
     tangent = np.linalg.svd(start.reshape(1, 9))[2][1:].reshape(8, 3, 3)
-    middle = lenses[:, 1:3]
     freedom = 2.0 * CENTRE_SHARE * lenses[:, 3:4]
 
     def lenses_at(z: FloatArray) -> FloatArray:
@@ -329,22 +330,23 @@ def _refined(
         scale = np.sqrt(((sigmas * _stretches(here, ideal)) ** 2).mean(axis=0))
         distances = sampson_distances(fundamental, *ideal) / scale
         # Matches without ideal pixels count as far off, not as perfect.
-        held = (here[list(free), 1:3] - middle[list(free)]) / freedom[list(free)]
-        return np.append(np.where(np.isfinite(distances), distances, 1e3), held.ravel())
+        return np.where(np.isfinite(distances), distances, 1e3)[:, None]
 
-    z, cost = np.zeros(8 + 3 * len(free)), np.inf
     # A robust loss forgives a centre far off, so that the prior alone would not hold it.
     limit = np.array([np.inf] * 8 + [np.inf, CENTRE_BOUND, CENTRE_BOUND] * len(free))
+    centres = np.isfinite(limit)
+
+    def step(z: FloatArray, x: FloatArray) -> FloatArray:
+        return np.clip(z + x, -limit, limit)
+
+    slopes = numeric_slopes(errors, np.add, len(limit), 1e-7)
+    z, cost = np.zeros(len(limit)), np.inf
     for scale in (3.0 * bound, 3.0):
-        fit = least_squares(
-            errors,
-            z,
-            loss="cauchy",
-            f_scale=scale,
-            x_scale="jac",
-            bounds=(-limit, limit),
-            max_nfev=60,
-        )
-        z, cost = fit.x, 2.0 * float(fit.cost)
-    distances = np.abs(errors(z)[: raw.shape[1]])
+        fit = DenseFit(
+            errors, slopes, step, RobustLoss("cauchy", scale),
+            lambda z: np.column_stack([np.eye(len(z)), z])[centres],
+        )  # fmt: skip
+        found = minimise(fit, z, SEARCH)
+        z, cost = found.state, found.cost
+    distances = np.abs(errors(z))
     return lenses_at(z), cost, float(np.median(distances)) / NORMAL_MEDIAN
