@@ -10,7 +10,6 @@ import numpy.typing as npt
 from stereoservo.calibration.bundle_adjustment import jacobian
 from stereoservo.calibration.relocalization.camera_resection import Correspondences, entry_jacobian
 from stereoservo.calibration.rig_model import Charts, Measurements, acting_order, own_acting_rig
-from stereoservo.geometry.distortion import lens_jacobian, terms_jacobian
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
@@ -74,71 +73,51 @@ def model_jacobian(
     model's by ``motion``, by the parameters of its covariance. ``offsets`` (s, n): joints of the poses, less the zero.
     Static points move with the cameras that triangulated them.
     """
-    k, p = len(views.camera), parameters_of(model)
-    found = np.zeros((k, 2, p))
-    stated = model.covariance
+    k, stated, order = len(views.camera), model.covariance, list(acting_order(model))
+    found = np.zeros((k, 2, parameters_of(model)))
     if stated is None:
         return found
-    lenses = np.array([model.cameras[c].lens for c in group])
-    rows = entry_jacobian(matrices, lenses, views)
-    entries = inherited_errors(model, group, motion).reshape(len(group), 12, p)
-    found += np.einsum("kia,kap->kip", rows, entries[views.camera], optimize=True)
     starts = first_parameters(stated)
-    images = np.einsum("kij,kj->ki", matrices[views.camera], views.points)
-    for i, c in enumerate(group):
-        mine, basis = views.camera == i, stated.lenses[c]
-        if len(basis):
-            ideal = images[mine, :2] / images[mine, 2:]
-            slope = lens_jacobian(lenses[i], ideal) @ basis[:, :3].T
-            if basis.shape[1] > 4:
-                slope += terms_jacobian(lenses[i], ideal) @ basis[:, 4:].T
-            found[mine, :, starts[2][c] : starts[2][c] + len(basis)] += slope
+    # A static point is a marker of its own at a stop where no joint is away from its zero.
+    apart = np.flatnonzero(views.pose < 0)
+    index = {marker: i for i, marker in enumerate(model.marker_ids)}
+    marker = np.array([index.get(int(i), -1) for i in views.ids], dtype=np.int64)
+    marker[apart] = len(index) + np.arange(len(apart))
+    rig = own_acting_rig(model)
+    rig = replace(
+        rig,
+        cameras=matrices,
+        lenses=np.array([model.cameras[c].lens for c in group]),
+        points=np.concatenate([rig.points, views.points[apart]]),
+    )
+    parts = (
+        [(starts[0][j], stated.generators[j]) for j in order],
+        [(starts[1][c], stated.cameras[c][: None if motion is not None else 0]) for c in group],
+        [(starts[2][c], stated.lenses[c]) for c in group],
+        list(zip(starts[3], stated.markers, strict=True)),
+    )
+    generators, cameras, lenses, markers = (tuple(basis for _, basis in part) for part in parts)
+    moved = tuple(basis if motion is None else basis @ motion for basis in cameras)
+    held = tuple(np.zeros_like(markers[0]) for _ in apart)
+    charts = Charts(generators, moved, lenses, (*markers, *held))
+    data = Measurements(
+        np.vstack([offsets[:, order], np.zeros(len(order))]),
+        views.camera,
+        np.where(views.pose < 0, len(offsets), views.pose),
+        marker,
+        views.pixels,
+        np.ones(k),
+    )
+    columns = np.concatenate([np.arange(at, at + len(basis)) for part in parts for at, basis in part])
+    slope = jacobian(rig, charts, np.zeros(charts.size), data)[:, : len(columns)]
+    found[:, :, columns] = slope.reshape(k, 2, len(columns))
+    rows = entry_jacobian(matrices, rig.lenses, views)
     static = {marker: i for i, marker in enumerate(model.scene_ids)}
-    for r in np.flatnonzero(views.pose < 0):
+    for r in apart:
         if int(views.ids[r]) in static:
             by_point = _by_point(rows[r], matrices[views.camera[r]], views.points[r])
             found[r] += by_point @ scene_by_model(model, static[int(views.ids[r])])
-    arm = np.flatnonzero(views.pose >= 0)
-    if len(arm):
-        slope, columns = _by_arm(model, stated, matrices, lenses, views, arm, offsets)
-        found[np.ix_(arm, np.arange(2), columns)] += slope
     return found
-
-
-def _by_arm(
-    model: CellModel,
-    stated: ModelCovariance,
-    matrices: FloatArray,
-    lenses: FloatArray,
-    views: Correspondences,
-    arm: IntArray,
-    offsets: FloatArray,
-) -> tuple[FloatArray, IntArray]:
-    """Derivative (a, 2, q) of the arm's markers by generators and points, and which parameters (q,) these are."""
-    order = list(acting_order(model))
-    rig = replace(own_acting_rig(model), cameras=matrices, lenses=lenses)
-    charts = Charts(
-        tuple(stated.generators[j] for j in order),
-        tuple(np.zeros((0, 3, 4)) for _ in matrices),
-        tuple(np.zeros((0, 4)) for _ in matrices),
-        stated.markers,
-    )
-    index = {marker: i for i, marker in enumerate(model.marker_ids)}
-    data = Measurements(
-        offsets[:, order],
-        views.camera[arm],
-        views.pose[arm],
-        np.array([index[int(i)] for i in views.ids[arm]], dtype=np.int64),
-        views.pixels[arm],
-        np.ones(len(arm)),
-    )
-    starts = first_parameters(stated)
-    columns = [np.arange(starts[0][j], starts[0][j] + len(stated.generators[j])) for j in order]
-    columns += [
-        np.arange(start, start + len(basis)) for start, basis in zip(starts[3], stated.markers, strict=True)
-    ]
-    slope = jacobian(rig, charts, np.zeros(charts.size), data)
-    return slope.reshape(len(arm), 2, charts.size), np.concatenate(columns)
 
 
 def _by_point(by_entries: FloatArray, matrix: FloatArray, point: FloatArray) -> FloatArray:
@@ -169,8 +148,9 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     lenses = np.array([model.cameras[c].lens for c in seen])
     # An id of no static point: the point itself is held here.
     held = model_jacobian(
-        model, tuple(seen), matrices, np.eye(4), replace(views, ids=np.full(len(seen), -1)), np.zeros((0, 0))
-    ).reshape(2 * len(seen), -1)
+        model, tuple(seen), matrices, np.eye(4), replace(views, ids=np.full(len(seen), -1)),
+        np.zeros((0, len(model.zero))),
+    ).reshape(2 * len(seen), -1)  # fmt: skip
     chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
     rows = entry_jacobian(matrices, lenses, views)
     J = np.concatenate([_by_point(row, P, point) @ chart for row, P in zip(rows, matrices, strict=True)])
