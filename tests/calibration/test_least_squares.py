@@ -10,7 +10,7 @@ from stereoservo.calibration.least_squares import (
     Limits,
     NormalEquations,
     RobustLoss,
-    deviation,
+    deviation_of,
     estimate_beside,
     minimise,
     numeric_slopes,
@@ -156,4 +156,4 @@ def test_what_a_motion_would_tell_is_what_it_tells():
     known = np.linalg.qr(rows, mode="r")
     for found, all_rows in ((known, rows), (with_rows(known, more), np.vstack([rows, more]))):
         expected = np.sqrt(slope @ np.linalg.inv(all_rows.T @ all_rows) @ slope)
-        assert deviation(found, slope) == pytest.approx(expected)
+        assert deviation_of(found, slope) == pytest.approx(expected)

@@ -15,10 +15,12 @@ from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     epipolar_lenses,
     implausible_lens,
+    lens_test,
+    lens_wanted,
+    lenses_explain_more,
     straight_lenses,
     undistorted,
 )
-from stereoservo.calibration.lens_significance import lens_test, lens_wanted, lenses_explain_more
 from stereoservo.calibration.rig_model import LensPriors, RigModel
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.single_joint_fit import measurements

@@ -10,15 +10,16 @@ from stereoservo.calibration.bundle_adjustment import jacobian, with_joint_error
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.joint_errors.joint_noise import joint_columns
-from stereoservo.calibration.joint_errors.score_tests import (
+from stereoservo.calibration.joint_errors.variance_components import (
     LIKELY,
     SHOWN,
     likely_errors,
     point_optimal_weights,
+    readings,
+    reduced_rows,
     score_tests,
     weighted_chi2_tail,
 )
-from stereoservo.calibration.joint_errors.variance_components import readings, reduced_rows
 from stereoservo.calibration.rig_model import JointNoise
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo_sim.experiments.arms.random_mechanics import WELL, judged_mechanics

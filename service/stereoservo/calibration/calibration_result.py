@@ -21,7 +21,7 @@ from stereoservo.calibration.bundle_adjustment import (
 )
 from stereoservo.calibration.joint_errors.variance_components import VarianceComponents, readings
 from stereoservo.calibration.least_squares import chi2_within
-from stereoservo.calibration.lens_significance import lens_test
+from stereoservo.calibration.lens_estimation import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.static_points import with_static_points

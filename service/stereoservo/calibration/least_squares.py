@@ -362,7 +362,7 @@ def with_rows(triangle: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
 
 
-def deviation(triangle: FloatArray, slope: FloatArray) -> float:
+def deviation_of(triangle: FloatArray, slope: FloatArray) -> float:
     """Standard deviation, at the stated sigmas, of what changes by ``slope`` (p,) with the parameters."""
     return float(np.linalg.norm(slope @ column_root(triangle, bounded=True)))
 

@@ -17,6 +17,8 @@ from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_inliers import (
     projective_bundle,
     refine_to_convergence,
+    refuse_poor_fit,
+    refuse_undetermined,
     with_whole_stops,
 )
 from stereoservo.calibration.calibration_result import (
@@ -27,38 +29,39 @@ from stereoservo.calibration.calibration_result import (
     completed,
 )
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
-from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
 from stereoservo.calibration.diagnosis.input_corrections import Refit
-from stereoservo.calibration.diagnosis.joint_errors import (
+from stereoservo.calibration.diagnosis.joint_scales import (
     ScalesError,
     explains,
     one_thing_happened,
     refuse_wrong_scales,
     scales_error,
     small_scales,
+    with_scales_removed,
 )
-from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
-from stereoservo.calibration.joint_errors.score_tests import likely_errors
 from stereoservo.calibration.joint_errors.variance_components import (
     ReducedRows,
     VarianceComponents,
     estimate_components,
+    likely_errors,
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.known_arm.known_arm_fit import fit_with_known_arm
+from stereoservo.calibration.known_arm import fit_with_known_arm
 from stereoservo.calibration.least_squares import RobustLoss, chi2_within
 from stereoservo.calibration.lens_estimation import (
+    FREE_LENS,
+    FULL_LENS,
     STARTING_BENDS,
     implausible_lens,
+    lens_wanted,
     lenses_may_bend,
     prior_of_lenses,
     starting_lenses,
     undistorted,
 )
-from stereoservo.calibration.lens_significance import FREE_LENS, FULL_LENS, lens_wanted
 from stereoservo.calibration.rig_model import (
     JointNoise,
     Measurements,

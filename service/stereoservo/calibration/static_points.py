@@ -12,8 +12,11 @@ import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
-from stereoservo.calibration.relocalization.camera_resection import Correspondences
-from stereoservo.calibration.relocalization.moved_camera_covariance import model_jacobian, parameters_of
+from stereoservo.calibration.relocalization.moved_cameras import (
+    Correspondences,
+    model_jacobian,
+    parameters_of,
+)
 from stereoservo.calibration.trial_data import StaticObservations
 from stereoservo.geometry.cameras import projection_jacobian_many, triangulate
 from stereoservo.geometry.distortion import distort, distortion_jacobian, undistort

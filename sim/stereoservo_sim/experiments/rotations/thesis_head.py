@@ -13,10 +13,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.generator_initialization import common_points, linear_generator
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.rig_model import Measurements, RigModel, rig_at
 from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.single_joint_fit import common_points, linear_generator
 from stereoservo.calibration.trial_data import TrialCamera, TrialData
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.rotation_fit import bundle_rotation
