@@ -11,15 +11,15 @@ from stereoservo.calibration.bundle_adjustment import jacobian, solve
 from stereoservo.calibration.change.model_check import check_model_holds
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
-from stereoservo.calibration.joint_errors.joint_noise import expected_squares, joint_columns
-from stereoservo.calibration.joint_errors.variance_components import (
+from stereoservo.calibration.joint_noise import expected_squares, joint_columns
+from stereoservo.calibration.rig_model import JointNoise, residuals
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.calibration.variance_components import (
     estimate_components,
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.rig_model import JointNoise, residuals
-from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
 from stereoservo_sim.experiments.arms.random_mechanics import driven_stops, judged_mechanics, unseen

@@ -9,8 +9,10 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.calibration.bundle_adjustment import jacobian, with_joint_errors_stated
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
-from stereoservo.calibration.joint_errors.joint_noise import joint_columns
-from stereoservo.calibration.joint_errors.variance_components import (
+from stereoservo.calibration.joint_noise import joint_columns
+from stereoservo.calibration.rig_model import JointNoise
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.variance_components import (
     LIKELY,
     SHOWN,
     likely_errors,
@@ -20,8 +22,6 @@ from stereoservo.calibration.joint_errors.variance_components import (
     score_tests,
     weighted_chi2_tail,
 )
-from stereoservo.calibration.rig_model import JointNoise
-from stereoservo.calibration.self_calibration import fit_model
 from stereoservo_sim.experiments.arms.random_mechanics import WELL, judged_mechanics
 from stereoservo_sim.world import synthetic
 

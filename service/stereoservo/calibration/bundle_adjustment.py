@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.calibration.joint_errors.joint_noise import (
+from stereoservo.calibration.joint_noise import (
     StopEquations,
     StopFactor,
     exact_fit_factor,

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.joint_errors.joint_noise import stop_rows
+from stereoservo.calibration.joint_noise import stop_rows
 from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.lens_estimation import FREE_LENS, lens_test, lens_wanted, straightened
 from stereoservo.calibration.normal_equations import by_stop

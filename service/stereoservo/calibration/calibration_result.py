@@ -19,13 +19,13 @@ from stereoservo.calibration.bundle_adjustment import (
     residual_expectations,
     with_joint_errors_stated,
 )
-from stereoservo.calibration.joint_errors.variance_components import VarianceComponents, readings
 from stereoservo.calibration.least_squares import chi2_within
 from stereoservo.calibration.lens_estimation import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import VarianceComponents, readings
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics

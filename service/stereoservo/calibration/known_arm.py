@@ -22,15 +22,7 @@ from stereoservo.calibration.bundle_inliers import (
     with_whole_stops,
 )
 from stereoservo.calibration.calibration_result import CalibrationFit, FitHistory, ModelFrame, build_fit
-from stereoservo.calibration.joint_errors.joint_noise import StopFactor, orthogonal_factor
-from stereoservo.calibration.joint_errors.variance_components import (
-    Readings,
-    VarianceComponents,
-    estimate_components,
-    joint_noise_of,
-    readings,
-    reduced_rows,
-)
+from stereoservo.calibration.joint_noise import StopFactor, orthogonal_factor
 from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.lens_estimation import (
     lens_wanted,
@@ -43,6 +35,14 @@ from stereoservo.calibration.rig_model import Measurements, RigModel, displaceme
 from stereoservo.calibration.single_joint_fit import measurements
 from stereoservo.calibration.stratum_selection import NOMINAL_PLANE, FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData
+from stereoservo.calibration.variance_components import (
+    Readings,
+    VarianceComponents,
+    estimate_components,
+    joint_noise_of,
+    readings,
+    reduced_rows,
+)
 from stereoservo.geometry.cameras import from_pixels, pixel_normaliser, resection
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError, to_homogeneous

@@ -19,7 +19,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
-from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
+from stereoservo.calibration.joint_noise import orthogonal_factor
 from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_slopes
 from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, predicted, residuals
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows

@@ -41,14 +41,6 @@ from stereoservo.calibration.diagnosis.joint_scales import (
 )
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
-from stereoservo.calibration.joint_errors.variance_components import (
-    ReducedRows,
-    VarianceComponents,
-    estimate_components,
-    likely_errors,
-    readings,
-    reduced_rows,
-)
 from stereoservo.calibration.known_arm import fit_with_known_arm
 from stereoservo.calibration.least_squares import RobustLoss, chi2_within
 from stereoservo.calibration.lens_estimation import (
@@ -77,6 +69,14 @@ from stereoservo.calibration.single_joint_fit import (
 )
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
+from stereoservo.calibration.variance_components import (
+    ReducedRows,
+    VarianceComponents,
+    estimate_components,
+    likely_errors,
+    readings,
+    reduced_rows,
+)
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import LensModel

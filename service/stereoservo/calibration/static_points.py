@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
-from stereoservo.calibration.relocalization.moved_cameras import (
+from stereoservo.calibration.moved_cameras import (
     Correspondences,
     model_jacobian,
     parameters_of,

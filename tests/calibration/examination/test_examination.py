@@ -11,8 +11,7 @@ import pytest
 from stereoservo.calibration.change.model_changes import start_state
 from stereoservo.calibration.examination.change_points import CLEAR, moved_camera, step_of_camera
 from stereoservo.calibration.examination.examination import examine_views
-from stereoservo.calibration.examination.examined_frames import examined_frames
-from stereoservo.calibration.examination.recorded_views import gaps, single_joint_motions
+from stereoservo.calibration.examination.recorded_views import examined_frames, gaps, single_joint_motions
 from stereoservo.calibration.examination.reference_model import course, frame_noise, learn_reference
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy

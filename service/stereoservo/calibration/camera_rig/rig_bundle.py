@@ -24,7 +24,7 @@ from stereoservo.calibration.initial_reconstruction import (
     planes_at_infinity,
     scaled_plane,
 )
-from stereoservo.calibration.joint_errors.joint_noise import joint_columns
+from stereoservo.calibration.joint_noise import joint_columns
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.calibration.lens_estimation import epipolar_lenses, undistorted
 from stereoservo.calibration.rig_model import (

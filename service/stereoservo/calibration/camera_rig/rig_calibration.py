@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.camera_rig.rig_bundle import EVALUATIONS, RigFit, RigStart, fit_rig, starts
 from stereoservo.calibration.camera_rig.views import RigViews, refused, usable_views
-from stereoservo.calibration.joint_errors.joint_noise import stop_rows
+from stereoservo.calibration.joint_noise import stop_rows
 from stereoservo.calibration.least_squares import deviation_of, with_rows
 from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted

@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.calibration.bundle_adjustment import jacobian
-from stereoservo.calibration.joint_errors.joint_noise import error_columns
-from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
+from stereoservo.calibration.joint_noise import error_columns
 from stereoservo.calibration.least_squares import DenseFit, Limits, column_root, estimate_beside, minimise
 from stereoservo.calibration.normal_equations import triangle_of
 from stereoservo.calibration.rig_model import (
@@ -32,6 +31,7 @@ from stereoservo.calibration.rig_model import (
     residuals,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.kinematics.parameterization import lens_model_of
 from stereoservo.messages.check_report import CauseKind

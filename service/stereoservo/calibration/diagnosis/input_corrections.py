@@ -17,12 +17,12 @@ import numpy.typing as npt
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES, initial_reconstruction
-from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
 from stereoservo.calibration.lens_estimation import prior_of_lenses, straight_lenses, undistorted
 from stereoservo.calibration.rig_model import Measurements, expected_pixels, projective_rig, stratum_rig
 from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.geometry.fundamental import INLIER_SIGMAS, fundamental_robust, sampson_distances
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import Kind, lens_model_of

@@ -23,12 +23,7 @@ from scipy.stats import t as student
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.diagnosis.marker_tracks import find_step
-from stereoservo.calibration.joint_errors.joint_noise import orthogonal_factor
-from stereoservo.calibration.joint_errors.variance_components import (
-    FALSE_ALARM,
-    SAME_READING,
-    VarianceComponents,
-)
+from stereoservo.calibration.joint_noise import orthogonal_factor
 from stereoservo.calibration.least_squares import RobustLoss, estimate_beside
 from stereoservo.calibration.lens_estimation import scale_columns
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
@@ -38,6 +33,11 @@ from stereoservo.calibration.single_joint_fit import (
     own_trials,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
+from stereoservo.calibration.variance_components import (
+    FALSE_ALARM,
+    SAME_READING,
+    VarianceComponents,
+)
 from stereoservo.geometry.cameras import NOMINAL_FOCAL
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 

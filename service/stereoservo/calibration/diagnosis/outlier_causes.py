@@ -37,16 +37,16 @@ from stereoservo.calibration.diagnosis.joint_scales import (
     with_scales_removed,
 )
 from stereoservo.calibration.diagnosis.marker_tracks import path_noise
-from stereoservo.calibration.joint_errors.variance_components import (
+from stereoservo.calibration.least_squares import RobustLoss
+from stereoservo.calibration.rig_model import RigModel, expected_pixels, projective_rig
+from stereoservo.calibration.stratum_selection import FitOptions
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import (
     VarianceComponents,
     estimate_components,
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.least_squares import RobustLoss
-from stereoservo.calibration.rig_model import RigModel, expected_pixels, projective_rig
-from stereoservo.calibration.stratum_selection import FitOptions
-from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 LOSS = RobustLoss("soft_l1", 2.0)

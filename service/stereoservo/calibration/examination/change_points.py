@@ -38,16 +38,14 @@ from stereoservo.calibration.change.model_changes import (
     estimate_changes,
     start_state,
 )
-from stereoservo.calibration.examination.examined_frames import (
-    ExaminedFrames,
-    Hypothesis,
-    frames_concerned,
-    partly_changed,
-)
 from stereoservo.calibration.examination.recorded_views import (
     ALONE,
+    ExaminedFrames,
+    Hypothesis,
     RecordedViews,
+    frames_concerned,
     instants,
+    partly_changed,
     probable_onset,
     single_joint_motions,
     stop_positions,

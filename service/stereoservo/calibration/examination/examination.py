@@ -33,15 +33,18 @@ from stereoservo.calibration.examination.change_points import (
     sums_from,
     without_step,
 )
-from stereoservo.calibration.examination.examined_frames import (
+from stereoservo.calibration.examination.recorded_views import (
     ExaminedFrames,
+    Gap,
     Hypothesis,
+    RecordedViews,
     corrected_views,
     examined_frames,
     frames_concerned,
+    gaps,
     hypotheses,
+    probable_onset,
 )
-from stereoservo.calibration.examination.recorded_views import Gap, RecordedViews, gaps, probable_onset
 from stereoservo.calibration.examination.reference_model import (
     AS_GOOD,
     LearningError,

@@ -24,7 +24,7 @@ from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
 from stereoservo.calibration.bundle_adjustment import Solution
-from stereoservo.calibration.joint_errors.joint_noise import stop_rows
+from stereoservo.calibration.joint_noise import stop_rows
 from stereoservo.calibration.least_squares import estimate_beside
 from stereoservo.calibration.normal_equations import by_stop, prior_rows
 from stereoservo.calibration.rig_model import JointNoise

@@ -18,7 +18,7 @@ from scipy.linalg import rq
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.least_squares import Limits, minimise
-from stereoservo.calibration.relocalization.moved_cameras import (
+from stereoservo.calibration.moved_cameras import (
     CameraErrors,
     Correspondences,
     FreeMatrix,
