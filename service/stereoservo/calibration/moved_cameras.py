@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +24,11 @@ from stereoservo.kinematics.kernels import exp_twist
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-EVALUATIONS = 100
-SETTLED = 1e-4
-"""Length of a step [standard deviations of the parameters] at which a fit has converged."""
-SUBSETS, OF_SUBSET, SUBSET_EVALUATIONS = 30, 4, 20
-"""Random starts, ids of each and evaluations, that are tried where a fit to everything leaves outliers: of 30 % wrong
-ids one in a thousand searches finds no clean start."""
+WHOLE, SUBSET = Limits(100, 0.0, 1e-8), Limits(20, 0.0, 1e-8)
+"""Of fits to all pixels and to some: a step of 1e-4 standard deviations is the last."""
+SUBSETS, OF_SUBSET = 30, 4
+"""Random starts, and ids of each, that are tried where a fit to everything leaves outliers: of 30 % wrong ids one in a
+thousand searches finds no clean start."""
 NOISY, FEW = 4.0, 0.25
 """Variance of the pixels over the stated one, and share of outliers, at which a search for better starts ends."""
 OUTSTANDING = 25.0
@@ -63,6 +62,15 @@ class Correspondences:
         )
 
 
+class Moved(NamedTuple):
+    """``matrices`` (c, 3, 4) of cameras under estimation, and the ``motion`` D (4, 4) with ``P D`` from those before;
+    None where the matrices are free.
+    """
+
+    matrices: FloatArray
+    motion: FloatArray | None
+
+
 class MatrixChange(Protocol):
     """Parameterization of a permitted change of camera matrices (c, 3, 4)."""
 
@@ -73,7 +81,7 @@ class MatrixChange(Protocol):
     def directions(self, matrices: FloatArray) -> FloatArray:
         """Derivative (c, size, 3, 4) of the matrices by the parameters, at 0."""
 
-    def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
+    def step(self, moved: Moved, x: FloatArray) -> Moved:
         """The matrices at parameters ``x`` (size,)."""
 
 
@@ -91,10 +99,10 @@ class RigidMotion:
         found: FloatArray = matrices[:, None] @ self.algebra[None]
         return found
 
-    def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
-        motion: FloatArray = exp_twist(np.tensordot(x, self.algebra, axes=1))
-        moved: FloatArray = matrices @ motion
-        return moved
+    def step(self, moved: Moved, x: FloatArray) -> Moved:
+        assert moved.motion is not None
+        motion = exp_twist(np.tensordot(x, self.algebra, axes=1))
+        return Moved(moved.matrices @ motion, moved.motion @ motion)
 
 
 @dataclass(frozen=True)
@@ -108,8 +116,8 @@ class FreeMatrix:
         rows = np.linalg.svd(matrix.reshape(1, 12))[2][1:]
         return np.asarray(rows.reshape(1, 11, 3, 4) * np.linalg.norm(matrices[0]))
 
-    def step(self, matrices: FloatArray, x: FloatArray) -> FloatArray:
-        return np.asarray(matrices + np.tensordot(x, self.directions(matrices)[0], axes=1))
+    def step(self, moved: Moved, x: FloatArray) -> Moved:
+        return Moved(moved.matrices + np.tensordot(x, self.directions(moved.matrices)[0], axes=1), None)
 
 
 def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
@@ -152,9 +160,10 @@ def parameter_jacobian(
     return found
 
 
-def whitening(covariances: FloatArray) -> FloatArray:
-    """Whitening matrices ``L⁻¹`` (k, 2, 2) of covariances ``L Lᵀ``."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+def by_pixel(views: Correspondences) -> Callable[[FloatArray], FloatArray]:
+    """Whitening of rows (k, 2, q) by each pixel's own covariance."""
+    roots = np.linalg.inv(np.linalg.cholesky(views.covariances))
+    return lambda rows: roots @ rows
 
 
 def matrix_fit(
@@ -163,47 +172,35 @@ def matrix_fit(
     views: Correspondences,
     whiten: Callable[[FloatArray], FloatArray],
     loss: RobustLoss | None = None,
-) -> DenseFit[FloatArray]:
-    """The fit of matrices (c, 3, 4); ``whiten`` takes rows (k, 2, q) [px] to sigmas."""
+) -> DenseFit[Moved]:
+    """The fit of matrices; ``whiten`` takes rows (k, 2, q) [px] to sigmas."""
     return DenseFit(
-        lambda matrices: whiten((predicted(matrices, lenses, views) - views.pixels)[..., None])[..., 0],
-        lambda matrices: whiten(parameter_jacobian(family, matrices, lenses, views)),
+        lambda moved: whiten((predicted(moved.matrices, lenses, views) - views.pixels)[..., None])[..., 0],
+        lambda moved: whiten(parameter_jacobian(family, moved.matrices, lenses, views)),
         family.step,
         loss,
     )
 
 
-def fit_matrices(
-    family: MatrixChange, start: FloatArray, lenses: FloatArray, views: Correspondences,
-    *, loss: RobustLoss | None, evaluations: int = EVALUATIONS,
-) -> Minimum[FloatArray]:  # fmt: skip
-    """Matrices (c, 3, 4) of least squared residuals, or of least ``loss``, from ``start``; the cost is infinite where
-    points lie behind a camera at the start.
-    """
-    roots = whitening(views.covariances)
-    fit = matrix_fit(family, lenses, views, lambda rows: roots @ rows, loss)
-    return minimise(fit, start, Limits(evaluations, 0.0, SETTLED**2))
-
-
 def fit_with_outliers(
-    family: MatrixChange, starts: list[FloatArray], lenses: FloatArray, views: Correspondences
-) -> tuple[FloatArray, float]:
-    """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids."""
-    best = min(
-        (fit_matrices(family, start, lenses, views, loss=LOSS) for start in starts), key=lambda one: one.cost
-    )
-    roots = whitening(views.covariances)
-    if _clean(_whitened(best.state, lenses, views, roots)):
-        return best.state, best.cost
+    family: MatrixChange, starts: list[Moved], lenses: FloatArray, views: Correspondences
+) -> Minimum[Moved]:
+    """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids; its
+    cost is infinite where points lie behind a camera at every start.
+    """
+    fit = matrix_fit(family, lenses, views, by_pixel(views), LOSS)
+    best = min((minimise(fit, start, WHOLE) for start in starts), key=lambda one: one.cost)
+    if _clean(fit.residuals(best.state)):
+        return best
     for subset in _subsets(views, family):
         some = views.select(subset)
+        part = matrix_fit(family, lenses, some, by_pixel(some))
         for start in starts:
-            part = fit_matrices(family, start, lenses, some, loss=None, evaluations=SUBSET_EVALUATIONS)
-            found = fit_matrices(family, part.state, lenses, views, loss=LOSS)
+            found = minimise(fit, minimise(part, start, SUBSET).state, WHOLE)
             best = found if found.cost < best.cost else best
-        if _is_good_enough(_whitened(best.state, lenses, views, roots)):
+        if _is_good_enough(fit.residuals(best.state)):
             break
-    return best.state, best.cost
+    return best
 
 
 def _clean(error: FloatArray) -> bool:
@@ -232,13 +229,6 @@ def _subsets(views: Correspondences, family: MatrixChange) -> Iterator[BoolArray
             if 2 * int(keep.sum()) >= family.size + 2:
                 yield keep
                 break
-
-
-def _whitened(
-    matrices: FloatArray, lenses: FloatArray, views: Correspondences, roots: FloatArray
-) -> FloatArray:
-    error: FloatArray = (roots @ (predicted(matrices, lenses, views) - views.pixels)[..., None])[..., 0]
-    return error
 
 
 NEGLIGIBLE = 1e-14
@@ -292,16 +282,16 @@ def inherited_errors(model: CellModel, group: tuple[int, ...], motion: FloatArra
 def model_jacobian(
     model: CellModel,
     group: tuple[int, ...],
-    matrices: FloatArray,
-    motion: FloatArray | None,
+    moved: Moved,
     views: Correspondences,
     offsets: FloatArray,
 ) -> FloatArray:
-    """Derivative (k, 2, p) of the raw pixels of ``views`` in cameras ``matrices`` (c, 3, 4), which inherit from the
-    model's by ``motion``, by the parameters of its covariance. ``offsets`` (s, n): joints of the poses, less the zero.
-    Static points move with the cameras that triangulated them.
+    """Derivative (k, 2, p) of the raw pixels of ``views`` in ``moved`` cameras, which inherit from the model's, by the
+    parameters of its covariance. ``offsets`` (s, n): joints of the poses, less the zero. Static points move with the
+    cameras that triangulated them.
     """
     k, stated, order = len(views.camera), model.covariance, list(acting_order(model))
+    matrices, motion = moved
     found = np.zeros((k, 2, parameters_of(model)))
     if stated is None:
         return found
@@ -325,9 +315,9 @@ def model_jacobian(
         list(zip(starts[3], stated.markers, strict=True)),
     )
     generators, cameras, lenses, markers = (tuple(basis for _, basis in part) for part in parts)
-    moved = tuple(basis if motion is None else basis @ motion for basis in cameras)
+    inherited = tuple(basis if motion is None else basis @ motion for basis in cameras)
     held = tuple(np.zeros_like(markers[0]) for _ in apart)
-    charts = Charts(generators, moved, lenses, (*markers, *held))
+    charts = Charts(generators, inherited, lenses, (*markers, *held))
     data = Measurements(
         np.vstack([offsets[:, order], np.zeros(len(order))]),
         views.camera,
@@ -376,7 +366,7 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     lenses = np.array([model.cameras[c].lens for c in seen])
     # An id of no static point: the point itself is held here.
     held = model_jacobian(
-        model, tuple(seen), matrices, np.eye(4), replace(views, ids=np.full(len(seen), -1)),
+        model, tuple(seen), Moved(matrices, np.eye(4)), replace(views, ids=np.full(len(seen), -1)),
         np.zeros((0, len(model.zero))),
     ).reshape(2 * len(seen), -1)  # fmt: skip
     chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
@@ -476,7 +466,7 @@ def predicted_deviation(
                 rows = entry_jacobian(matrices, lenses, views)
                 variances = np.einsum("kia,ab,kib->ki", rows, one.covariance[mine, mine], rows, optimize=True)
             else:
-                rows = model_jacobian(model, (c,), matrices, np.eye(4), views, joints - model.zero)
+                rows = model_jacobian(model, (c,), Moved(matrices, np.eye(4)), views, joints - model.zero)
                 variances = np.einsum(
                     "kia,ab,kib->ki", rows, model.covariance.covariance, rows, optimize=True
                 )

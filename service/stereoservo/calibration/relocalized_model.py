@@ -17,12 +17,14 @@ import numpy as np
 from scipy.linalg import rq
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.calibration.least_squares import Limits, minimise
+from stereoservo.calibration.least_squares import minimise
 from stereoservo.calibration.moved_cameras import (
+    WHOLE,
     CameraErrors,
     Correspondences,
     FreeMatrix,
     MatrixChange,
+    Moved,
     RigidMotion,
     fit_with_outliers,
     inherited_errors,
@@ -213,8 +215,6 @@ SPARE = 2
 RESECTION_POINTS, RIG_POINTS = 6, 5
 ROUNDS, WEIGHED = 6, 2
 """Times that outliers are told, and that pixels are weighted by what the matrices make of the model's covariance."""
-SETTLED = 1e-4
-"""Length of a step [standard deviations] at which the least squares have converged."""
 FAR_PX = 1e6
 """Error of a point that is predicted behind its camera."""
 
@@ -356,22 +356,22 @@ def _attempt(
 ) -> CameraGroup:
     """Fit of one class of motion: robust, then least squares in the full covariance of pixels and model."""
     _refuse_few(model, views, group, family, how)
-    starts = [start]
-    if isinstance(family, FreeMatrix):
+    free = isinstance(family, FreeMatrix)
+    starts = [Moved(start, None if free else np.eye(4))]
+    if free:
         starts += _resected(views, lenses)
-    matrices, loss = fit_with_outliers(family, starts, lenses, views)
-    if not np.isfinite(loss):
+    found = fit_with_outliers(family, starts, lenses, views)
+    if not np.isfinite(found.cost):
         _refuse_outliers(model, views, group, np.zeros(len(views.camera), dtype=bool))
-    keep = np.ones(len(views.camera), dtype=bool)
+    moved, keep = found.state, np.ones(len(views.camera), dtype=bool)
     for _ in range(ROUNDS):
-        motion = _motion(model, start, matrices, family)
-        again = _inliers(model, group, matrices, motion, lenses, views, offsets)
+        again = _inliers(model, group, moved, lenses, views, offsets)
         _refuse_outliers(model, views, group, again)
         inside = views.select(again)
         _refuse_few(model, inside, group, family, how)
-        solved = _least_squares(model, group, family, start, matrices, lenses, inside, offsets)
+        solved = _least_squares(model, group, family, moved, lenses, inside, offsets)
         settled = bool(np.array_equal(again, keep))
-        matrices, keep = solved.matrices, again
+        moved, keep = Moved(solved.matrices, solved.motion), again
         if settled:
             break
     outliers = _outliers(model, group, solved.matrices, lenses, views, keep)
@@ -382,27 +382,10 @@ def _attempt(
     )
 
 
-def _motion(model: CellModel, old: FloatArray, new: FloatArray, family: MatrixChange) -> FloatArray | None:
-    """Displacement D (4, 4) with ``new = old D`` (c, 3, 4), from the matrices; None for free ones."""
-    if not isinstance(family, RigidMotion):
-        return None
-    if len(old) > 1:
-        rows, right = old.reshape(-1, 4), new.reshape(-1, 4)
-        return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0])
-    assert model.projective_to_euclidean is not None
-    H = model.projective_to_euclidean
-    back = np.linalg.inv(H)
-    before, after = old[0] @ back, new[0] @ back
-    D = np.eye(4)
-    D[:3] = np.linalg.solve(before[:, :3], np.column_stack([after[:, :3], after[:, 3] - before[:, 3]]))
-    return np.asarray(back @ D @ H)
-
-
 def _inliers(
     model: CellModel,
     group: tuple[int, ...],
-    matrices: FloatArray,
-    motion: FloatArray | None,
+    moved: Moved,
     lenses: FloatArray,
     views: Correspondences,
     offsets: FloatArray,
@@ -411,12 +394,12 @@ def _inliers(
     throughout.
     """
     covariances = views.covariances.copy()
-    static = static_roots(model, matrices, lenses, views)
+    static = static_roots(model, moved.matrices, lenses, views)
     covariances += static @ static.transpose(0, 2, 1)
     if model.covariance is not None:
-        rows = model_jacobian(model, group, matrices, motion, views, offsets)
+        rows = model_jacobian(model, group, moved, views, offsets)
         covariances += np.einsum("kip,pq,kjq->kij", rows, model.covariance.covariance, rows, optimize=True)
-    error = predicted(matrices, lenses, views) - views.pixels
+    error = predicted(moved.matrices, lenses, views) - views.pixels
     error = np.where(np.isfinite(error), error, FAR_PX)
     squares = np.einsum("ki,ki->k", error, np.linalg.solve(covariances, error[..., None])[..., 0])
     factor = max(1.0, float(np.median(squares)) / np.log(4.0))
@@ -433,8 +416,7 @@ def _least_squares(
     model: CellModel,
     group: tuple[int, ...],
     family: MatrixChange,
-    start: FloatArray,
-    matrices: FloatArray,
+    moved: Moved,
     lenses: FloatArray,
     views: Correspondences,
     offsets: FloatArray,
@@ -444,34 +426,41 @@ def _least_squares(
     sigma = np.zeros((0, 0)) if model.covariance is None else model.covariance.covariance
     names = [model.cameras[c].name for c in group]
     for _ in range(WEIGHED):
-        motion = _motion(model, start, matrices, family)
-        F = model_jacobian(model, group, matrices, motion, views, offsets).reshape(2 * k, p)
-        static = static_roots(model, matrices, lenses, views).reshape(2 * k, -1)
+        F = model_jacobian(model, group, moved, views, offsets).reshape(2 * k, p)
+        static = static_roots(model, moved.matrices, lenses, views).reshape(2 * k, -1)
         noise = static @ static.T
         for i in range(k):
             noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += views.covariances[i]
         white = np.linalg.inv(np.linalg.cholesky(noise + F @ sigma @ F.T))
         fit = matrix_fit(family, lenses, views, _jointly(white))
-        found = minimise(fit, matrices, Limits(settled=SETTLED**2))
+        found = minimise(fit, moved, WHOLE)
         if not np.isfinite(found.cost):
             wrong = tuple(int(i) for i in np.unique(views.ids))
             raise not_explained(names, np.inf, np.inf, 0, wrong, 1.0, MAX_OUTLIERS)
-        matrices = found.state
-        determined = fit.determined(matrices)
+        moved = found.state
+        determined = fit.determined(moved)
         if determined.rank < family.size:
             raise points_coplanar(names, k, len(np.unique(views.ids)))
-    gain = determined.root @ determined.root.T @ fit.rows(matrices)[:, :-1].T @ white
-    entries = family.directions(matrices).transpose(0, 2, 3, 1).reshape(12 * len(group), family.size)
-    motion = _motion(model, start, matrices, family)
+    gain = determined.root @ determined.root.T @ fit.rows(moved)[:, :-1].T @ white
+    entries = family.directions(moved.matrices).transpose(0, 2, 3, 1).reshape(12 * len(group), family.size)
     own = entries @ gain
     # Where the residuals are larger than stated, so was the noise.
     errors = CameraErrors(
         group,
-        inherited_errors(model, group, motion) - own @ F,
+        inherited_errors(model, group, moved.motion) - own @ F,
         max(1.0, determined.variance) * own @ noise @ own.T,
     )
     return CameraGroup(
-        group, matrices, motion, "moved", views, determined.cost, determined.freedom, errors, (), ()
+        group,
+        moved.matrices,
+        moved.motion,
+        "moved",
+        views,
+        determined.cost,
+        determined.freedom,
+        errors,
+        (),
+        (),
     )
 
 
@@ -480,12 +469,12 @@ def _jointly(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
     return lambda rows: (white @ rows.reshape(len(white), -1)).reshape(rows.shape)
 
 
-def _resected(views: Correspondences, lenses: FloatArray) -> list[FloatArray]:
+def _resected(views: Correspondences, lenses: FloatArray) -> list[Moved]:
     """The matrix of a camera by linear resection and refinement, where the points determine it."""
     ideal = undistort(lenses[0], views.pixels)
     sigma = float(np.sqrt(np.median(np.trace(views.covariances, axis1=1, axis2=2)) / 2.0))
     try:
-        return [resect_moved_camera(views.points, ideal, sigma).P[None]]
+        return [Moved(resect_moved_camera(views.points, ideal, sigma).P[None], None)]
     except GeometryError:
         return []  # it may still be near the matrix that the camera had; least squares show if it is determined
 
