@@ -150,7 +150,8 @@ def column_sizes(rows: FloatArray) -> FloatArray:
 def column_root(triangle: FloatArray, *, bounded: bool = False) -> FloatArray:
     """``R⁻¹`` of a root (p, p) of an information matrix, by way of unit columns: ``R⁻¹ R⁻ᵀ`` is the covariance.
 
-    ``bounded``: directions that the data leave open get a large finite variance. Else raises LinAlgError for them.
+    ``bounded``: directions that the data leave open get a large finite variance, and the root may have any number of
+    rows. Else raises LinAlgError for them.
     """
     sizes = column_sizes(triangle)
     unit = triangle / sizes

@@ -25,7 +25,7 @@ from stereoservo.calibration.initial_reconstruction import (
     scaled_plane,
 )
 from stereoservo.calibration.joint_noise import joint_columns
-from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
+from stereoservo.calibration.least_squares import DenseFit, Limits, column_root, minimise
 from stereoservo.calibration.lens_estimation import epipolar_lenses, undistorted
 from stereoservo.calibration.rig_model import (
     JointNoise,
@@ -430,13 +430,8 @@ class RigFit(RigProblem):
         rows = joint_columns(self.rig, data)
         found = np.full((len(self.views.names), 6), np.inf)
         for stop in np.unique(data.stop):
-            mine = np.repeat(data.stop == stop, 2)
-            J = rows[mine]
-            sizes = np.linalg.norm(J, axis=0)
-            sizes[sizes == 0.0] = 1.0
-            values, vectors = np.linalg.eigh((J / sizes).T @ (J / sizes))
-            spread = (vectors**2 / np.maximum(values, 1e-300)).sum(axis=1)
-            found[stop] = np.sqrt(self.variance * spread) / sizes
+            root = column_root(rows[np.repeat(data.stop == stop, 2)], bounded=True)
+            found[stop] = np.sqrt(self.variance) * np.linalg.norm(root, axis=1)
         return found
 
 

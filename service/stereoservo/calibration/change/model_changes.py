@@ -339,6 +339,11 @@ class ChangeEstimate:
     left: FloatArray
     effects_px: tuple[float, ...]
 
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (q, q); of directions that the pixels leave open none."""
+        return np.asarray(np.linalg.pinv(self.information))
+
 
 def start_state(problem: LinearisedProblem) -> State:
     """The state of the unchanged model."""

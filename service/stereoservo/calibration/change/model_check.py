@@ -50,6 +50,7 @@ from stereoservo.calibration.change.model_changes import (
     linearised_problem,
     possible_changes,
     start_state,
+    unbounded,
     with_corrected_zeros,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
@@ -350,12 +351,7 @@ def make_check_report(
 
 def _model_variance(problem: LinearisedProblem) -> FloatArray:
     """Variance (k,) that the model's uncertainty adds to each pixel, in units of the pixel's own."""
-    if not problem.uncertainty.shape[1]:
-        return np.zeros(len(problem.data.camera))
-    inner = np.eye(problem.uncertainty.shape[1]) - problem.uncertainty.T @ problem.uncertainty
-    rows = np.linalg.solve(np.linalg.cholesky(inner), problem.uncertainty.T)
-    found: FloatArray = (rows**2).sum(axis=0).reshape(-1, 2).mean(axis=1)
-    return found
+    return np.asarray((unbounded(problem.uncertainty) ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1))
 
 
 def _drift(problem: LinearisedProblem, cause: ModelChange) -> Drift:
@@ -374,7 +370,7 @@ def _found_cause(model: CellModel, problem: LinearisedProblem, found: ChangeEsti
     cause = found.changes[i]
     at = sum(other.size for other in found.changes[:i])
     x = found.x[at : at + cause.size]
-    covariance = np.linalg.pinv(found.information)[at : at + cause.size, at : at + cause.size]
+    covariance = found.covariance[at : at + cause.size, at : at + cause.size]
     others = tuple(other for other in found.changes if other is not cause)
     ratio = estimate_changes(problem, others).chi2 - found.chi2
     value = deviation = None
@@ -504,7 +500,7 @@ def reset_zeros(
     rest = estimate_changes(problem, found.changes)
     drift = found.x + rest.x
     at = [model.joint_names.index(cause.subject) for cause in found.changes]
-    covariance: FloatArray = np.asarray(np.linalg.pinv(rest.information), dtype=np.float64)
+    covariance = rest.covariance
     deviations = np.sqrt(np.diag(covariance))
     _must_be_observable(examined, deviations)
     zero = model.zero.copy()

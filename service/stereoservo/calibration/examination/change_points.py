@@ -503,9 +503,8 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     whole = partly_changed(problem, rows)
     estimate = estimate_changes(whole, (change,), x)
     ratio = float(here @ problem.whitened(here)) - estimate.chi2
-    covariance: FloatArray = np.linalg.pinv(estimate.information).astype(np.float64)
     return ChangePoint(
-        one.hypothesis, frames, one.after, onset, span, estimate.x, covariance, rows,
+        one.hypothesis, frames, one.after, onset, span, estimate.x, estimate.covariance, rows,
         change_effect(part, estimate.changes, estimate.x), ratio,
     )  # fmt: skip
 
