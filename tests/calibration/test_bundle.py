@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, jacobian, solve
-from stereoservo.calibration.bundle_statistics import rank_of
+from stereoservo.calibration.bundle_adjustment import jacobian, solve
+from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.normal_equations import (
     CHUNK,
     arrow_factor,
@@ -124,7 +124,7 @@ def test_parameters_net_of_gauge_are_all_determined(arms, stratum, parameters):
     fit = solve(rig, data, stratum)
     assert fit.converged
     assert fit.charts.size == parameters
-    assert rank_of(fit) == parameters
+    assert fit.determined.rank == parameters
 
 
 @pytest.mark.parametrize("stratum", ["projective", "metric"])
@@ -186,7 +186,7 @@ def test_memory_does_not_grow_with_the_images(arms):
         data, _ = measured(cell, cell.stops(stops)[0], np.random.default_rng(6), lost=0.0)
         tracemalloc.start()
         fit = solve(rig, data, "metric")
-        assert rank_of(fit) == fit.charts.size
+        assert fit.determined.rank == fit.charts.size
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     dense = 2 * len(data.pixels) * fit.charts.size * 8

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.calibration.change.check_trend import find_trend
+from stereoservo.calibration.change.model_check import find_trend
 from stereoservo.daemon.jobs.check_job import KEPT_CHECKS, load_checks, save_checks
 from stereoservo.messages.check_report import CheckReport, Drift
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.calibration.bundle_statistics import chi2_within
+from stereoservo.calibration.least_squares import chi2_within
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError

@@ -11,15 +11,15 @@ from stereoservo.calibration.bundle_adjustment import jacobian, solve
 from stereoservo.calibration.change.model_check import check_model_holds
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
-from stereoservo.calibration.joint_errors.joint_noise import expected_squares, joint_columns
-from stereoservo.calibration.joint_errors.variance_components import (
+from stereoservo.calibration.joint_noise import expected_squares, joint_columns
+from stereoservo.calibration.rig_model import JointNoise, residuals
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.calibration.variance_components import (
     estimate_components,
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.rig_model import JointNoise, residuals
-from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
 from stereoservo_sim.experiments.random_rigs import driven_stops, judged_mechanics, unseen
@@ -99,7 +99,10 @@ def test_bundle_with_joint_noise_is_generalised_least_squares():
     P = np.linalg.inv(V) - np.linalg.solve(V, X) @ np.linalg.solve(information, np.linalg.solve(V, X).T)
     assert solution.cost == pytest.approx(y @ P @ y, rel=1e-9)
     assert np.allclose(
-        solution.triangle.T @ solution.triangle, information, rtol=1e-6, atol=1e-9 * information.max()
+        solution.determined.triangle.T @ solution.determined.triangle,
+        information,
+        rtol=1e-6,
+        atol=1e-9 * information.max(),
     )
     expected = expected_squares(solution.rig, solution.charts, solution.data)
     assert np.allclose(expected, np.diag(P).reshape(-1, 2).sum(axis=1), atol=1e-8)

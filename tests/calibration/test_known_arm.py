@@ -8,8 +8,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.known_arm.free_arm import free_arm, trials_of_poses
-from stereoservo.calibration.known_arm.known_arm_fit import frame_of_known_arm
+from stereoservo.calibration.known_arm import frame_of_known_arm, free_arm, trials_of_poses
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, decode_trials, encode_trials
 from stereoservo.geometry.distortion import distort

@@ -8,17 +8,19 @@ import pytest
 
 from stereoservo.calibration import self_calibration, stratum_selection
 from stereoservo.calibration.bundle_adjustment import solve
-from stereoservo.calibration.bundle_statistics import chi2_within
 from stereoservo.calibration.calibration_result import intrinsics
 from stereoservo.calibration.diagnosis.joint_scales import model_scales
+from stereoservo.calibration.least_squares import chi2_within
 from stereoservo.calibration.lens_estimation import (
     STARTING_BENDS,
     epipolar_lenses,
     implausible_lens,
+    lens_test,
+    lens_wanted,
+    lenses_explain_more,
     straight_lenses,
     undistorted,
 )
-from stereoservo.calibration.lens_significance import lens_test, lens_wanted, lenses_explain_more
 from stereoservo.calibration.rig_model import LensPriors, RigModel
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.single_joint_fit import measurements

@@ -9,8 +9,7 @@ import pytest
 
 from stereoservo.calibration.bundle_adjustment import solve
 from stereoservo.calibration.calibration_result import Outlier
-from stereoservo.calibration.diagnosis.moved_parts import every_pixel, moved_part
-from stereoservo.calibration.diagnosis.outlier_causes import explain_outliers
+from stereoservo.calibration.diagnosis.outlier_causes import every_pixel, explain_outliers, moved_part
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo_sim.world import synthetic

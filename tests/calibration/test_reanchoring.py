@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.calibration.relocalization.relocalized_model import RestObservations, RestPose, relocalize
+from stereoservo.calibration.relocalized_model import RestObservations, RestPose, relocalize
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import (
     CalibrationError,

@@ -7,21 +7,21 @@ from scipy.stats import binom
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.bundle_adjustment import jacobian, with_joint_errors_stated
-from stereoservo.calibration.bundle_statistics import parameter_covariance
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
-from stereoservo.calibration.joint_errors.joint_noise import joint_columns
-from stereoservo.calibration.joint_errors.score_tests import (
+from stereoservo.calibration.joint_noise import joint_columns
+from stereoservo.calibration.rig_model import JointNoise
+from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.variance_components import (
     LIKELY,
     SHOWN,
     likely_errors,
     point_optimal_weights,
+    readings,
+    reduced_rows,
     score_tests,
     weighted_chi2_tail,
 )
-from stereoservo.calibration.joint_errors.variance_components import readings, reduced_rows
-from stereoservo.calibration.rig_model import JointNoise
-from stereoservo.calibration.self_calibration import fit_model
 from stereoservo_sim.experiments.random_rigs import WELL, judged_mechanics
 from stereoservo_sim.world import synthetic
 
@@ -121,13 +121,13 @@ def test_exact_parameters_scatter_by_the_errors_of_the_joints(bundle):
         course = features[stop] @ features[stop].T
         V += np.outer(D[:, j], D[:, j]) * (own**2 * same + common**2 * both + giving[j] ** 2 * course)
     X = jacobian(bundle.rig, bundle.charts, np.zeros(bundle.charts.size), bundle.data)
-    pseudo = np.linalg.pinv(X / bundle.sizes) / bundle.sizes[:, None]
+    pseudo = np.linalg.pinv(X / bundle.determined.sizes) / bundle.determined.sizes[:, None]
     expected = pseudo @ V @ pseudo.T
-    found = parameter_covariance(with_joint_errors_stated(bundle, noise))
+    found = with_joint_errors_stated(bundle, noise).determined.covariance
     scale = np.sqrt(np.diag(expected))
     assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-5)
     assert np.trace(found / np.outer(scale, scale)) > 1.2 * np.trace(
-        parameter_covariance(bundle) / np.outer(scale, scale)
+        bundle.determined.covariance / np.outer(scale, scale)
     )
 
 

@@ -7,8 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.calibration.bundle_adjustment import solve
-from stereoservo.calibration.bundle_statistics import generator_noise
+from stereoservo.calibration.bundle_adjustment import generator_noise, solve
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction

@@ -14,8 +14,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.calibration.change.model_check import check_model_holds, examine_model, make_check_report
-from stereoservo.calibration.change.zero_reset import reset_zeros
+from stereoservo.calibration.change.model_check import (
+    check_model_holds,
+    examine_model,
+    make_check_report,
+    reset_zeros,
+)
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.kinematics.covariance import covariance_axes, displaced_model, propagated

@@ -1,28 +1,37 @@
 """Bundle adjustment of joint generators, cameras, lenses and markers in any stratum (projective, affine, metric) by
-Levenberg-Marquardt (thesis 5.53, 5.55 to 5.57).
+Levenberg-Marquardt (thesis 5.53, 5.55 to 5.57), and statistics of what it predicts.
 
-The model and its residuals are in `rig_model`, its normal equations in `normal_equations`.
+The model and its residuals are in `rig_model`, its rows in `normal_equations`, the fit's core in `least_squares`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.calibration.joint_errors.joint_noise import (
+from stereoservo.calibration.joint_noise import (
     StopEquations,
     StopFactor,
     exact_fit_factor,
+    expected_squares,
+    joint_columns,
     orthogonal_factor,
+    prediction_leverages,
     stop_equations,
+)
+from stereoservo.calibration.least_squares import (
+    Determined,
+    Limits,
+    NormalEquations,
+    RobustLoss,
+    column_root,
+    minimise,
 )
 from stereoservo.calibration.normal_equations import (
     ArrowFactor,
-    NormalEquations,
-    Weights,
     by_stop,
     chunks,
     normal_equations,
@@ -35,27 +44,13 @@ from stereoservo.calibration.rig_model import (
     Measurements,
     RigModel,
     full_charts,
+    predicted,
     residuals,
     rig_at,
 )
 from stereoservo.kinematics.model import Stratum
 from stereoservo.kinematics.parameterization import LensModel, conjugation
 from stereoservo.numerics.arrays import FloatArray
-
-GRADIENT = 1e-6
-"""Largest entry of the gradient on unit columns at which a bundle has converged: it moves no parameter by a notable
-part of its deviation."""
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-14, 1e10
-"""Levenberg-Marquardt: added to the diagonal of ones."""
-FREE_DAMPING = 1e-2
-"""Damping up to which a step's predicted decrease estimates the distance to the minimum."""
-
-
-class RobustLoss(NamedTuple):
-    """Loss by iteratively re-weighted least squares, in which residuals beyond ``scale`` [sigmas] count less."""
-
-    kind: Literal["soft_l1", "cauchy"]
-    scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -95,17 +90,9 @@ class Solution:
         return self.lens_factor.without(self.charts.start(2) + np.arange(fixed))
 
     @cached_property
-    def triangle(self) -> FloatArray:
-        """Root (p, p) of the normal matrix, ``triangleᵀ triangle = Jᵀ J``, to the accuracy of QR; triangular where
-        markers come first.
-        """
-        return self.factor.dense()[:-1, :-1]
-
-    @cached_property
-    def sizes(self) -> FloatArray:
-        """Lengths (p,) of the Jacobian's columns; 1 where a column is zero."""
-        sizes = np.linalg.norm(self.triangle, axis=0)
-        return np.where(sizes > 0.0, sizes, 1.0)
+    def determined(self) -> Determined:
+        """What the data determined of the parameters."""
+        return Determined(self.cost, self.rows, self.charts.size, lambda: self.factor.dense()[:-1, :-1])
 
 
 def with_joint_errors_stated(solution: Solution, noise: JointNoise) -> Solution:
@@ -113,7 +100,7 @@ def with_joint_errors_stated(solution: Solution, noise: JointNoise) -> Solution:
     ``noise``.
     """
     data = solution.data.with_joint_noise(noise)
-    factor = exact_fit_factor(solution.rig, solution.charts, data, solution.triangle)
+    factor = exact_fit_factor(solution.rig, solution.charts, data, solution.determined.triangle)
     return replace(solution, stated_factor=factor)
 
 
@@ -129,6 +116,56 @@ def jacobian(rig: RigModel, charts: Charts, x: FloatArray, data: Measurements) -
     for part, rows in chunks(rig_at(rig, charts, x), here, ordered):
         out[order[part]] = rows.dense(len(rig.points))[:, :-1].reshape(-1, 2, charts.size)
     return out.reshape(2 * len(order), charts.size)
+
+
+class _State:
+    """A rig under estimation, sorted measurements with the errors of their joints, the charts at the rig, and those
+    from which a step has led to it.
+    """
+
+    def __init__(self, bundle: _Bundle, rig: RigModel, data: Measurements, before: Charts) -> None:
+        self.bundle, self.rig, self.data, self.before = bundle, rig, data, before
+
+    @cached_property
+    def charts(self) -> Charts:
+        return self.bundle.charts_at(self.rig)
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """The bundle as a fit: which parts are free, and their loss."""
+
+    stratum: Stratum
+    generators: bool
+    cameras: bool
+    points: bool
+    lenses: LensModel
+    loss: RobustLoss | None
+
+    def charts_at(self, rig: RigModel) -> Charts:
+        return full_charts(
+            rig, self.stratum, generators=self.generators, cameras=self.cameras, points=self.points,
+            lenses=self.lenses,
+        )  # fmt: skip
+
+    def cost(self, state: _State) -> float:
+        squares = residuals(state.rig, state.data) ** 2
+        pixels = float(squares.sum()) if self.loss is None else self.loss.cost(squares)
+        prior = prior_rows(state.rig, state.before, state.data)[:, -1]
+        return pixels + _cost_of_errors(state.data) + float(prior @ prior)
+
+    def equations(self, state: _State) -> NormalEquations | StopEquations:
+        weights = None if self.loss is None else self.loss.weights
+        make = normal_equations if state.data.joint_noise is None else stop_equations
+        return make(state.rig, state.charts, state.data, weights)
+
+    def moved(self, state: _State, x: FloatArray) -> _State:
+        """Behind the charts' parameters are the errors that stops have in common, and each stop's own."""
+        p, data = state.charts.size, state.data
+        if data.joint_noise is not None:
+            own = p + data.joint_noise.common
+            data = data.corrected(JointErrors(x[own:].reshape(data.offsets.shape), x[p:own]))
+        return _State(self, rig_at(state.rig, state.charts, x[:p]), data, state.charts)
 
 
 def solve(
@@ -152,97 +189,93 @@ def solve(
     on a bad fit: look at ``converged`` and ``cost``. Where the joints have noise, their errors are estimated with the
     parameters, from ``data``'s on.
     """
-    ordered, _ = by_stop(data)
-    weights = _weights(loss)
-
-    def charts_at(rig: RigModel) -> Charts:
-        return full_charts(rig, stratum, generators=generators, cameras=cameras, points=points, lenses=lenses)
-
-    def cost_at(rig: RigModel, charts: Charts, here: Measurements) -> float:
-        pixels = _loss(residuals(rig, here), loss) + _cost_of_errors(here)
-        return pixels + float((prior_rows(rig, charts, data)[:, -1] ** 2).sum())
-
-    charts = charts_at(rig)
-    cost = cost_at(rig, charts, ordered)
-    if not np.isfinite(cost):
+    bundle = _Bundle(stratum, generators, cameras, points, lenses, loss)
+    start = _State(bundle, rig, by_stop(data)[0], bundle.charts_at(rig))
+    found = minimise(bundle, start, Limits(max_evaluations, tolerance))
+    if not np.isfinite(found.cost):
         raise np.linalg.LinAlgError("points at infinity or in a focal plane at the start of a bundle")
-    damping, evaluations, converged, exhausted = FIRST_DAMPING, 1, False, False
-    while not (converged or exhausted):
-        equations = _equations(rig, charts, ordered, weights)
-        if float(np.abs(equations.gradient).max(initial=0.0)) <= GRADIENT:
-            converged = True
-            break
-        while True:
-            if evaluations >= max_evaluations or damping > MOST_DAMPING:
-                exhausted = True
-                break
-            try:
-                x, expected = equations.step(damping)
-            except np.linalg.LinAlgError:
-                damping = max(10.0 * damping, 1e-12)
-                continue
-            trial, there = rig_at(rig, charts, x), ordered.corrected(_errors(equations, x))
-            evaluations += 1
-            least = cost_at(trial, charts, there)
-            gain = (cost - least) / expected if expected > 0.0 else 0.0
-            converged = damping <= FREE_DAMPING and expected <= tolerance * cost
-            if gain > 1e-3:
-                rig, cost, ordered = trial, least, there
-                charts = charts_at(rig)
-                damping = max(damping * (0.03 if gain > 0.75 else 0.3 if gain > 0.25 else 2.0), LEAST_DAMPING)
-                break
-            if converged:
-                break
-            damping = 10.0 * max(damping, 1e-12)
-    data = data.corrected(ordered.joint_errors)
+    rig, charts = found.state.rig, found.state.charts
+    data = data.corrected(found.state.data.joint_errors)
     error = residuals(rig, data)
     prior = prior_rows(rig, charts, data)[:, -1]
-    return Solution(
-        rig,
-        data,
-        charts,
-        stratum,
-        lenses,
-        float(error @ error + prior @ prior) + _cost_of_errors(data),
-        error,
-        len(error) + len(prior),
-        converged,
-        evaluations,
-    )
-
-
-def _equations(
-    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
-) -> NormalEquations | StopEquations:
-    if data.joint_noise is None:
-        return normal_equations(rig, charts, data, weights)
-    return stop_equations(rig, charts, data, weights)
-
-
-def _errors(equations: NormalEquations | StopEquations, x: FloatArray) -> JointErrors | None:
-    return equations.errors(x) if isinstance(equations, StopEquations) else None
+    cost = float(error @ error + prior @ prior) + _cost_of_errors(data)
+    rows = len(error) + len(prior)
+    return Solution(rig, data, charts, stratum, lenses, cost, error, rows, found.converged, found.evaluations)
 
 
 def _cost_of_errors(data: Measurements) -> float:
     return 0.0 if data.joint_errors is None else data.joint_errors.cost
 
 
-def _loss(error: FloatArray, loss: RobustLoss | None) -> float:
-    """``Σ s² ρ(e²/s²)`` of residuals (2 k,)."""
-    if loss is None:
-        return float(error @ error)
-    kind, scale = loss
-    square = (error / scale) ** 2
-    if kind == "soft_l1":
-        return float(2.0 * scale**2 * (np.sqrt(1.0 + square) - 1.0).sum())
-    return float(scale**2 * np.log1p(square).sum())
+# -- predictions ------------------------------------------------------------------------------------------------
 
 
-def _weights(loss: RobustLoss | None) -> Weights | None:
-    """IRLS weights ``ρ'(e²/s²)`` of squared residuals; None for plain least squares."""
-    if loss is None:
-        return None
-    kind, scale = loss
-    if kind == "soft_l1":
-        return lambda square: np.asarray(1.0 / np.sqrt(1.0 + square / scale**2))
-    return lambda square: np.asarray(1.0 / (1.0 + square / scale**2))
+def prediction_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
+    """Variance (c, s, m) [px², of both coordinates together] of pixels predicted at ``offsets`` (s, n), ``J Cov Jᵀ``
+    at the stated sigmas; NaN where the lens images nothing.
+    """
+    c, s, m = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
+    grid = _grid(solution, offsets)
+    variances = prediction_leverages(solution.rig, solution.charts, grid, solution.factor)
+    seen = np.isfinite(predicted(solution.rig, grid)).all(axis=1)
+    return np.where(seen, variances, np.nan).reshape(c, s, m)
+
+
+def _grid(solution: Solution, offsets: FloatArray) -> Measurements:
+    """Every marker in every camera at ``offsets`` (s, n), with sigmas of 1 px."""
+    shape = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
+    camera, stop, marker = (index.ravel() for index in np.indices(shape))
+    k = len(camera)
+    return Measurements(offsets, camera, stop, marker, np.zeros((k, 2)), np.ones(k))
+
+
+def joint_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
+    """Variance (c, s, m, n) [px², of both coordinates together] that a unit variance of each joint's reading gives
+    pixels predicted at ``offsets`` (s, n); NaN where the lens images nothing.
+    """
+    grid = _grid(solution, offsets)
+    slopes = joint_columns(solution.rig, grid).reshape(len(grid.camera), 2, -1)
+    c, m = len(solution.rig.cameras), len(solution.rig.points)
+    seen = np.asarray(np.isfinite(predicted(solution.rig, grid)).all(axis=1))
+    return np.where(seen[:, None], (slopes**2).sum(axis=1), np.nan).reshape(c, len(offsets), m, -1)
+
+
+def residual_expectations(solution: Solution) -> FloatArray:
+    """Expected squared residual (k,) of each measurement of a bundle with joint noise [sigmas², both coordinates]."""
+    return expected_squares(solution.rig, solution.charts, solution.data)
+
+
+class GroupRms(NamedTuple):
+    """Residual rms [px] of some pixels, its expected value ``σ √(1 - trace(H_g)/n_g)`` at the stated sigmas, and its
+    standard error about that.
+    """
+
+    rms_px: float
+    expected_px: float
+    standard_error_px: float
+
+
+def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) -> GroupRms:
+    """Residual statistics of a group of pixels (k,), from squared residuals of the two coordinates [px²], sigmas
+    [px], and the variance of their prediction [px², both coordinates].
+    """
+    n = 2 * len(squares)
+    if not n:
+        return GroupRms(0.0, 0.0, 0.0)
+    left = np.maximum(2.0 - variances / sigmas**2, 0.0)
+    expected = float((sigmas**2 * left).sum()) / n
+    # Of Gaussian residuals r = (I - H) e: var(rᵀr) <= 2 σ⁴ trace(I - H_g).
+    deviation = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
+    error = 0.5 * deviation / np.sqrt(expected) if expected > 0.0 else 0.0
+    return GroupRms(float(np.sqrt(squares.mean())), float(np.sqrt(expected)), float(error))
+
+
+def generator_noise(solution: Solution) -> FloatArray:
+    """Standard deviation (n,) of the entries of each generator, rms, from the bundle's covariance."""
+    root = column_root(solution.determined.triangle, bounded=True)
+    at, result = 0, []
+    for generator, basis in zip(solution.rig.generators, solution.charts.generators, strict=True):
+        changes = (basis @ generator - generator @ basis).reshape(len(basis), 16)
+        result.append(((changes.T @ root[at : at + len(basis)]) ** 2).sum() / 16)
+        at += len(basis)
+    return np.sqrt(np.array(result) * max(1.0, solution.determined.variance))

@@ -10,25 +10,22 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import Solution, with_joint_errors_stated
-from stereoservo.calibration.bundle_statistics import (
+from stereoservo.calibration.bundle_adjustment import (
     GroupRms,
-    chi2_within,
-    degrees_of_freedom,
+    Solution,
     group_rms,
     joint_variances,
-    noise_factor,
-    parameter_covariance,
     prediction_variances,
     residual_expectations,
-    variance_factor,
+    with_joint_errors_stated,
 )
-from stereoservo.calibration.joint_errors.variance_components import VarianceComponents, readings
-from stereoservo.calibration.lens_significance import lens_test
+from stereoservo.calibration.least_squares import chi2_within
+from stereoservo.calibration.lens_estimation import lens_test
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.shutter_offset import with_shutter_offsets
 from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import VarianceComponents, readings
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.strata import affine_to_projective, euclidean_to_projective
 from stereoservo.kinematics.axes import camera_intrinsics
@@ -188,7 +185,7 @@ def build_fit(
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
     squares = (errors**2).sum(axis=1) / 2
-    freedom = degrees_of_freedom(solution)
+    freedom = solution.determined.freedom
     variances = prediction_variances(solution, every.offsets)
     own = variances[data.camera, data.stop, data.marker]
     if components is not None:
@@ -200,7 +197,7 @@ def build_fit(
         by_joint = joint_variances(solution, every.offsets)
         there = _accuracy(components).deviations(every.offsets - every.corrections)
         by_error = (by_joint * there[None, :, None] ** 2).sum(axis=3)
-        variances = variances + by_error / noise_factor(solution)
+        variances = variances + by_error / solution.determined.noise
 
     def group(members: BoolArray) -> GroupRms:
         return group_rms(squares[members], data.sigmas[members], own[members])
@@ -219,7 +216,7 @@ def build_fit(
     model = build_model(trials, solution, frame, statistics, epoch, created)
     if components is not None:
         model = msgspec.structs.replace(model, joint_accuracy=_accuracy(components))
-    shown = variances[np.isfinite(variances)] / 2 * noise_factor(solution)
+    shown = variances[np.isfinite(variances)] / 2 * solution.determined.noise
     tested = lens_test(solution)
     report = CalibrationReport(
         stratum=solution.stratum,
@@ -227,7 +224,7 @@ def build_fit(
         chi2=statistics.chi2,
         degrees_of_freedom=freedom,
         chi2_ok=statistics.chi2_ok,
-        sigma_factor=float(np.sqrt(variance_factor(solution))),
+        sigma_factor=float(np.sqrt(solution.determined.variance)),
         projective_chi2=history.projective[0],
         projective_degrees_of_freedom=history.projective[1],
         prediction_rms_px=float(np.sqrt(shown.mean())),
@@ -282,7 +279,7 @@ def _camera_report(
         k, cu, cv, _, k2, p1, p2 = (float(value) for value in solution.rig.lenses[c])
         basis = solution.charts.lenses[c]
         at = solution.charts.start(2) + sum(len(other) for other in solution.charts.lenses[:c])
-        covariance = parameter_covariance(solution)[at : at + len(basis), at : at + len(basis)]
+        covariance = solution.determined.covariance[at : at + len(basis), at : at + len(basis)]
         lens = k, cu, cv
         deviations = tuple(float(value) for value in np.sqrt(np.diag(basis.T @ covariance @ basis)))
         lens_std = deviations[:3]
@@ -388,7 +385,7 @@ def _covariance(
         tuple(scale * (basis @ back) for scale, basis in zip(camera_scales, charts.cameras, strict=True)),
         tuple(basis[:, : _lens_size(solution)] for basis in charts.lenses),
         tuple(scale * (basis @ frame.T) for scale, basis in zip(point_scales, charts.points, strict=True)),
-        parameter_covariance(solution),
+        solution.determined.covariance,
     )
 
 
@@ -400,7 +397,7 @@ def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
 
 def _left_intrinsics_std(solution: Solution) -> tuple[float, ...]:
     at = solution.charts.start(1)
-    deviations = np.sqrt(np.diag(parameter_covariance(solution))[at : at + 5])
+    deviations = np.sqrt(np.diag(solution.determined.covariance)[at : at + 5])
     fx, skew, u0, fy, v0 = (float(value) for value in deviations)
     return fx, skew, fy, u0, v0
 

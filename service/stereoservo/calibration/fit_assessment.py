@@ -286,6 +286,7 @@ def depth_spread(model: CellModel, trials: TrialData) -> float | None:
     From the curvature of the fit at the model, over the trials' own stops and sigmas.
     """
     from stereoservo.calibration.change.model_changes import known_measurements
+    from stereoservo.calibration.least_squares import column_root
     from stereoservo.calibration.normal_equations import triangle_of
     from stereoservo.calibration.rig_model import acting_order, acting_rig, full_charts
 
@@ -295,10 +296,9 @@ def depth_spread(model: CellModel, trials: TrialData) -> float | None:
     data = known_measurements(model, trials, order)
     charts = full_charts(rig, model.stratum)
     triangle = triangle_of(rig, charts, data)[:-1, :-1]
-    sizes = np.linalg.norm(triangle, axis=0)
-    if not (sizes > 0.0).all():
+    if not triangle.any(axis=0).all():
         return None
-    root = np.linalg.pinv(triangle / sizes) / sizes[:, None]
+    root = column_root(triangle, bounded=True)
     at = charts.start(3)
     depths = rig.points @ rig.cameras[0][2]
     spreads = []

@@ -1,13 +1,21 @@
-"""Initial projective reconstruction of calibration images without kinematics: fundamental matrix over all stops,
-canonical camera pair, further cameras, triangulated markers.
+"""Start of a calibration: projective reconstruction of the first two cameras, its upgrade to the affine and metric
+strata (thesis 5.4.3, 5.4.4): plane at infinity (5.59), camera intrinsics, start values of the metric model.
+
+Frames: projective ``P`` with ``P_left = [N⁻¹ | 0]``; affine ``A`` with the plane at infinity (0, 0, 0, 1) and
+the same left camera; Euclidean ``E`` with ``P_left = [K | 0]``. A generator's upper block in ``A`` is ``K̃
+[w]ₓ K̃⁻¹`` with ``K̃ = N K``.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
+from stereoservo.calibration.rig_model import RigModel
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.cameras import canonical_pair, resection, triangulate
+from stereoservo.geometry.displacements import exp_rotation, nearest_rotation_generator
 from stereoservo.geometry.fundamental import (
     INLIER_SIGMAS,
     fundamental_refine,
@@ -16,7 +24,134 @@ from stereoservo.geometry.fundamental import (
     sampson_distances,
 )
 from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.screws import screw_twist
+from stereoservo.geometry.strata import euclidean_to_projective, projective_to_euclidean, triangular_root
 from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+SEPARATION = 10.0
+"""Singular value over its noise above which it counts as not zero."""
+NOMINAL_FOCALS = (2.0, 3.0, 1.4)
+"""Focal lengths [half image widths] to start from where the linear estimate fails: 53°, 37° and 71°
+across.
+"""
+
+
+def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
+    """Candidates (4,) for the plane that all generators (n, 4, 4) leave fixed, ``ker`` of the stack of
+    ``-Ĥᵀ`` (5.59).
+
+    Rows are weighted by ``noise`` (n,), the standard deviation of each generator's entries. First the least
+    singular vector; then, of all that vanish within their noise, the one nearest to (0, 0, 0, 1), which is
+    the infinity of the canonical frame's nominal cameras: where axes are parallel a pencil of planes is left.
+    """
+    stack = (-generators.transpose(0, 2, 1) / noise[:, None, None]).reshape(-1, 4)
+    _, values, rows = np.linalg.svd(stack)
+    kernel = rows[values <= max(SEPARATION * np.sqrt(len(stack)), 1e-9 * values[0], values[3])]
+    nearest: FloatArray = kernel.T @ kernel[:, 3]
+    return rows[3], nearest, len(kernel) == 1
+
+
+def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
+    """``plane`` (4,) scaled to mean height 1 over points (m, 4) of depth 1; None when it passes between
+    the points.
+    """
+    heights = points @ plane / points[:, 2]
+    mean = float(heights.mean())
+    if mean == 0.0 or (heights / mean).min() <= 0.0:
+        return None
+    result: FloatArray = plane / mean
+    return result
+
+
+def affine_rig(rig: RigModel, plane: FloatArray) -> RigModel:
+    """The projective ``rig`` in the affine frame of ``plane`` (4,), generators snapped to it.
+
+    Raises GeometryError where a generator is no rotation there: the plane is far from being left fixed.
+    """
+    moved = _transformed(rig, plane, np.eye(3))
+    for j, kind in enumerate(rig.kinds):
+        moved.generators[j, 3] = 0.0
+        if kind == "revolute":
+            moved.generators[j] = nearest_rotation_generator(moved.generators[j])
+            moved.generators[j, 3] = 0.0
+        else:
+            moved.generators[j, :, :3] = 0.0
+    return moved
+
+
+def metric_rig(rig: RigModel, plane: FloatArray, intrinsics: FloatArray, spans: FloatArray) -> RigModel:
+    """The projective ``rig`` in the Euclidean frame of ``plane`` (4,) and ``K̃`` (3, 3), generators unit
+    twists.
+
+    A revolute joint gets the rigid rotation nearest to what it does to the markers over half of its trial's
+    range ``spans`` (n,) [rad]. That needs no exact frame, and asks nothing of a generator where the markers
+    do not go: off the plane of a flat target that turns in itself, it is unknown.
+    """
+    moved = _transformed(rig, plane, intrinsics)
+    for j, kind in enumerate(rig.kinds):
+        if kind == "revolute":
+            half = 0.25 * spans[j]
+            ends = [moved.points @ exp_rotation(moved.generators[j], angle).T for angle in (-half, half)]
+            moved.generators[j] = twist_between(*(end[:, :3] / end[:, 3:] for end in ends))
+        else:
+            moved.generators[j, 3] = 0.0
+            moved.generators[j, :, :3] = 0.0
+    return moved
+
+
+def _transformed(rig: RigModel, plane: FloatArray, intrinsics: FloatArray) -> RigModel:
+    upgrade, back = projective_to_euclidean(plane, intrinsics), euclidean_to_projective(plane, intrinsics)
+    points = rig.points @ upgrade.T
+    return RigModel(
+        rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:], rig.lenses
+    )
+
+
+def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Unit twist (4, 4), without pitch, of the rigid motion that best takes points (m, 3) to others
+    (Kabsch).
+    """
+    centroid, centroid_after = before.mean(axis=0), after.mean(axis=0)
+    u, _, vt = np.linalg.svd((after - centroid_after).T @ (before - centroid))
+    u[:, 2] *= np.linalg.det(u @ vt)
+    turn = Rotation.from_matrix(u @ vt).as_rotvec()
+    angle = float(np.linalg.norm(turn))
+    axis = turn / angle
+    # The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
+    chord = centroid_after - centroid
+    chord = chord - axis * (axis @ chord)
+    centre = centroid + 0.5 * chord + 0.5 * np.cross(axis, chord) / np.tan(0.5 * angle)
+    return screw_twist(axis, centre)
+
+
+def intrinsics_linear(
+    generators: FloatArray, revolute: npt.NDArray[np.bool_], noise: FloatArray
+) -> tuple[FloatArray | None, bool]:
+    """``K̃`` (3, 3) from affine generators (n, 4, 4) by ``A Ω + Ω Aᵀ = 0``, ``Ω = K̃ K̃ᵀ``, linear, weighted
+    by ``noise`` (n,).
+
+    None where noise leaves ``Ω`` indefinite. Second, whether ``Ω`` is unique beyond its noise.
+    """
+    blocks = generators[revolute, :3, :3] / noise[revolute, None, None]
+    if not len(blocks):
+        return None, False
+    basis = np.zeros((6, 3, 3))
+    for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+        basis[k, i, j] = basis[k, j, i] = 1.0
+    system = blocks[:, None] @ basis + basis @ blocks[:, None].transpose(0, 1, 3, 2)
+    _, values, rows = np.linalg.svd(system.transpose(0, 2, 3, 1).reshape(-1, 6))
+    omega = np.tensordot(rows[5], basis, axes=1)
+    omega = omega * np.sign(omega[2, 2])
+    unique = bool(values[4] > SEPARATION * np.sqrt(9 * len(blocks)))
+    return (triangular_root(omega) if np.linalg.eigvalsh(omega)[0] > 0.0 else None), unique
+
+
+def nominal_intrinsics(focal: float) -> FloatArray:
+    """``K̃`` (3, 3) of a camera with square pixels, its principal point in the middle and ``focal`` [half
+    widths].
+    """
+    return np.diag([focal, focal, 1.0])
+
 
 MIN_MATCHES = 16
 """Matches between two cameras below which the epipolar geometry is not worth a robust search."""

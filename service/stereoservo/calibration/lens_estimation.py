@@ -1,5 +1,5 @@
 """Lens models of the cameras in a calibration: start values from straight lines or epipolar geometry, undistortion,
-priors, and plausibility of a lens that was found.
+priors, significance of what a lens adds to a solved bundle, and plausibility of one that was found.
 
 The models are nested: none; a radial parameter with its centre for each camera; second radial and tangential terms
 beside them. Centre and terms are held by weak priors: a small distortion does not determine them, but fixing them would
@@ -9,27 +9,154 @@ underestimate the uncertainty.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import cv2
 import msgspec
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_distribution
 
+from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
-from stereoservo.calibration.lens_significance import FREE_LENS
-from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel
+from stereoservo.calibration.joint_noise import orthogonal_factor
+from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_slopes
+from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, predicted, residuals
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.cameras import isotropic_normaliser
-from stereoservo.geometry.distortion import LensEstimate, straight_lens, undistort
+from stereoservo.geometry.distortion import LensEstimate, straight_lens, terms_jacobian, undistort
 from stereoservo.geometry.fundamental import INLIER_SIGMAS, fundamental_robust, sampson_distances
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.kinematics.model import pinhole
+from stereoservo.kinematics.parameterization import LENS_PARAMETERS, LensModel
 from stereoservo.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
     from stereoservo.calibration.calibration_result import CalibrationFit
+
+
+FREE_LENS: LensModel = "radial_centre"
+"""The lens model of cameras that distort."""
+FULL_LENS: LensModel = "brown"
+"""The lens model of cameras whose distortion a radial parameter with its centre does not follow."""
+LENS_TAIL = 1e-4
+"""Probability with which a lens is taken for one of a richer model than it is."""
+
+
+@dataclass(frozen=True)
+class LensTest:
+    """Test of lens parameters: ``chi2`` of ``freedom`` parameters against zero, and the ``limit`` that lenses without
+    them exceed with probability ``LENS_TAIL``.
+    """
+
+    chi2: float
+    freedom: int
+    limit: float
+
+    @property
+    def distorted(self) -> bool:
+        """Whether lenses without these parameters are rejected."""
+        return self.chi2 > self.limit
+
+
+def lens_test(solution: Solution) -> LensTest:
+    """Chi-square of the parameters of all lenses, but centres and reference radii, against zero.
+
+    With pinholes the score test of the radial ones: what freeing them would gain, to first order. With free lenses
+    Wald's: the estimates against their covariance, centres fixed, for without distortion a centre explains nothing.
+    Both relative to the noise left, where that is above the stated one.
+    """
+    c, at = len(solution.rig.lenses), solution.charts.start(2)
+    if solution.lenses == "none":
+        own, values = at + np.arange(c), None
+    else:
+        free = len(solution.charts.lenses[0])
+        terms = [i for i in range(free) if i not in (1, 2)]
+        own = at + (free * np.arange(c)[:, None] + terms).ravel()
+        values = solution.rig.lenses[:, [LENS_PARAMETERS[i] for i in terms]].ravel()
+    core = solution.lens_factor.core[:, [*range(at), *own, -1]]
+    last = np.asarray(np.linalg.qr(core, mode="r"))[at:, at:]
+    block = last[: len(own), : len(own)]
+    scores = last[: len(own), -1] if values is None else block @ values
+    gain = float(scores @ scores)
+    left = solution.cost - (gain if values is None else 0.0)
+    parameters = at + len(own) + solution.charts.size - solution.charts.start(3)
+    factor = max(1.0, left / max(1, solution.rows - parameters))
+    return LensTest(gain / factor, len(own), float(chi2_distribution.isf(LENS_TAIL, len(own))))
+
+
+def terms_test(solution: Solution) -> LensTest:
+    """Chi-square, to first order, of the second radial and both tangential terms of all lenses that lack them."""
+    gain, terms = _gain(solution, _distortion_columns(solution))
+    freedom = max(1, solution.determined.freedom - terms)
+    factor = max(1.0, (solution.cost - gain) / freedom)
+    return LensTest(gain / factor, terms, float(chi2_distribution.isf(LENS_TAIL, terms)))
+
+
+def lens_wanted(solution: Solution) -> LensModel:
+    """The lens model that the bundle's residuals ask for: its own, or a richer one.
+
+    Terms that a lens lacks are held against scale factors of the joints, which they imitate: of two hypotheses that of
+    the larger likelihood.
+    """
+    if solution.lenses == "none" and lens_test(solution).distorted:
+        return FREE_LENS
+    if solution.lenses == FULL_LENS or not terms_test(solution).distorted:
+        return solution.lenses
+    lenses, scales = _evidence(solution)
+    return FULL_LENS if lenses > scales or scales <= 0.0 else solution.lenses
+
+
+def lenses_explain_more(solution: Solution) -> bool:
+    """Whether terms of distortion that the model lacks (second radial, tangential) explain more of its residuals than
+    scale factors of its joints do: of two hypotheses that of the larger likelihood, by Bayes's information criterion.
+    """
+    lenses, scales = _evidence(solution)
+    return bool(lenses > max(scales, 0.0))
+
+
+def _evidence(solution: Solution) -> tuple[float, float]:
+    """Bayes's information criterion of terms of distortion, and of scale factors of revolute joints: gain in
+    chi-square less the penalty.
+    """
+    joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
+    found = []
+    for columns in (_distortion_columns(solution), scale_columns(solution, joints)):
+        gain, count = _gain(solution, columns)
+        found.append(gain / max(1.0, solution.determined.variance) - count * float(np.log(solution.rows)))
+    return found[0], found[1]
+
+
+def _gain(solution: Solution, columns: FloatArray) -> tuple[float, int]:
+    """Chi-square that ``columns`` (2 k, e) would gain beside the free parameters, to first order, and their number."""
+    core = orthogonal_factor(solution.rig, solution.charts, solution.data, columns).core
+    return float((core[solution.charts.start(3) : -1, -1] ** 2).sum()), columns.shape[1]
+
+
+def scale_columns(solution: Solution, joints: list[int]) -> FloatArray:
+    """Derivatives (2 k, j) of the residuals by the logarithms of the joints' scale factors."""
+    step = 1e-5
+    columns = [np.zeros((len(solution.residuals), 0))]
+    for joint in joints:
+        ends = []
+        for sign in (-1.0, 1.0):
+            offsets = solution.data.offsets.copy()
+            offsets[:, joint] *= np.exp(-sign * step)
+            ends.append(residuals(solution.rig, replace(solution.data, offsets=offsets)))
+        columns.append((ends[1] - ends[0])[:, None] / (2.0 * step))
+    return np.hstack(columns)
+
+
+def _distortion_columns(solution: Solution) -> FloatArray:
+    """Derivatives (2 k, 3 c) of the residuals by the second radial and both tangential terms of each camera's lens."""
+    rig, data = solution.rig, solution.data
+    ideal = predicted(replace(rig, lenses=np.tile(pinhole(), (len(rig.lenses), 1))), data)
+    out = np.zeros((len(ideal), 2, 3 * len(rig.lenses)))
+    for c, lens in enumerate(rig.lenses):
+        mine = data.camera == c
+        out[mine, :, 3 * c : 3 * c + 3] = terms_jacobian(lens, ideal[mine]) / data.sigmas[mine, None, None]
+    return out.reshape(2 * len(out), -1)
+
 
 STARTING_BENDS = (-0.1, -0.04, -0.2, 0.04)
 """Radial parameters at half the image width of all cameras, from which fits start where the search has failed."""
@@ -152,6 +279,8 @@ CENTRE_BOUND = 2.0
 """Largest offset of a centre in the search, in those standard deviations."""
 START_GAIN = 100.0
 """Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
+SEARCH = Limits(evaluations=60, tolerance=1e-8)
+"""Of a search for a lens."""
 MOST_MATCHES = 20_000
 """Matches of two cameras at most, evenly spread, that the search for a lens looks at."""
 
@@ -311,7 +440,6 @@ def _refined(
     start = np.linalg.inv(normalisers[1]).T @ F @ np.linalg.inv(normalisers[0])
     start = start / np.linalg.norm(start)
     tangent = np.linalg.svd(start.reshape(1, 9))[2][1:].reshape(8, 3, 3)
-    middle = lenses[:, 1:3]
     freedom = 2.0 * CENTRE_SHARE * lenses[:, 3:4]
 
     def lenses_at(z: FloatArray) -> FloatArray:
@@ -329,22 +457,23 @@ def _refined(
         scale = np.sqrt(((sigmas * _stretches(here, ideal)) ** 2).mean(axis=0))
         distances = sampson_distances(fundamental, *ideal) / scale
         # Matches without ideal pixels count as far off, not as perfect.
-        held = (here[list(free), 1:3] - middle[list(free)]) / freedom[list(free)]
-        return np.append(np.where(np.isfinite(distances), distances, 1e3), held.ravel())
+        return np.where(np.isfinite(distances), distances, 1e3)[:, None]
 
-    z, cost = np.zeros(8 + 3 * len(free)), np.inf
     # A robust loss forgives a centre far off, so that the prior alone would not hold it.
     limit = np.array([np.inf] * 8 + [np.inf, CENTRE_BOUND, CENTRE_BOUND] * len(free))
+    centres = np.isfinite(limit)
+
+    def step(z: FloatArray, x: FloatArray) -> FloatArray:
+        return np.clip(z + x, -limit, limit)
+
+    slopes = numeric_slopes(errors, np.add, len(limit), 1e-7)
+    z, cost = np.zeros(len(limit)), np.inf
     for scale in (3.0 * bound, 3.0):
-        fit = least_squares(
-            errors,
-            z,
-            loss="cauchy",
-            f_scale=scale,
-            x_scale="jac",
-            bounds=(-limit, limit),
-            max_nfev=60,
-        )
-        z, cost = fit.x, 2.0 * float(fit.cost)
-    distances = np.abs(errors(z)[: raw.shape[1]])
+        fit = DenseFit(
+            errors, slopes, step, RobustLoss("cauchy", scale),
+            lambda z: np.column_stack([np.eye(len(z)), z])[centres],
+        )  # fmt: skip
+        found = minimise(fit, z, SEARCH)
+        z, cost = found.state, found.cost
+    distances = np.abs(errors(z))
     return lenses_at(z), cost, float(np.median(distances)) / NORMAL_MEDIAN

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.calibration.least_squares import NormalEquations, column_root
 from stereoservo.calibration.rig_model import (
     Charts,
     Measurements,
@@ -350,46 +351,6 @@ def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
     return np.vstack([np.zeros((0, charts.size + 1)), *rows])
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    """``Jᵀ W J`` and ``Jᵀ W r`` by blocks: ``core`` (p_core + 1, p_core + 1) with the residuals as its last row and
-    column, ``cross`` (m, q, p_core + 1), ``square`` (m, q, q). Columns are of unit length; ``sizes`` (p,) are
-    their lengths before.
-    """
-
-    core: FloatArray
-    cross: FloatArray
-    square: FloatArray
-    sizes: FloatArray
-
-    @property
-    def gradient(self) -> FloatArray:
-        """``Jᵀ W r`` (p,) on unit columns."""
-        return np.concatenate([self.core[:-1, -1], self.cross[:, :, -1].ravel()])
-
-    def step(self, damping: float) -> tuple[FloatArray, float]:
-        """Damped step ``-(Jᵀ W J + λ I)⁻¹ Jᵀ W r`` (p,), not on unit columns, and the decrease it predicts.
-
-        Raises LinAlgError where rounding leaves the matrix indefinite.
-        """
-        m, q, width = self.cross.shape
-        width -= 1
-        matrix = self.core[:-1, :-1] + damping * np.eye(width)
-        right = -self.core[:-1, -1]
-        if q:
-            inverse = np.linalg.inv(np.linalg.cholesky(self.square + damping * np.eye(q)))
-            half = (inverse @ self.cross).reshape(m * q, width + 1)
-            matrix = matrix - half[:, :-1].T @ half[:, :-1]
-            right = right + half[:, :-1].T @ half[:, -1]
-        root = np.linalg.cholesky(matrix)
-        core = np.linalg.solve(root.T, np.linalg.solve(root, right))
-        x = core
-        if q:
-            back = -(half[:, -1] + half[:, :-1] @ core).reshape(m, q, 1)
-            x = np.append(core, inverse.transpose(0, 2, 1) @ back)
-        return x / self.sizes, float(damping * (x @ x) - self.gradient @ x)
-
-
 def normal_equations(
     rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
 ) -> NormalEquations:
@@ -417,6 +378,7 @@ def normal_equations(
         cross / along[:, :, None] / across,
         square / along[:, :, None] / along[:, None, :],
         sizes,
+        float(core[-1, -1]),
     )
 
 
@@ -545,10 +507,7 @@ def leverages(rig: RigModel, charts: Charts, data: Measurements, factor: ArrowFa
     trace. ``factor``: of the measurements that determine the parameters. Raises LinAlgError where they do not.
     """
     sorted_data, order = by_stop(data)
-    triangle = factor.core[:-1, :-1]
-    sizes = np.linalg.norm(triangle, axis=0)
-    sizes[sizes == 0.0] = 1.0
-    core_root = np.linalg.inv(triangle / sizes) / sizes[:, None]
+    core_root = column_root(factor.core[:-1, :-1])
     lengths = np.linalg.norm(factor.own, axis=1)
     lengths[lengths == 0.0] = 1.0
     own_roots = np.linalg.inv(factor.own / lengths[:, None, :]) / lengths[:, :, None]

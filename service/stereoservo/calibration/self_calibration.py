@@ -13,13 +13,14 @@ from typing import Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
+from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.bundle_inliers import (
     projective_bundle,
     refine_to_convergence,
+    refuse_poor_fit,
+    refuse_undetermined,
     with_whole_stops,
 )
-from stereoservo.calibration.bundle_statistics import chi2_within, degrees_of_freedom
 from stereoservo.calibration.calibration_result import (
     CalibrationFit,
     FitHistory,
@@ -28,37 +29,31 @@ from stereoservo.calibration.calibration_result import (
     completed,
 )
 from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
-from stereoservo.calibration.diagnosis.fit_refusal import refuse_poor_fit, refuse_undetermined
 from stereoservo.calibration.diagnosis.input_corrections import Refit
-from stereoservo.calibration.diagnosis.joint_errors import (
+from stereoservo.calibration.diagnosis.joint_scales import (
     ScalesError,
     explains,
     one_thing_happened,
     refuse_wrong_scales,
     scales_error,
     small_scales,
+    with_scales_removed,
 )
-from stereoservo.calibration.diagnosis.joint_scales import with_scales_removed
 from stereoservo.calibration.diagnosis.marker_tracks import check_motions
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
-from stereoservo.calibration.joint_errors.score_tests import likely_errors
-from stereoservo.calibration.joint_errors.variance_components import (
-    ReducedRows,
-    VarianceComponents,
-    estimate_components,
-    readings,
-    reduced_rows,
-)
-from stereoservo.calibration.known_arm.known_arm_fit import fit_with_known_arm
+from stereoservo.calibration.known_arm import fit_with_known_arm
+from stereoservo.calibration.least_squares import RobustLoss, chi2_within
 from stereoservo.calibration.lens_estimation import (
+    FREE_LENS,
+    FULL_LENS,
     STARTING_BENDS,
     implausible_lens,
+    lens_wanted,
     lenses_may_bend,
     prior_of_lenses,
     starting_lenses,
     undistorted,
 )
-from stereoservo.calibration.lens_significance import FREE_LENS, FULL_LENS, lens_wanted
 from stereoservo.calibration.rig_model import (
     JointNoise,
     Measurements,
@@ -74,6 +69,14 @@ from stereoservo.calibration.single_joint_fit import (
 )
 from stereoservo.calibration.stratum_selection import DEFAULTS, FitOptions, StratumSelection, select_stratum
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, check_trials
+from stereoservo.calibration.variance_components import (
+    ReducedRows,
+    VarianceComponents,
+    estimate_components,
+    likely_errors,
+    readings,
+    reduced_rows,
+)
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import LensModel
@@ -372,7 +375,7 @@ def _fit(
                 refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
-            elif chi2_within(bundles.final.cost, degrees_of_freedom(bundles.final)):
+            elif chi2_within(bundles.final.cost, bundles.final.determined.freedom):
                 components, chance = likely_errors(rows)
     report_progress("report", 0.95)
     result = build_fit(
@@ -382,7 +385,7 @@ def _fit(
         bundles.inliers,
         ModelFrame(start.zero, bundles.raised.plane),
         FitHistory(
-            (bundles.projective.cost, degrees_of_freedom(bundles.projective)),
+            (bundles.projective.cost, bundles.projective.determined.freedom),
             bundles.raised.notes,
             start.markers_left_out,
         ),
@@ -493,7 +496,7 @@ def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponen
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
-    if chi2_within(free.cost, degrees_of_freedom(free)):
+    if chi2_within(free.cost, free.determined.freedom):
         return None
     # Wrong pixels would be taken for errors of the joints; those of a stop as a whole would not be seen.
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)

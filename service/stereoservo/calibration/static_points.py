@@ -11,8 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.calibration.relocalization.camera_resection import Correspondences
-from stereoservo.calibration.relocalization.moved_camera_covariance import model_jacobian, parameters_of
+from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
+from stereoservo.calibration.moved_cameras import (
+    Correspondences,
+    Moved,
+    model_jacobian,
+    parameters_of,
+)
 from stereoservo.calibration.trial_data import StaticObservations
 from stereoservo.geometry.cameras import projection_jacobian_many, triangulate
 from stereoservo.geometry.distortion import distort, distortion_jacobian, undistort
@@ -24,9 +29,8 @@ TAIL = 1e-6
 """Probability that the views of a static point are taken for those of two points."""
 LEAST_HEIGHT = 1e-3
 """Height of a point, relative to its size, below which it is as good as at infinity."""
-OPEN = 1e14
-"""Condition of the equations of a point above which it is not determined."""
-ROUNDS = 20
+OPEN = 1e7
+"""Condition of the rows of a point from which on it is not determined."""
 SETTLED = 1e-3
 """Length of a step [standard deviations] at which a point has converged."""
 
@@ -85,18 +89,17 @@ def _scene_point(
     # Three directions that keep the height.
     chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
     covariance = _covariance(model, seen, matrices, point, pixels, sigmas)
-    inverse: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-    for _ in range(ROUNDS):
-        J, error = _equations(model, seen, matrices, point, pixels, chart)
-        information: FloatArray = J.T @ inverse @ J
-        if not (np.isfinite(error).all() and np.linalg.cond(information) < OPEN):
-            return "its rays do not tell how far away it is"
-        step = -np.linalg.solve(information, J.T @ inverse @ error)
-        point = point + chart @ step
-        if float(step @ information @ step) < SETTLED**2:
-            break
-    _, error = _equations(model, seen, matrices, point, pixels, chart)
-    chi2, freedom = float(error @ inverse @ error), 2 * len(seen) - 3
+    white: FloatArray = np.linalg.inv(np.linalg.cholesky(covariance))
+    fit = DenseFit[FloatArray](
+        lambda at: (white @ _equations(model, seen, matrices, at, pixels, chart)[1])[:, None],
+        lambda at: (white @ _equations(model, seen, matrices, at, pixels, chart)[0])[:, None],
+        lambda at, x: at + chart @ x,
+    )
+    found = minimise(fit, point, Limits(settled=SETTLED**2))
+    point, determined = found.state, fit.determined(found.state)
+    if not np.isfinite(found.cost) or np.linalg.cond(determined.triangle) >= OPEN:
+        return "its rays do not tell how far away it is"
+    chi2, freedom = determined.cost, determined.freedom
     noise = 1.0
     if model.statistics is not None and model.statistics.degrees_of_freedom > 0:
         noise = max(1.0, model.statistics.chi2 / model.statistics.degrees_of_freedom)
@@ -106,9 +109,9 @@ def _scene_point(
             f"its views do not belong together (chi-square {chi2:.4g}, limit {limit:.4g}): did it move, is its id "
             "there twice?"
         )
-    gain = chart @ np.linalg.solve(information, J.T @ inverse)
-    found: FloatArray = gain @ (np.repeat(sigmas[seen] ** 2, 2)[:, None] * gain.T)
-    return point, found
+    rows = fit.rows(point)[:, :-1]
+    gain = chart @ determined.root @ determined.root.T @ rows.T @ white
+    return point, gain @ (np.repeat(sigmas[seen] ** 2, 2)[:, None] * gain.T)
 
 
 def _equations(
@@ -153,7 +156,7 @@ def _covariance(
         np.tile(np.eye(2), (count, 1, 1)),
     )
     group = tuple(int(c) for c in seen)
-    rows = model_jacobian(model, group, matrices, np.eye(4), views, np.zeros((1, len(model.zero))))
+    rows = model_jacobian(model, group, Moved(matrices, np.eye(4)), views, np.zeros((1, len(model.zero))))
     rows = rows.reshape(2 * count, parameters_of(model))
     widened: FloatArray = covariance + rows @ model.covariance.covariance @ rows.T
     return widened

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import ceil
 from typing import Literal, NamedTuple
 
@@ -11,21 +11,100 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 
-from stereoservo.calibration import stratum_upgrade
-from stereoservo.calibration.alternative_axes import with_other_axes
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
-from stereoservo.calibration.bundle_statistics import (
-    covariance_root,
-    generator_noise,
-    rank_of,
-    variance_factor,
-)
-from stereoservo.calibration.lens_significance import lens_wanted
-from stereoservo.calibration.rig_model import Measurements, RigModel
+from stereoservo.calibration import initial_reconstruction
+from stereoservo.calibration.bundle_adjustment import Solution, generator_noise, solve
+from stereoservo.calibration.least_squares import RobustLoss
+from stereoservo.calibration.lens_estimation import lens_wanted
+from stereoservo.calibration.rig_model import Measurements, RigModel, partial_products
+from stereoservo.calibration.single_joint_fit import DIRECTIONS, twist_about
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.parameterization import LensModel
 from stereoservo.numerics.arrays import FloatArray
+
+STILL = 2e-3
+"""How far other joints may stray [rad or m] at the stops of a joint's own trial."""
+GAIN = 8.0
+"""Chi-square by which another axis must explain a joint's trial better to be tried in the whole bundle."""
+
+
+def with_other_axes(solution: Solution) -> list[RigModel]:
+    """Metric rigs to start from again: revolute joints get the axes that fit their own trials better, most joints
+    first.
+
+    Empty where no joint has a better one.
+    """
+    better: dict[int, FloatArray] = {}
+    for joint, kind in enumerate(solution.rig.kinds):
+        if kind == "revolute":
+            generator = _better_generator(solution, joint)
+            if generator is not None:
+                better[joint] = generator
+    rigs = []
+    for joints in [tuple(better), *([(joint,) for joint in better] if len(better) > 1 else [])]:
+        if joints:
+            generators = solution.rig.generators.copy()
+            for joint in joints:
+                generators[joint] = better[joint]
+            rigs.append(replace(solution.rig, generators=generators))
+    return rigs
+
+
+def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
+    """Generator (4, 4) that fits a joint's own trial better, with cameras and markers fixed; None where there is
+    none.
+    """
+    rig, data = solution.rig, solution.data
+    used = np.unique(data.stop)
+    reported = data.corrected(None).offsets
+    base = np.median(reported[used], axis=0)
+    still = np.asarray((np.delete(np.abs(reported - base), joint, axis=1) <= STILL).all(axis=1))
+    own = data.select(still[data.stop])
+    displacement = data.offsets[:, joint]
+    span = float(np.ptp(displacement[still])) if still.any() else 0.0
+    if span == 0.0:
+        return None
+    base[joint] = 0.0
+    before, after = partial_products(rig, base[None])
+    single = RigModel(
+        ("revolute",),
+        rig.generators[joint : joint + 1],
+        rig.cameras @ before[joint, 0],
+        rig.points @ after[joint + 1, 0].T,
+        rig.lenses,
+    )
+    own = replace(
+        own,
+        offsets=data.offsets[:, joint : joint + 1],
+        lens_priors=None,
+        joint_noise=None,
+        joint_errors=None,
+    )
+    now = _solved(single, own)
+    centroids = [
+        _centroid(single, float(end)) for end in (displacement[still].min(), displacement[still].max())
+    ]
+    best: Solution | None = None
+    for direction in DIRECTIONS:
+        start = replace(single, generators=twist_about(direction, centroids, span)[None])
+        try:
+            fit = _solved(start, own)
+        except np.linalg.LinAlgError:
+            continue  # the axis takes a marker into a focal plane
+        if best is None or fit.cost < best.cost:
+            best = fit
+    return best.rig.generators[0] if best is not None and best.cost < now.cost - GAIN else None
+
+
+def _solved(rig: RigModel, data: Measurements) -> Solution:
+    return solve(rig, data, "metric", cameras=False, points=False, max_evaluations=40, tolerance=1e-4)
+
+
+def _centroid(rig: RigModel, angle: float) -> FloatArray:
+    """Centroid (3,) of a single joint's markers at ``angle``."""
+    _, after = partial_products(rig, np.array([[angle]]))
+    points = rig.points @ after[0, 0].T
+    return np.asarray((points[:, :3] / points[:, 3:]).mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -94,7 +173,7 @@ class StratumSelector:
         if problem:
             self._note(solution, problem)
             # A good fit that leaves directions wide open, converged along them or not: so will any other.
-            open_ones = rank_of(solution) < solution.charts.size
+            open_ones = solution.determined.rank < solution.charts.size
             wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_SPREAD
             done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
             self.hopeless = self._close(solution) and (wide or done)
@@ -157,12 +236,14 @@ class StratumSelector:
         Its covariance is large; predictions are as good as the trials allow.
         """
         projective = solve(self.projective.rig, data, "projective", lenses=self.projective.lenses)
-        if projective.converged and rank_of(projective) == projective.charts.size:
+        if projective.converged and projective.determined.rank == projective.charts.size:
             return None
         for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _solve_to_convergence(solution, data)
             deviation = (
-                max(_relative_deviations(final).values()) if rank_of(final) == final.charts.size else np.inf
+                max(_relative_deviations(final).values())
+                if final.determined.rank == final.charts.size
+                else np.inf
             )
             if (
                 final.converged
@@ -207,14 +288,14 @@ class StratumSelector:
         else:
             stops, joints = solution.data.offsets.shape
             allowed = fewer * float(f_distribution.isf(tail, fewer, max(stops // joints - 3, 1)))
-        return solution.cost - beside.cost > allowed * max(1.0, variance_factor(beside))
+        return solution.cost - beside.cost > allowed * max(1.0, beside.determined.variance)
 
     def _close(self, solution: Solution) -> bool:
-        beside = max(1.0, variance_factor(self.projective))
-        return variance_factor(solution) <= self.options.metric_loss * beside
+        beside = max(1.0, self.projective.determined.variance)
+        return solution.determined.variance <= self.options.metric_loss * beside
 
     def _unidentified(self, solution: Solution) -> str:
-        rank = rank_of(solution)
+        rank = solution.determined.rank
         if rank < solution.charts.size:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
         limit = self.options.max_spread
@@ -245,8 +326,8 @@ def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:
 
 def _relative_deviations(solution: Solution) -> dict[str, float]:
     """Largest relative standard deviation of depths and, in the metric stratum, of focal lengths."""
-    factor = max(1.0, variance_factor(solution))
-    deviations = np.sqrt((covariance_root(solution) ** 2).sum(axis=1) * factor)
+    factor = max(1.0, solution.determined.variance)
+    deviations = np.sqrt((solution.determined.root**2).sum(axis=1) * factor)
     m = len(solution.rig.points)
     scale = np.array([basis[2, 2] for basis in solution.charts.points])
     depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
@@ -282,10 +363,10 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
     # the time.
     exact = data.with_errors_removed()
     selector = StratumSelector(solution, options)
-    least, nearest, unique = stratum_upgrade.planes_at_infinity(solution.rig.generators, noise)
+    least, nearest, unique = initial_reconstruction.planes_at_infinity(solution.rig.generators, noise)
     finite: list[FloatArray] = []
     for candidate in (nearest, least, NOMINAL_PLANE):
-        scaled = stratum_upgrade.scaled_plane(candidate, solution.rig.points)
+        scaled = initial_reconstruction.scaled_plane(candidate, solution.rig.points)
         if scaled is not None and not any(np.allclose(scaled, p, rtol=1e-3, atol=1e-6) for p in finite):
             finite.append(scaled)
     if not finite:
@@ -323,7 +404,7 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
         for plane in finite:
             try:
                 affine = solve(
-                    stratum_upgrade.affine_rig(solution.rig, plane),
+                    initial_reconstruction.affine_rig(solution.rig, plane),
                     data,
                     "affine",
                     lenses=solution.lenses,
@@ -348,8 +429,8 @@ def _several_directions(rig: RigModel, plane: FloatArray, noise: FloatArray) -> 
     """Whether rotation axes of different directions determine the intrinsics reliably."""
     revolute = np.array([kind == "revolute" for kind in rig.kinds])
     try:
-        return stratum_upgrade.intrinsics_linear(
-            stratum_upgrade.affine_rig(rig, plane).generators, revolute, noise
+        return initial_reconstruction.intrinsics_linear(
+            initial_reconstruction.affine_rig(rig, plane).generators, revolute, noise
         )[1]
     except GeometryError:
         return False
@@ -366,14 +447,16 @@ def _metric_starts(
         return
     for plane in planes:
         try:
-            affine = stratum_upgrade.affine_rig(rig, plane)
-            linear, _ = stratum_upgrade.intrinsics_linear(affine.generators, revolute, noise)
+            affine = initial_reconstruction.affine_rig(rig, plane)
+            linear, _ = initial_reconstruction.intrinsics_linear(affine.generators, revolute, noise)
         except GeometryError:
             linear = None  # this plane is no start for the linear estimate; nominal cameras follow
         if linear is not None:
-            yield stratum_upgrade.metric_rig(rig, plane, linear, spans), plane
-        for focal in stratum_upgrade.NOMINAL_FOCALS:
+            yield initial_reconstruction.metric_rig(rig, plane, linear, spans), plane
+        for focal in initial_reconstruction.NOMINAL_FOCALS:
             yield (
-                stratum_upgrade.metric_rig(rig, plane, stratum_upgrade.nominal_intrinsics(focal), spans),
+                initial_reconstruction.metric_rig(
+                    rig, plane, initial_reconstruction.nominal_intrinsics(focal), spans
+                ),
                 plane,
             )

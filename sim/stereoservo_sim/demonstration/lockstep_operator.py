@@ -5,8 +5,12 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable
 
-from stereoservo.calibration.change.model_check import check_model_holds, examine_model, make_check_report
-from stereoservo.calibration.change.zero_reset import reset_zeros
+from stereoservo.calibration.change.model_check import (
+    check_model_holds,
+    examine_model,
+    make_check_report,
+    reset_zeros,
+)
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.core.cycle import Event, ModelUpdate

@@ -22,7 +22,7 @@ from stereoservo.calibration.examination.examination import (
     examine_views,
 )
 from stereoservo.calibration.examination.recorded_views import RecordedViews
-from stereoservo.calibration.known_arm.free_arm import KINDS, NAMES, free_arm
+from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.experiment import cases

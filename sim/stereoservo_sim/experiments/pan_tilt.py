@@ -19,11 +19,10 @@ import numpy as np
 from rich.console import Console
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.bundle_statistics import covariance_root
-from stereoservo.calibration.generator_initialization import common_points, linear_generator
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
 from stereoservo.calibration.rig_model import Measurements, RigModel, rig_at
 from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.single_joint_fit import common_points, linear_generator
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData
 from stereoservo.geometry.fundamental import fundamental_robust, sampson_distances
 from stereoservo.geometry.homogeneous import GeometryError
@@ -221,7 +220,7 @@ class HeadCalibration:
         """
         charts = self.solution.charts
         size = charts.size - 3 * len(self.solution.rig.points)
-        rows = covariance_root(self.solution)[:size]
+        rows = self.solution.determined.root[:size]
         for column in np.linalg.cholesky(rows @ rows.T).T:
             x = np.concatenate([column, np.zeros(charts.size - size)])
             yield tuple(_seen(rig_at(self.solution.rig, charts, sign * x), self.zero) for sign in (1, -1))  # type: ignore[misc]

@@ -29,7 +29,6 @@ from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
 from stereoservo.calibration.bundle_adjustment import jacobian
-from stereoservo.calibration.bundle_statistics import covariance_root, variance_factor
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
@@ -138,10 +137,11 @@ def held_out_ratio(case: RandomCase, trials: TrialData, result: CalibrationFit) 
     exact = case.cell.pixels(positions)[:, :, kept][seen]
     data = Measurements(order - result.model.zero, camera, stop, marker, exact, np.ones(len(exact)))
     errors = residuals(solution.rig, data)
-    roots = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data) @ covariance_root(
-        solution
+    roots = (
+        jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data)
+        @ solution.determined.root
     )
-    moments = roots.T @ roots * max(1.0, variance_factor(solution))
+    moments = roots.T @ roots * max(1.0, solution.determined.variance)
     mean = float(np.trace(moments))
     freedom = mean**2 / float((moments**2).sum())
     return float(errors @ errors) / mean, freedom, float(np.sqrt((errors**2).mean()))

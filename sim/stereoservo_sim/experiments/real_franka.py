@@ -24,8 +24,7 @@ from scipy.stats import binom
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.known_arm.free_arm import free_arm, trials_of_poses
-from stereoservo.calibration.known_arm.known_arm_fit import LEAST_VIEWS, frame_of_known_arm
+from stereoservo.calibration.known_arm import LEAST_VIEWS, frame_of_known_arm, free_arm, trials_of_poses
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import (

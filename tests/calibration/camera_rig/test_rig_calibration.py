@@ -16,16 +16,14 @@ from scipy.stats import chi2
 
 from oracles import waved_bodies
 from oracles.waved_bodies import DEGENERATE, degenerate, rendered_pictures, waved
-from stereoservo.calibration.camera_rig.initialization import starts
-from stereoservo.calibration.camera_rig.rig_bundle import fit_rig
+from stereoservo.calibration.camera_rig.rig_bundle import fit_rig, starts
 from stereoservo.calibration.camera_rig.rig_calibration import (
     KnownDistance,
     calibrate_rig,
     load_rig,
     save_rig,
 )
-from stereoservo.calibration.camera_rig.still_places import still_places
-from stereoservo.calibration.camera_rig.views import RigViews, usable_views
+from stereoservo.calibration.camera_rig.views import RigViews, still_places, usable_views
 from stereoservo.calibration.normal_equations import prior_rows
 from stereoservo.calibration.rig_model import rig_at
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera

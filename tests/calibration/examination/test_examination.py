@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.change.model_changes import start_state
-from stereoservo.calibration.examination.camera_steps import CLEAR, moved_camera, step_of_camera
+from stereoservo.calibration.examination.change_points import CLEAR, moved_camera, step_of_camera
 from stereoservo.calibration.examination.examination import examine_views
-from stereoservo.calibration.examination.examined_frames import examined_frames
-from stereoservo.calibration.examination.frame_times import gaps
-from stereoservo.calibration.examination.recorded_views import single_joint_motions
-from stereoservo.calibration.examination.reference_model import frame_noise, learn_reference
-from stereoservo.calibration.examination.stamp_offsets import course
+from stereoservo.calibration.examination.recorded_views import examined_frames, gaps, single_joint_motions
+from stereoservo.calibration.examination.reference_model import course, frame_noise, learn_reference
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo_sim.experiments.examined_recordings import (

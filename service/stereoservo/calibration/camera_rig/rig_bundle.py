@@ -15,9 +15,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.bundle_adjustment import Solution, solve
-from stereoservo.calibration.camera_rig.initialization import RigStart
-from stereoservo.calibration.camera_rig.views import RigViews
-from stereoservo.calibration.joint_errors.joint_noise import joint_columns
+from stereoservo.calibration.camera_rig.views import RigViews, refused
+from stereoservo.calibration.initial_reconstruction import (
+    NOMINAL_FOCALS,
+    initial_reconstruction,
+    intrinsics_linear,
+    nominal_intrinsics,
+    planes_at_infinity,
+    scaled_plane,
+)
+from stereoservo.calibration.joint_noise import joint_columns
+from stereoservo.calibration.least_squares import DenseFit, Limits, column_root, minimise
+from stereoservo.calibration.lens_estimation import epipolar_lenses, undistorted
 from stereoservo.calibration.rig_model import (
     JointNoise,
     Measurements,
@@ -28,10 +37,308 @@ from stereoservo.calibration.rig_model import (
     residuals,
     rig_at,
 )
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.geometry.cameras import pixel_normaliser
+from stereoservo.geometry.displacements import similarity_from_points
+from stereoservo.geometry.distortion import lens_from_lines, straight_lens, undistort
+from stereoservo.geometry.homogeneous import GeometryError
+from stereoservo.geometry.homography import homography_from_points, plane_homography
 from stereoservo.geometry.screws import twist_matrix
-from stereoservo.geometry.strata import decompose_camera
+from stereoservo.geometry.strata import decompose_camera, projective_to_euclidean
 from stereoservo.kinematics.parameterization import Kind, LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+FOCAL_RANGE = (0.8, 20.0)
+"""Focal lengths [half image widths] that a start may have; beyond it is a nominal one."""
+LINE_MARKERS = 5
+"""Markers on a line of a layout from which its image shows the lens."""
+LINES = 16
+"""About as many lines, evenly spread over the views, start a lens."""
+ON_LINE = 1e-6
+"""Distance from a line, relative to the layout's size, up to which a marker is on it."""
+
+
+@dataclass(frozen=True)
+class RigStart:
+    """Start of a bundle: ``cameras`` (c, 3, 4) in the first one's frame, ``poses`` (s, 4, 4) of the body in it,
+    ``points`` (m, 3) on the body, ``lenses`` (c, 4). Lengths in metres where the layout is known,
+    else in a unit of their own; the body is then at rest at stop ``reference``.
+    """
+
+    cameras: FloatArray
+    poses: FloatArray
+    points: FloatArray
+    lenses: FloatArray
+    reference: int | None
+
+
+def rigid(R: FloatArray, t: FloatArray) -> FloatArray:
+    """Motion (4, 4) of a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def starts(views: RigViews) -> list[RigStart]:
+    """Starts of the bundle, the best first. Raises CalibrationError where the views allow none."""
+    return [_start_of_layout(views)] if views.layout is not None else _starts_of_body(views)
+
+
+# -- a board of known layout --------------------------------------------------------------------------------
+
+
+def _start_of_layout(views: RigViews) -> RigStart:
+    assert views.layout is not None
+    lenses = np.array([_line_lens(views, k) for k in range(len(views.cameras))])
+    frame, plane = _in_plane(views.layout)
+    homographies = plane_homographies(views, lenses, plane)
+    focals = np.array(
+        [_focal(views, k, homographies[k]) for k in range(len(views.cameras))], dtype=np.float64
+    )
+    c, s = homographies.shape[:2]
+    poses = np.full((c, s, 4, 4), np.nan)
+    for k in range(c):
+        for stop in np.flatnonzero(np.isfinite(homographies[k]).all(axis=(1, 2))):
+            poses[k, stop] = _plane_pose(homographies[k, stop], focals[k], lenses[k, 1:3]) @ frame
+    extrinsics = _extrinsics(poses)
+    counts = views.seen.sum(axis=2)
+    best = np.argmax(counts, axis=0)
+    body = np.array([np.linalg.inv(extrinsics[best[i]]) @ poses[best[i], i] for i in range(s)])
+    cameras = np.array([_pinhole(focals[k], lenses[k, 1:3]) @ extrinsics[k][:3] for k in range(c)])
+    return RigStart(cameras, body, views.layout.copy(), lenses, None)
+
+
+def _pinhole(focal: float, centre: FloatArray) -> FloatArray:
+    return np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
+
+
+def _in_plane(layout: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Motion (4, 4) of the layout into its plane z = 0, and its coordinates (m, 2) there."""
+    middle = layout.mean(axis=0)
+    rows = np.linalg.svd(layout - middle)[2]
+    rows[2] *= np.linalg.det(rows)
+    frame = rigid(rows, -rows @ middle)
+    return frame, (layout - middle) @ rows[:2].T
+
+
+def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -> FloatArray:
+    """Homographies (c, s, 3, 3) from the plane (m, 2) to ideal pixels; NaN where a camera did not see it."""
+    c, s, _ = views.sigmas.shape
+    found = np.full((c, s, 3, 3), np.nan)
+    for k in range(c):
+        ideal = undistort(lenses[k], views.pixels[k])
+        for stop in range(s):
+            there = np.isfinite(ideal[stop]).all(axis=1)
+            if int(there.sum()) >= 4:
+                try:
+                    found[k, stop] = plane_homography(plane[there], ideal[stop, there])
+                except GeometryError:
+                    continue  # the markers that this picture shows are on one line: it starts nothing
+    return found
+
+
+def _line_lens(views: RigViews, k: int) -> FloatArray:
+    """Lens (4,) of camera k by the images of the layout's straight lines; without distortion where there are none."""
+    camera, lines = views.cameras[k], []
+    for members in _layout_lines(views.layout):
+        for raw in views.pixels[k][:, members]:
+            there = raw[np.isfinite(raw).all(axis=1)]
+            if len(there) >= LINE_MARKERS:
+                lines.append(there)
+    lines = lines[:: max(1, len(lines) // LINES)]
+    if lines:
+        sigma = float(np.median(views.sigmas[k][views.seen[k]]))
+        try:
+            found = lens_from_lines(lines, sigma, camera.width, camera.height).lens
+            # Lines hardly show the centre of a weak distortion, and the principal point goes with it.
+            return np.append(found[0], straight_lens(camera.width, camera.height)[1:])
+        except GeometryError:
+            pass  # the bundle finds the lens from a straight one, too
+    return straight_lens(camera.width, camera.height)
+
+
+def _layout_lines(layout: FloatArray | None) -> list[list[int]]:
+    """Markers of each line along the layout's own axes that has enough of them."""
+    if layout is None:
+        return []
+    size = float(np.ptp(layout, axis=0).max())
+    found = []
+    for axis in range(3):
+        others = np.delete(layout, axis, axis=1)
+        keys = np.round(others / (ON_LINE * size)).astype(np.int64)
+        for key in np.unique(keys, axis=0):
+            members = np.flatnonzero((keys == key).all(axis=1)).tolist()
+            if len(members) >= LINE_MARKERS:
+                found.append(members)
+    return found
+
+
+def _focal(views: RigViews, k: int, homographies: FloatArray) -> float:
+    """Focal length [px] by the circular points of all places, principal point in the middle; nominal where they do
+    not show it: ``h₁ᵀ ω h₂ = 0``, ``h₁ᵀ ω h₁ = h₂ᵀ ω h₂``, linear in 1/f².
+    """
+    camera = views.cameras[k]
+    N = pixel_normaliser(camera.width, camera.height)
+    rows, right = [], []
+    for H in homographies[np.isfinite(homographies).all(axis=(1, 2))]:
+        G = N @ H
+        a, b = G[:, 0], G[:, 1]
+        size = float(np.linalg.norm(a) * np.linalg.norm(b))
+        rows += [(a[:2] @ b[:2]) / size, (a[:2] @ a[:2] - b[:2] @ b[:2]) / size]
+        right += [-a[2] * b[2] / size, -(a[2] ** 2 - b[2] ** 2) / size]
+    square = float(np.dot(rows, right) / max(float(np.dot(rows, rows)), 1e-300))
+    focal = 1.0 / np.sqrt(square) if square > 0.0 else NOMINAL_FOCALS[0]
+    if not FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1]:
+        focal = NOMINAL_FOCALS[0]
+    return float(focal) * camera.width / 2.0
+
+
+def _plane_pose(H: FloatArray, focal: float, centre: FloatArray) -> FloatArray:
+    """Pose (4, 4) of the plane z = 0 whose homography to ideal pixels is ``H`` (3, 3)."""
+    M = np.linalg.solve(_pinhole(focal, centre), H)
+    M = M / np.sqrt(np.linalg.norm(M[:, 0]) * np.linalg.norm(M[:, 1])) * (np.sign(M[2, 2]) or 1.0)
+    U, _, Vt = np.linalg.svd(np.column_stack([M[:, 0], M[:, 1], np.cross(M[:, 0], M[:, 1])]))
+    return rigid(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, M[:, 2])
+
+
+def _extrinsics(poses: FloatArray) -> FloatArray:
+    """Motions (c, 4, 4) from the first camera's frame into each, along the pairs with most places in common."""
+    c = len(poses)
+    there = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
+    found = np.full((c, 4, 4), np.nan)
+    found[0], done = np.eye(4), {0}
+    while len(done) < c:
+        common = [(int((there[j] & there[k]).sum()), j, k) for j in done for k in range(c) if k not in done]
+        count, j, k = max(common)
+        if not count:
+            raise refused(
+                "camera_apart", "a camera has no place of the board in common with another", 0, 1, " places",
+                "Hold it where two cameras at a time see it",
+            )  # fmt: skip
+        both = np.flatnonzero(there[j] & there[k])
+        motions = np.array([poses[k, i] @ np.linalg.inv(poses[j, i]) for i in both])
+        turns = Rotation.from_matrix(motions[:, :3, :3])
+        apart = [np.median((turns * turns[i].inv()).magnitude()) for i in range(len(both))]
+        found[k] = motions[int(np.argmin(apart))] @ found[j]
+        done.add(k)
+    return found
+
+
+# -- a body that nobody has measured ------------------------------------------------------------------------
+
+
+def _starts_of_body(views: RigViews) -> list[RigStart]:
+    trials = TrialData(
+        (), (), views.cameras, views.marker_ids, np.zeros((len(views.names), 0)),
+        np.full(len(views.names), -1), views.pixels, views.sigmas,
+    )  # fmt: skip
+    found, failure = [], None
+    for lenses in (
+        epipolar_lenses(trials),
+        np.array([straight_lens(c.width, c.height) for c in views.cameras]),
+    ):
+        try:
+            found += _starts_through(views, trials, lenses)
+        except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
+            failure = failure or error
+    if not found and failure is not None:
+        raise failure
+    return found
+
+
+def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> list[RigStart]:
+    """Starts with these ``lenses`` (c, 4): noise of a pixel shows others than there are, and where a bundle from those
+    comes to nothing, one without distortion may."""
+    cameras, points, _ = initial_reconstruction(undistorted(trials, lenses))
+    there = np.asarray(np.isfinite(points).all(axis=2))
+    reference = int(np.argmax((there[:, None] & there[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
+    motions = _displacements(points, reference)
+    plane, _, _ = planes_at_infinity(motions - np.eye(4), np.ones(len(motions)))
+    everywhere = points[there]
+    scaled = scaled_plane(plane, everywhere)
+    if scaled is None:
+        scaled = scaled_plane(np.array([0.0, 0.0, 0.0, 1.0]), everywhere)
+    if scaled is None:
+        raise refused(
+            "no_upgrade", "no plane at infinity leaves the body in front of the cameras", 0, 1, " planes",
+            "Turn the body about two axes, by 30 degrees or more, and hold it still for each picture",
+        )  # fmt: skip
+    A = projective_to_euclidean(scaled, np.eye(3))
+    affine = A @ motions @ np.linalg.inv(A)
+    turning = 0.5 * (affine - np.linalg.inv(affine))
+    linear, _ = intrinsics_linear(turning, np.ones(len(turning), dtype=bool), np.ones(len(turning)))
+    focals = [] if linear is None else [float(np.sqrt(linear[0, 0] * linear[1, 1]))]
+    focals = [f for f in focals if FOCAL_RANGE[0] <= f <= FOCAL_RANGE[1]] + list(NOMINAL_FOCALS)
+    return [
+        _metric_start(views, cameras, points, reference, scaled, nominal_intrinsics(f), lenses)
+        for f in focals
+    ]
+
+
+def _displacements(points: FloatArray, reference: int) -> FloatArray:
+    """Projective displacements (k, 4, 4), of determinant 1, from the reference place to others.
+
+    Raises CalibrationError (``flat_body``, ``too_few_markers``).
+    """
+    there, found, flat = np.asarray(np.isfinite(points).all(axis=2)), [], 0
+    for stop in range(len(points)):
+        common = there[stop] & there[reference]
+        if stop == reference or int(common.sum()) < 6:
+            continue
+        try:
+            H = homography_from_points(points[reference, common], points[stop, common])
+        except GeometryError as error:
+            if error.code != "degenerate":
+                raise
+            flat += 1
+            continue
+        found.append(H if np.linalg.det(H) > 0 else -H)
+    if len(found) < 2:
+        if flat:
+            raise refused(
+                "flat_body", "the markers lie in one plane within their noise: places that show the body's depth",
+                len(found), 2, " places",
+                "State the layout (--board with --pitch, or --layout), or use a body with markers off one plane",
+            )  # fmt: skip
+        raise refused(
+            "too_few_markers", "too few places show six markers in two cameras", len(found), 2, " places",
+            "Turn the body so that two cameras at a time see the same six markers",
+        )  # fmt: skip
+    return np.array(found)
+
+
+def _metric_start(
+    views: RigViews, cameras: FloatArray, points: FloatArray, reference: int, plane: FloatArray,
+    intrinsics: FloatArray, lenses: FloatArray,
+) -> RigStart:  # fmt: skip
+    """The start in the Euclidean frame of ``plane`` (4,) and ``intrinsics`` (3, 3) [half widths]."""
+    upgrade = projective_to_euclidean(plane, intrinsics)
+    matrices = cameras @ np.linalg.inv(upgrade)
+    X = points @ upgrade.T
+    X = X[..., :3] / X[..., 3:]
+    there = np.asarray(np.isfinite(X).all(axis=2))
+    poses = np.full((len(X), 4, 4), np.nan)
+    poses[reference] = np.eye(4)
+    body = X[reference].copy()
+    for _ in range(len(X)):
+        known = np.asarray(np.isfinite(body).all(axis=1))
+        open_stops = np.flatnonzero(~np.isfinite(poses[:, 0, 0]))
+        if not len(open_stops):
+            break
+        stop = int(open_stops[np.argmax((there[open_stops] & known).sum(axis=1))])
+        common = there[stop] & known
+        try:
+            poses[stop] = similarity_from_points(body[common], X[stop, common], scaled=False)
+        except GeometryError:
+            break  # the rest shows too little of what is known: left out
+        new = there[stop] & ~known
+        body[new] = (X[stop, new] - poses[stop, :3, 3]) @ poses[stop, :3, :3]
+    # The first camera is K [I | 0] in this frame. The others' matrices are not of square pixels yet: the bundle's ties
+    # make them so from where they explain the images.
+    return RigStart(
+        matrices / np.linalg.norm(matrices[:, 2, :3], axis=1)[:, None, None], poses, body, lenses, reference
+    )
+
 
 HAND: tuple[Kind, ...] = ("prismatic",) * 3 + ("revolute",) * 3
 TIED = 1e-2
@@ -47,7 +354,8 @@ ASPECT_GAIN = 25.0
 """Chi-square that pixels which are not square must gain to be believed, beside 2 for each camera."""
 ASPECT_ROUNDS = 3
 EVALUATIONS = 150
-POSE_STEPS = 30
+POSE = Limits(evaluations=40, tolerance=1e-6)
+"""Of the fit of one pose."""
 FRAMES = 60
 """Frames of the body among which the one is taken in which its middle angle stays farthest from a quarter turn."""
 
@@ -110,9 +418,7 @@ class RigFit(RigProblem):
     @cached_property
     def root(self) -> FloatArray:
         """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance that residuals show."""
-        sizes = self.solution.sizes
-        inverse = np.linalg.inv(self.solution.triangle / sizes) / sizes[:, None]
-        return np.asarray(inverse * np.sqrt(self.variance))
+        return np.asarray(self.solution.determined.root * np.sqrt(self.variance))
 
     def moved(self, x: FloatArray) -> RigModel:
         """The model at chart coordinates ``x`` (p,)."""
@@ -124,13 +430,8 @@ class RigFit(RigProblem):
         rows = joint_columns(self.rig, data)
         found = np.full((len(self.views.names), 6), np.inf)
         for stop in np.unique(data.stop):
-            mine = np.repeat(data.stop == stop, 2)
-            J = rows[mine]
-            sizes = np.linalg.norm(J, axis=0)
-            sizes[sizes == 0.0] = 1.0
-            values, vectors = np.linalg.eigh((J / sizes).T @ (J / sizes))
-            spread = (vectors**2 / np.maximum(values, 1e-300)).sum(axis=1)
-            found[stop] = np.sqrt(self.variance * spread) / sizes
+            root = column_root(rows[np.repeat(data.stop == stop, 2)], bounded=True)
+            found[stop] = np.sqrt(self.variance) * np.linalg.norm(root, axis=1)
         return found
 
 
@@ -213,38 +514,23 @@ def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeT
 
 
 def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
-    """The measurements with the hand's readings at the least residuals of each stop, cameras and body as they are:
-    Levenberg-Marquardt of each stop on its own, for the bundle does not damp the hand's errors.
+    """The measurements with the hand's readings at the least residuals of each stop, cameras and body as they are: each
+    stop on its own, for the bundle does not damp the hand's errors.
     """
-    s = len(data.offsets)
-    damping = np.full(s, 1e-3)
+    offsets = data.offsets.copy()
+    for stop in np.unique(data.stop):
+        mine = data.select(data.stop == stop)
+        offsets[stop] = _settled_pose(rig, replace(mine, stop=np.zeros_like(mine.stop)), offsets[stop])
+    return replace(data, offsets=offsets)
 
-    def squares(error: FloatArray) -> FloatArray:
-        found = np.bincount(data.stop, (error.reshape(-1, 2) ** 2).sum(axis=1), s)
-        return np.where(np.isfinite(found), found, np.inf)
 
-    error = residuals(rig, data)
-    cost = squares(error)
-    for _ in range(POSE_STEPS):
-        J = joint_columns(rig, data)
-        stop = np.repeat(data.stop, 2)
-        normal, gradient = np.zeros((s, 6, 6)), np.zeros((s, 6))
-        np.add.at(normal, stop, J[:, :, None] * J[:, None, :])
-        np.add.at(gradient, stop, J * error[:, None])
-        scale = np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-12)
-        damped = normal + np.eye(6) * (damping[:, None] * scale)[:, None, :]
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial = replace(data, offsets=data.offsets - step)
-        there = residuals(rig, trial)
-        found = squares(there)
-        better = found < cost
-        done = cost - found <= 1e-6 * cost
-        data = replace(data, offsets=np.where(better[:, None], trial.offsets, data.offsets))
-        error = np.where(better[stop], there, error)
-        cost, damping = np.where(better, found, cost), damping * np.where(better, 0.1, 10.0)
-        if done.all():
-            break
-    return data
+def _settled_pose(rig: RigModel, data: Measurements, reading: FloatArray) -> FloatArray:
+    fit = DenseFit[FloatArray](
+        lambda q: residuals(rig, replace(data, offsets=q[None]))[:, None],
+        lambda q: joint_columns(rig, replace(data, offsets=q[None]))[:, None],
+        np.add,
+    )
+    return minimise(fit, reading, POSE).state
 
 
 def _rig(start: RigStart, body_frame: FloatArray) -> RigModel:

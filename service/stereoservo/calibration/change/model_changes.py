@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from stereoservo.calibration.bundle_adjustment import jacobian
-from stereoservo.calibration.joint_errors.joint_noise import error_columns
-from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
+from stereoservo.calibration.joint_noise import error_columns
+from stereoservo.calibration.least_squares import DenseFit, Limits, column_root, estimate_beside, minimise
 from stereoservo.calibration.normal_equations import triangle_of
 from stereoservo.calibration.rig_model import (
     Charts,
@@ -30,6 +31,7 @@ from stereoservo.calibration.rig_model import (
     residuals,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.kinematics.parameterization import lens_model_of
 from stereoservo.messages.check_report import CauseKind
@@ -37,7 +39,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 STEP = 1e-6
 """Step of the finite differences, relative to the size of the scene."""
-ROUNDS, HALVINGS = 10, 6
+EVALUATIONS = 60
 SETTLED = 1e-3
 """Last step [sigmas] at which an estimate has converged."""
 
@@ -79,6 +81,11 @@ class LinearisedProblem:
         found: FloatArray = rows - self.uncertainty @ (self.uncertainty.T @ rows)
         return found
 
+    @cached_property
+    def white(self) -> Callable[[FloatArray], FloatArray]:
+        """Rows by a root of that weight, `whitening`."""
+        return whitening(self.uncertainty)
+
     def select(self, keep: npt.NDArray[np.bool_]) -> LinearisedProblem:
         """The problem with only the pixels where ``keep`` (k,) holds."""
         root = unbounded(self.uncertainty)
@@ -92,6 +99,13 @@ def bounded(A: FloatArray) -> FloatArray:
     triangle = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
     bound: FloatArray = np.linalg.solve(triangle, A.T).T
     return bound
+
+
+def whitening(B: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Rows (2 k, q) by ``T``, the symmetric root of ``I - B Bᵀ``, of which ``B`` is :func:`bounded`."""
+    values, vectors = np.linalg.eigh(B.T @ B)
+    inner = (vectors / (1.0 + np.sqrt(np.maximum(1.0 - values, 0.0)))) @ vectors.T
+    return lambda rows: rows - B @ (inner @ (B.T @ rows))
 
 
 def unbounded(B: FloatArray) -> FloatArray:
@@ -218,13 +232,8 @@ def _curvature_uncertainty(
     """Like `_stated_uncertainty`, from the curvature of the calibration's own least squares at the model."""
     charts = full_charts(rig, model.stratum, lenses=lens_model_of(rig.lenses))
     triangle = triangle_of(rig, charts, past)[:-1, :-1]
-    sizes = np.linalg.norm(triangle, axis=0)
-    sizes[sizes == 0.0] = 1.0
-    # A direction that the calibration left open has a large finite deviation here instead of none.
-    finite = np.linalg.qr(np.vstack([triangle / sizes, 1e-7 * np.eye(charts.size)]), mode="r")
-    slopes = jacobian(rig, charts, np.zeros(charts.size), data) / sizes
-    uncertainty: FloatArray = slopes @ np.linalg.inv(np.asarray(finite))
-    return uncertainty
+    slopes = jacobian(rig, charts, np.zeros(charts.size), data)
+    return np.asarray(slopes @ column_root(triangle, bounded=True))
 
 
 # -- the hypotheses -----------------------------------------------------------------------------------------
@@ -330,6 +339,11 @@ class ChangeEstimate:
     left: FloatArray
     effects_px: tuple[float, ...]
 
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (q, q); of directions that the pixels leave open none."""
+        return np.asarray(np.linalg.pinv(self.information))
+
 
 def start_state(problem: LinearisedProblem) -> State:
     """The state of the unchanged model."""
@@ -360,24 +374,7 @@ def change_jacobian(
 def first_order_gain(problem: LinearisedProblem, cause: ModelChange, here: FloatArray) -> float:
     """Reduction of chi-square by one change, to first order."""
     slopes = change_jacobian(problem, (cause,), np.zeros(cause.size), here)
-    whitened = problem.whitened(slopes)
-    moment = whitened.T @ here
-    information = slopes.T @ whitened
-    return float(moment @ np.linalg.lstsq(information, moment, rcond=None)[0])
-
-
-def lowering_step(
-    x: FloatArray, step: FloatArray, cost: float, seen: Callable[[FloatArray], tuple[FloatArray, float]]
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """The ``step`` from ``x`` (q,), halved until the cost is no more than ``cost``, with the residuals and the cost
-    that are ``seen`` there; None where `HALVINGS` do not lower it.
-    """
-    for _ in range(HALVINGS):
-        here, less = seen(x + step)
-        if less <= cost:
-            return step, here, less
-        step = 0.5 * step
-    return None
+    return estimate_beside(problem.white(np.column_stack([slopes, here]))).gain
 
 
 def estimate_changes(
@@ -387,25 +384,17 @@ def estimate_changes(
     own uncertainty in the weights.
     """
 
-    def seen(x: FloatArray) -> tuple[FloatArray, float]:
-        here = problem.residuals_at(changed_state(problem, found, x))
-        return here, float(here @ problem.whitened(here))
+    def seen(x: FloatArray) -> FloatArray:
+        return problem.residuals_at(changed_state(problem, found, x))
 
+    fit = DenseFit[FloatArray](
+        lambda x: problem.white(seen(x))[:, None],
+        lambda x: problem.white(change_jacobian(problem, found, x, seen(x)))[:, None],
+        np.add,
+    )
     x = np.zeros(sum(cause.size for cause in found)) if start is None else start
-    here, chi2 = seen(x)
-    slopes = change_jacobian(problem, found, x, here)
-    for _ in range(ROUNDS):
-        whitened = problem.whitened(slopes)
-        information = slopes.T @ whitened
-        step = np.asarray(-np.linalg.lstsq(information, whitened.T @ here, rcond=None)[0], dtype=np.float64)
-        lower = lowering_step(x, step, chi2, seen)
-        if lower is None:
-            break
-        step, here, chi2 = lower
-        x = x + step
-        slopes = change_jacobian(problem, found, x, here)
-        if float(step @ information @ step) < SETTLED**2:
-            break
+    end = minimise(fit, x, Limits(EVALUATIONS, 0.0, SETTLED**2))
+    x = end.state
     before = problem.residuals_at(start_state(problem))
     effects, at = [], 0
     for cause in found:
@@ -413,4 +402,5 @@ def estimate_changes(
         change = (alone - before).reshape(-1, 2) * problem.data.sigmas[:, None]
         effects.append(float(np.sqrt((change**2).mean())))
         at += cause.size
-    return ChangeEstimate(found, x, slopes.T @ problem.whitened(slopes), chi2, here, tuple(effects))
+    rows = fit.rows(x)[:, :-1]
+    return ChangeEstimate(found, x, rows.T @ rows, end.cost, seen(x), tuple(effects))

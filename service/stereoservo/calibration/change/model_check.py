@@ -4,15 +4,26 @@ has changed and by how much, as a report.
 Under a valid model the residuals are Gaussian with the stated noise and the model's own uncertainty. A chi-square test
 rejects the model; likelihood ratios, by the decision that the on-line monitor uses too (`hypothesis_test`), name what
 has changed: camera, cameras together, marker body, marker or joint zero.
+
+Reset of joint zeros: a new model in which the zeros of drifted joints are moved by the drifts that a check
+estimated.
+
+Nothing else of the model changes. Its covariance is extended by that of the drifts and their correlation with the
+errors of the model.
+
+Trends of a model over successive checks: weighted straight lines through the estimates of each change, the most
+significant one, and the time when it reaches the limit.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import combinations
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
@@ -31,17 +42,22 @@ from stereoservo.calibration.change.model_changes import (
     ChangeEstimate,
     LinearisedProblem,
     ModelChange,
+    change_jacobian,
+    changed_state,
+    covariance_jacobian,
     estimate_changes,
     first_order_gain,
     linearised_problem,
     possible_changes,
     start_state,
+    unbounded,
+    with_corrected_zeros,
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.kinematics.joint_angles import AMBIGUOUS, joint_zeros
+from stereoservo.kinematics.joint_angles import AMBIGUOUS, LARGEST_DEVIATION, joint_zeros
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
-from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.check_report import CheckReport, Drift, FoundCause, Status
+from stereoservo.kinematics.model import CellModel, ModelCovariance
+from stereoservo.messages.check_report import CheckReport, Drift, FoundCause, JointReset, Status, ZeroReset
 from stereoservo.numerics.arrays import FloatArray
 
 ALPHA = 0.003
@@ -335,12 +351,7 @@ def make_check_report(
 
 def _model_variance(problem: LinearisedProblem) -> FloatArray:
     """Variance (k,) that the model's uncertainty adds to each pixel, in units of the pixel's own."""
-    if not problem.uncertainty.shape[1]:
-        return np.zeros(len(problem.data.camera))
-    inner = np.eye(problem.uncertainty.shape[1]) - problem.uncertainty.T @ problem.uncertainty
-    rows = np.linalg.solve(np.linalg.cholesky(inner), problem.uncertainty.T)
-    found: FloatArray = (rows**2).sum(axis=0).reshape(-1, 2).mean(axis=1)
-    return found
+    return np.asarray((unbounded(problem.uncertainty) ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1))
 
 
 def _drift(problem: LinearisedProblem, cause: ModelChange) -> Drift:
@@ -359,7 +370,7 @@ def _found_cause(model: CellModel, problem: LinearisedProblem, found: ChangeEsti
     cause = found.changes[i]
     at = sum(other.size for other in found.changes[:i])
     x = found.x[at : at + cause.size]
-    covariance = np.linalg.pinv(found.information)[at : at + cause.size, at : at + cause.size]
+    covariance = found.covariance[at : at + cause.size, at : at + cause.size]
     others = tuple(other for other in found.changes if other is not cause)
     ratio = estimate_changes(problem, others).chi2 - found.chi2
     value = deviation = None
@@ -466,3 +477,272 @@ def _message(
     if status == "drifting":
         return f"model holds, but it drifts: {because}; below the limit of {limit_px:g} px. {said[0].upper()}{said[1:]}"
     return f"recalibrate because {because}. {said[0].upper()}{said[1:]}"
+
+
+DISTINGUISHABLE = 25.0
+"""Chi-square by which another joint must explain the check worse than the one that is reset."""
+
+
+def reset_zeros(
+    examined: ModelExamination, report: CheckReport, *, epoch: int, created: str = ""
+) -> tuple[CellModel, ZeroReset]:
+    """New model of epoch ``epoch`` with the zeros of drifted joints moved, and what was moved.
+
+    Raises CalibrationError: ``check_holds`` where nothing drifted, ``other_cause`` where anything but joint zeros
+    changed, ``not_observable`` with the ``joints`` that the check does not distinguish or not determine well enough.
+    """
+    _must_be_zeros(report)
+    model, found = examined.model, examined.explanation
+    # Again at the true joint positions: far zeros change what the model's own uncertainty does to the pixels.
+    problem = with_corrected_zeros(
+        examined.problem, model, changed_state(examined.problem, found.changes, found.x)[1]
+    )
+    rest = estimate_changes(problem, found.changes)
+    drift = found.x + rest.x
+    at = [model.joint_names.index(cause.subject) for cause in found.changes]
+    covariance = rest.covariance
+    deviations = np.sqrt(np.diag(covariance))
+    _must_be_observable(examined, deviations)
+    zero = model.zero.copy()
+    zero[at] -= drift
+    joints = tuple(
+        JointReset(
+            model.joint_names[j],
+            model.joint_kinds[j],
+            float(x),
+            float(s),
+            float(model.zero[j]),
+            float(zero[j]),
+        )
+        for j, x, s in zip(at, drift, deviations, strict=True)
+    )
+    stated = model.covariance
+    told = ", ".join(f"{joint.joint} {_amount(joint)}" for joint in joints)
+    source = f"{model.source or 'model'} (epoch {model.epoch}); zeros reset by a check"
+    source += f" at {report.created}" if report.created else ""
+    source += f": {told}" + (
+        "" if stated is not None else "; their uncertainty is not carried, the model had no covariance"
+    )
+    after = float(np.sqrt(rest.chi2 / max(1, report.measurements - drift.size)))
+    reset = ZeroReset(
+        epoch, model.epoch, joints, report.sigmas, after,
+        f"zeros reset in model epoch {epoch}: {told}; residuals {report.sigmas:.3g} times the expected noise before, "
+        f"{after:.3g} times after. Teach the goals of epoch {model.epoch} again",
+    )  # fmt: skip
+    return msgspec.structs.replace(
+        model, epoch=epoch, created=created, source=source, zero=zero, refined_from=0, in_place_of=0,
+        covariance=None if stated is None else _with_zeros(model, stated, problem, rest, covariance),
+    ), reset  # fmt: skip
+
+
+def _must_be_zeros(report: CheckReport) -> None:
+    if report.status == "holds" or not report.causes:
+        raise CalibrationError("check_holds", f"no joint zero is to be reset: {report.message}")
+    others = [cause.message for cause in report.causes if cause.kind != "joint"]
+    if others:
+        raise CalibrationError(
+            "other_cause",
+            f"a reset of joint zeros does not cure this: {'; '.join(others)}. Remove the cause, or calibrate anew",
+            causes=others,
+        )
+
+
+def _must_be_observable(examined: ModelExamination, deviations: FloatArray) -> None:
+    found, problem = examined.explanation, examined.problem
+    poor = [c.subject for c, s in zip(found.changes, deviations, strict=True) if s > LARGEST_DEVIATION]
+    if poor:
+        raise CalibrationError(
+            "not_observable",
+            f"the check does not tell the zero of {', '.join(poor)}: standard deviation above {LARGEST_DEVIATION:g} "
+            "rad or m. Markers farther from its axis, or another base, are needed",
+            joints=poor,
+        )
+    noise = max(1.0, found.chi2 / max(1, 2 * len(problem.data.camera) - found.x.size))
+    idle = [cause for cause in examined.hypotheses if cause.kind == "joint" and cause not in found.changes]
+    for i, cause in enumerate(found.changes):
+        for other in idle:
+            swapped = (*found.changes[:i], other, *found.changes[i + 1 :])
+            if estimate_changes(problem, swapped).chi2 - found.chi2 < DISTINGUISHABLE * noise:
+                raise CalibrationError(
+                    "not_observable",
+                    f"the check does not tell a drift of {cause.subject} from one of {other.subject}: at these stops "
+                    "both move the markers alike. Take a base where their axes are different lines, or calibrate anew",
+                    joints=[cause.subject, other.subject],
+                )
+
+
+def _amount(joint: JointReset) -> str:
+    if joint.kind == "revolute":
+        return f"by {np.degrees(joint.drift):+.4g}° ± {np.degrees(joint.deviation):.2g}°"
+    return f"by {joint.drift:+.5g} m ± {joint.deviation:.2g} m"
+
+
+def _with_zeros(
+    model: CellModel,
+    stated: ModelCovariance,
+    problem: LinearisedProblem,
+    found: ChangeEstimate,
+    own: FloatArray,
+) -> ModelCovariance:
+    """The model's covariance with that of its moved zeros, ``own`` (z, z), and between both.
+
+    A zero that is off by ``e`` moves what its joint carries by ``exp(e Ĥ)``: the generators of the joints behind it
+    in the chain and the markers, all with the same ``e``. The rest of what the check estimates is not used.
+    """
+    at = [model.joint_names.index(cause.subject) for cause in found.changes]
+    order = list(problem.order)
+    here = problem.residuals_at(changed_state(problem, found.changes, found.x))
+    weighted = problem.whitened(change_jacobian(problem, found.changes, found.x, here))
+    slopes, columns = covariance_jacobian(model, stated, problem.data)
+    sway = np.empty((len(at), len(stated.covariance)))
+    sway[:, columns] = -own @ (weighted.T @ slopes)
+    across = sway @ stated.covariance
+
+    rows: list[FloatArray] = []
+    p, z = len(stated.covariance), len(at)
+    start = 0
+
+    def widened(basis: FloatArray, more: list[tuple[int, FloatArray]]) -> FloatArray:
+        nonlocal start
+        for i in range(start, start + len(basis)):
+            rows.append(np.eye(p + z)[i])
+        start += len(basis)
+        for k, _ in more:
+            rows.append(np.eye(p + z)[p + k])
+        return np.concatenate([basis, np.array([d for _, d in more]).reshape(-1, *basis.shape[1:])])
+
+    def before(j: int) -> list[int]:
+        return [k for k, moved in enumerate(at) if order.index(moved) < order.index(j)]
+
+    generators = tuple(
+        widened(basis, [(k, model.generators[at[k]]) for k in before(j)])
+        for j, basis in enumerate(stated.generators)
+    )
+    cameras = tuple(widened(basis, []) for basis in stated.cameras)
+    lenses = tuple(widened(basis, []) for basis in stated.lenses)
+    markers = tuple(
+        widened(basis, [(k, model.generators[j] @ point) for k, j in enumerate(at)])
+        for basis, point in zip(stated.markers, model.marker_points, strict=True)
+    )
+    jacobian = np.array(rows)
+    whole = np.block([[stated.covariance, across.T], [across, own]])
+    return ModelCovariance(generators, cameras, lenses, markers, jacobian @ whole @ jacobian.T)
+
+
+MIN_CHECKS = 3
+TREND_ALPHA = 0.003
+"""Probability that constant estimates are reported to grow, over all changes."""
+DAY_S = 86_400.0
+FAR_DAYS = 3650.0
+"""Horizon beyond which no crossing is reported."""
+
+
+class DriftTrend(msgspec.Struct, frozen=True):
+    """A change that grows from check to check. ``ratio``: chi-square of its slope with ``freedoms``; ``px_a_day`` as
+    it shows in the images; ``days``: until it reaches the limit, 0 where it has, None where it is too far away or
+    shrinks.
+    """
+
+    kind: str
+    subject: str
+    checks: int
+    ratio: float
+    freedoms: int
+    px_a_day: float
+    days: float | None
+    message: str
+
+
+def find_trend(history: Sequence[CheckReport]) -> DriftTrend | None:
+    """The most significant trend over the checks of the newest one's model, oldest first.
+
+    Reports without a time, or of other models, do not count. None where nothing grows.
+    """
+    if not history:
+        return None
+    same = [check for check in history if check.model_epoch == history[-1].model_epoch and check.created]
+    if len(same) < MIN_CHECKS:
+        return None
+    first = datetime.fromisoformat(same[0].created)
+    days = np.array(
+        [(datetime.fromisoformat(check.created) - first).total_seconds() / DAY_S for check in same]
+    )
+    if np.ptp(days) <= 0.0:
+        return None
+    price = np.log(float(sum(check.measurements for check in same)))
+    found: list[tuple[float, DriftTrend]] = []
+    subjects = [(drift.kind, drift.subject) for drift in same[-1].drifts]
+    for kind, subject in subjects:
+        line = [_drift_of(check, kind, subject) for check in same]
+        if any(drift is None or len(drift.x) != len(line[-1].x) for drift in line if line[-1] is not None):
+            continue
+        grown = _fit_line([drift for drift in line if drift is not None], days, same[-1].limit_px)
+        if grown is None:
+            continue
+        score = grown.ratio - grown.freedoms * price
+        if score > 0 and chi2_distribution.sf(grown.ratio, grown.freedoms) < TREND_ALPHA / len(subjects):
+            found.append((score, grown))
+    return max(found, key=lambda entry: entry[0])[1] if found else None
+
+
+def _drift_of(check: CheckReport, kind: str, subject: str) -> Drift | None:
+    return next((drift for drift in check.drifts if (drift.kind, drift.subject) == (kind, subject)), None)
+
+
+def _matrix(drift: Drift) -> FloatArray:
+    q = len(drift.x)
+    upper = np.zeros((q, q))
+    upper[np.triu_indices(q)] = drift.information
+    full: FloatArray = upper + upper.T - np.diag(np.diag(upper))
+    return full
+
+
+def _fit_line(line: list[Drift], days: FloatArray, limit_px: float) -> DriftTrend | None:
+    """Weighted line ``x = a + b t`` through the estimates, and when it crosses the limit."""
+    q = len(line[0].x)
+    normal = np.zeros((2 * q, 2 * q))
+    right = np.zeros(2 * q)
+    for drift, day in zip(line, days, strict=True):
+        information, x = _matrix(drift), np.array(drift.x)
+        row = np.hstack([np.eye(q), day * np.eye(q)])
+        normal += row.T @ information @ row
+        right += row.T @ (information @ x)
+    covariance = np.linalg.pinv(normal)
+    both = covariance @ right
+    a, b = both[:q], both[q:]
+    ratio = float(b @ np.linalg.pinv(covariance[q:, q:]) @ b)
+    last = line[-1]
+    information = _matrix(last)
+    size = float(np.sqrt(max(np.array(last.x) @ information @ np.array(last.x), 0.0)))
+    if size == 0.0:
+        return None
+    # The information is, but for the model's own uncertainty, the pixels' quadratic form.
+    scale = last.effect_px / size
+    now = a + b * days[-1]
+    aa, ab, bb = (float(u @ information @ v) * scale**2 for u, v in ((now, now), (now, b), (b, b)))
+    left = _crossing(aa, ab, bb, limit_px)
+    speed = float(np.sqrt(bb))
+    what = {"joint": "the zero of joint {}", "camera": "the place of camera {}", "cameras": "the place of the cameras",
+            "body": "the place of the marker body"}[last.kind].format(last.subject)  # fmt: skip
+    text = f"{what} has changed steadily over {len(line)} checks, by {speed * 30:.3g} px a month"
+    if left == 0.0:
+        text += f"; it is beyond the limit of {limit_px:g} px"
+    elif left is not None:
+        text += f"; it will cross the limit of {limit_px:g} px in about {_span(left)}"
+    return DriftTrend(last.kind, last.subject, len(line), ratio, q, speed, left, text)
+
+
+def _crossing(aa: float, ab: float, bb: float, limit: float) -> float | None:
+    """First time [days] from now at which ``|now + b t|`` reaches ``limit``."""
+    if aa >= limit**2:
+        return 0.0
+    if bb <= 0.0:
+        return None
+    days = (-ab + np.sqrt(max(ab * ab - bb * (aa - limit**2), 0.0))) / bb
+    return float(days) if 0.0 <= days < FAR_DAYS else None
+
+
+def _span(days: float) -> str:
+    if days < 2.0:
+        return f"{days * 24:.0f} hours"
+    return f"{days:.0f} days" if days < 60.0 else f"{days / 30:.0f} months"

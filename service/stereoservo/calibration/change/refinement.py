@@ -21,13 +21,12 @@ from stereoservo.calibration.change.model_changes import (
     bounded,
     covariance_charts,
     joint_uncertainty,
-    lowering_step,
+    whitening,
 )
 from stereoservo.calibration.change.model_check import examine_model, make_check_report
+from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.calibration.rig_model import (
-    Charts,
     Measurements,
-    RigModel,
     acting_order,
     own_acting_rig,
     residuals,
@@ -52,7 +51,7 @@ FOLDS = 4
 """One in so many poses is held out of an estimate and judges it, in turn (cross-validation)."""
 LEAST_KNOWLEDGE = 0.01
 """Information of the poses about a direction, relative to the prior's, below which its step is not tested."""
-ROUNDS = 20
+EVALUATIONS = 40
 SETTLED = 1e-3
 """Last step [sigmas of the prior] at which the estimate has converged."""
 
@@ -163,7 +162,7 @@ class RefinementStep:
 def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     """Maximum a posteriori estimate by ``data``, its joints in the model's acting order, with the prior of ``base``.
 
-    Gauss-Newton in coordinates z of unit covariance, ``x = L z``: least ``zᵀz + rᵀ W r``, with the errors of the joints
+    In coordinates z of unit covariance, ``x = L z``: least ``zᵀz + rᵀ W r``, with the errors of the joints
     in the weights W. Raises NoCovarianceError.
     """
     stated = base.covariance
@@ -173,27 +172,17 @@ def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     rig, charts, columns = covariance_charts(base, stated)
     axes = covariance_axes(base)
     L = axes[columns]
-    B = bounded(joint_uncertainty(base, data, order))
-
-    def seen(z: FloatArray) -> tuple[FloatArray, float]:
-        error = residuals(rig_at(rig, charts, L @ z), data)
-        return error, float(z @ z) + _squares(error, B)
-
-    z = np.zeros(L.shape[1])
-    error, cost = seen(z)
-    for _ in range(ROUNDS):
-        slopes, J = _slopes(rig, charts, L, z, data, B)
-        M = J.T @ slopes
-        step = np.asarray(np.linalg.solve(np.eye(len(z)) + M, -(slopes.T @ error) - z), dtype=np.float64)
-        lower = lowering_step(z, step, cost, seen)
-        if lower is None:
-            break
-        step, error, cost = lower
-        z = z + step
-        if float(step @ step) < SETTLED**2:
-            break
-    slopes, J = _slopes(rig, charts, L, z, data, B)
-    values, vectors = np.linalg.eigh(J.T @ slopes)
+    white = whitening(bounded(joint_uncertainty(base, data, order)))
+    q = L.shape[1]
+    fit = DenseFit[FloatArray](
+        lambda z: white(residuals(rig_at(rig, charts, L @ z), data))[:, None],
+        lambda z: white(jacobian(rig, charts, L @ z, data) @ L)[:, None],
+        np.add,
+        prior=lambda z: np.column_stack([np.eye(q), z]),
+    )
+    z = minimise(fit, np.zeros(q), Limits(EVALUATIONS, 0.0, SETTLED**2)).state
+    rows = fit.rows(z)[:-q, :-1]
+    values, vectors = np.linalg.eigh(rows.T @ rows)
     values = np.maximum(values, 0.0)
     covariance = (axes @ vectors / (1.0 + values)) @ (axes @ vectors).T
     told = values > LEAST_KNOWLEDGE
@@ -202,14 +191,6 @@ def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     chi2 = float((steps**2 * (1.0 + values[told]) / values[told]).sum())
     limit = float(chi2_distribution.isf(CHANCE, max(1, int(told.sum()))))
     return RefinementStep(axes @ z, 0.5 * (covariance + covariance.T), chi2, limit)
-
-
-def _slopes(
-    rig: RigModel, charts: Charts, L: FloatArray, z: FloatArray, data: Measurements, B: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Derivative (2 k, r) of the residuals by ``z``, weighted and not."""
-    J = jacobian(rig, charts, L @ z, data) @ L
-    return J - B @ (B.T @ J), J
 
 
 def _squares(error: FloatArray, B: FloatArray) -> float:

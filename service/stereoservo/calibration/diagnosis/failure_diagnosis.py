@@ -13,38 +13,36 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.diagnosis.epipolar_faults import (
-    exchanged_ids,
-    plane_or_baseline,
-    views_unrelated,
-)
-from stereoservo.calibration.diagnosis.input_consistency import (
-    SUSPICIOUS_OUTLIERS,
-    residual_trials,
-    scale_error,
-    scaled_positions,
-    underestimated_noise,
-)
 from stereoservo.calibration.diagnosis.input_corrections import (
     Refit,
     exchange_hypotheses,
+    exchanged_ids,
     fit_of_correction,
     ids_exchanged,
     kind_hypotheses,
     order_hypotheses,
     pinhole_reconstruction,
+    plane_or_baseline,
     solution_of,
+    views_unrelated,
 )
 from stereoservo.calibration.diagnosis.joint_scales import prismatic_ratios
 from stereoservo.calibration.diagnosis.marker_tracks import find_step, path_noise, paths_are_smooth
-from stereoservo.calibration.diagnosis.moved_parts import (
+from stereoservo.calibration.diagnosis.outlier_causes import (
+    SUSPICIOUS_OUTLIERS,
     camera_moved,
     every_pixel,
+    explain_outliers,
+    marker_slipped,
     moved_part,
     moved_together,
+    predictions,
+    residual_trials,
+    scale_error,
+    scaled_positions,
+    underestimated_noise,
 )
-from stereoservo.calibration.diagnosis.outlier_causes import explain_outliers, marker_slipped, predictions
-from stereoservo.calibration.lens_significance import lenses_explain_more
+from stereoservo.calibration.lens_estimation import lenses_explain_more
 from stereoservo.calibration.single_joint_fit import MIN_SHOWN
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError, TrialData

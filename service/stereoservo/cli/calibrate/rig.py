@@ -15,15 +15,15 @@ import cv2
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.camera_rig.next_views import ViewAdvice, next_views
 from stereoservo.calibration.camera_rig.rig_calibration import (
     KnownDistance,
     RigCalibration,
+    ViewAdvice,
     calibrate_rig,
+    next_views,
     save_rig,
 )
-from stereoservo.calibration.camera_rig.still_places import still_places
-from stereoservo.calibration.camera_rig.views import RigViews
+from stereoservo.calibration.camera_rig.views import RigViews, still_places
 from stereoservo.calibration.trial_data import TrialCamera
 from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
 from stereoservo.cli.output import CommandError, note, shipped_or_path

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.examination.recorded_views import RecordedViews
-from stereoservo.calibration.known_arm.free_arm import KINDS, NAMES, free_arm
+from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
 from stereoservo.calibration.trial_data import TrialCamera
 from stereoservo.cli.output import CommandError, note
 from stereoservo.kinematics.parameterization import Kind

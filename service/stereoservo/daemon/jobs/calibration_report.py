@@ -29,10 +29,10 @@ from matplotlib.figure import Figure
 from stereoservo.calibration.calibration_result import CalibrationReport
 from stereoservo.calibration.change.model_changes import known_measurements
 from stereoservo.calibration.fit_assessment import JOINT_ERRORS, STRATA, Acceptance
-from stereoservo.calibration.joint_errors.joint_noise import estimated_errors
-from stereoservo.calibration.joint_errors.variance_components import noise_of_accuracy, readings
+from stereoservo.calibration.joint_noise import estimated_errors
 from stereoservo.calibration.rig_model import Measurements, acting_order, acting_rig, full_charts, predicted
 from stereoservo.calibration.trial_data import TrialData
+from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.kinematics.denavit_hartenberg import (
     DH_HEAD,
     ReadOutError,

@@ -16,9 +16,13 @@ from pathlib import Path
 
 import msgspec
 
-from stereoservo.calibration.change.check_trend import find_trend
-from stereoservo.calibration.change.model_check import ModelExamination, examine_model, make_check_report
-from stereoservo.calibration.change.zero_reset import reset_zeros
+from stereoservo.calibration.change.model_check import (
+    ModelExamination,
+    examine_model,
+    find_trend,
+    make_check_report,
+    reset_zeros,
+)
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
 from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line, trials_file
 from stereoservo.kinematics.model import ModelFileError, load_model, save_model

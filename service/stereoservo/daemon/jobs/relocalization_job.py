@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from stereoservo.calibration.relocalization.relocalized_model import (
+from stereoservo.calibration.relocalized_model import (
     RelocalizedModel,
     RestObservations,
     RestPose,

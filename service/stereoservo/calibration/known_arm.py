@@ -7,7 +7,7 @@ matrix; nothing of it is assumed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,13 +15,27 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.bundle_adjustment import RobustLoss, Solution, solve
-from stereoservo.calibration.bundle_inliers import refine_to_convergence, with_whole_stops
-from stereoservo.calibration.bundle_statistics import degrees_of_freedom, variance_factor
+from stereoservo.calibration.bundle_adjustment import Solution, solve
+from stereoservo.calibration.bundle_inliers import (
+    refine_to_convergence,
+    refuse_undetermined,
+    with_whole_stops,
+)
 from stereoservo.calibration.calibration_result import CalibrationFit, FitHistory, ModelFrame, build_fit
-from stereoservo.calibration.diagnosis.fit_refusal import refuse_undetermined
-from stereoservo.calibration.joint_errors.joint_noise import StopFactor, orthogonal_factor
-from stereoservo.calibration.joint_errors.variance_components import (
+from stereoservo.calibration.joint_noise import StopFactor, orthogonal_factor
+from stereoservo.calibration.least_squares import RobustLoss
+from stereoservo.calibration.lens_estimation import (
+    lens_wanted,
+    prior_of_lenses,
+    starting_lenses,
+    straight_lenses,
+    straightened,
+)
+from stereoservo.calibration.rig_model import Measurements, RigModel, displacements, residuals
+from stereoservo.calibration.single_joint_fit import measurements
+from stereoservo.calibration.stratum_selection import NOMINAL_PLANE, FitOptions
+from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData
+from stereoservo.calibration.variance_components import (
     Readings,
     VarianceComponents,
     estimate_components,
@@ -29,24 +43,86 @@ from stereoservo.calibration.joint_errors.variance_components import (
     readings,
     reduced_rows,
 )
-from stereoservo.calibration.lens_estimation import (
-    prior_of_lenses,
-    starting_lenses,
-    straight_lenses,
-    straightened,
-)
-from stereoservo.calibration.lens_significance import lens_wanted
-from stereoservo.calibration.rig_model import Measurements, RigModel, displacements, residuals
-from stereoservo.calibration.single_joint_fit import measurements
-from stereoservo.calibration.stratum_selection import NOMINAL_PLANE, FitOptions
-from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.cameras import from_pixels, pixel_normaliser, resection
 from stereoservo.geometry.distortion import LensEstimate
 from stereoservo.geometry.homogeneous import GeometryError, to_homogeneous
+from stereoservo.geometry.screws import screw_twist
 from stereoservo.geometry.strata import decompose_camera
 from stereoservo.kinematics.model import CellModel
-from stereoservo.kinematics.parameterization import LensModel
+from stereoservo.kinematics.parameterization import Kind, LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
+
+NAMES = ("x", "y", "z", "rz", "ry", "rx")
+"""Joints of a free arm, base first."""
+KINDS: tuple[Kind, ...] = ("prismatic", "prismatic", "prismatic", "revolute", "revolute", "revolute")
+RIGID = 1e-6
+"""Largest entry of RᵀR - 1 with which a displacement is taken for a rigid one."""
+
+
+def free_arm(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Positions (s, 6) [m, rad] and generators (6, 4, 4) of a free arm that makes ``displacements`` (s, 4, 4) [m] of a
+    body, and the displacement (4, 4) at its zero: their middle.
+
+    ``D = E_x E_y E_z E_rz E_ry E_rx D_zero``, with the rotations about the zero's origin. Raises CalibrationError
+    (``bad_data``) for a displacement that is not rigid.
+    """
+    D = np.asarray(displacements, dtype=np.float64)
+    _check_rigid(D)
+    zero = np.eye(4)
+    zero[:3, :3] = Rotation.from_matrix(D[:, :3, :3]).mean().as_matrix()
+    zero[:3, 3] = D[:, :3, 3].mean(axis=0)
+    turns = Rotation.from_matrix(D[:, :3, :3] @ zero[:3, :3].T)
+    positions = np.hstack([D[:, :3, 3] - zero[:3, 3], turns.as_euler("ZYX")])
+    generators = np.zeros((6, 4, 4))
+    generators[[0, 1, 2], [0, 1, 2], 3] = 1.0
+    generators[3:] = [screw_twist(axis, zero[:3, 3]) for axis in np.eye(3)[::-1]]
+    return positions, generators, zero
+
+
+def _check_rigid(D: FloatArray) -> None:
+    if D.ndim != 3 or D.shape[1:] != (4, 4) or not len(D):
+        raise CalibrationError(
+            "bad_data", f"displacements of shape {D.shape}; (s, 4, 4) with at least one are needed"
+        )
+    off = np.abs(D[:, :3, :3].transpose(0, 2, 1) @ D[:, :3, :3] - np.eye(3)).max(axis=(1, 2))
+    off = np.maximum(off, np.abs(D[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1))
+    wrong = ~(off <= RIGID) | ~(np.linalg.det(D[:, :3, :3]) > 0.0) | ~np.isfinite(D).all(axis=(1, 2))
+    if wrong.any():
+        stop = int(np.flatnonzero(wrong)[0])
+        raise CalibrationError(
+            "bad_data",
+            f"displacement {stop} is not rigid: RᵀR differs from 1 by {off[stop]:.3g}, at most {RIGID:g} is taken, and "
+            "its last row must be 0 0 0 1",
+            stop=stop,
+        )
+
+
+def trials_of_poses(
+    displacements: FloatArray,
+    cameras: Sequence[TrialCamera],
+    marker_ids: Sequence[int],
+    pixels: FloatArray,
+    sigmas: FloatArray,
+) -> TrialData:
+    """Trial data of a body with markers at known ``displacements`` (s, 4, 4) [m], as from a robot that reports its
+    hand's poses; ``pixels`` (c, s, m, 2) and ``sigmas`` (c, s, m) as there.
+
+    Raises CalibrationError (``bad_data``).
+    """
+    positions, generators, _ = free_arm(displacements)
+    return TrialData(
+        joint_names=NAMES,
+        joint_kinds=KINDS,
+        cameras=tuple(cameras),
+        marker_ids=tuple(marker_ids),
+        positions=positions,
+        trials=np.full(len(positions), -1),
+        pixels=pixels,
+        sigmas=sigmas,
+        images=int(np.isfinite(pixels).all(axis=-1).any(axis=-1).sum()),
+        generators=generators,
+    )
+
 
 LEAST_VIEWS = 6
 """Stops at which a camera must see markers: it has 11 unknowns, and markers of unknown places close together count
@@ -111,7 +187,7 @@ def fit_with_known_arm(
         every,
         found.inliers,
         ModelFrame(np.zeros(len(trials.joint_names)), NOMINAL_PLANE),
-        FitHistory((found.solution.cost, degrees_of_freedom(found.solution)), _notes(factor)),
+        FitHistory((found.solution.cost, found.solution.determined.freedom), _notes(factor)),
         epoch=epoch,
         created=created,
         components=found.components,
@@ -179,7 +255,7 @@ def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _Erro
         before, lenses = components, solution.lenses
         components = estimate_components(reduced_rows(solution, at), scales=False, near=before)
         if components is None or not components.significant:
-            components, factor, every = None, variance_factor(solution), every.with_joint_noise(None)
+            components, factor, every = None, solution.determined.variance, every.with_joint_noise(None)
         else:
             factor, every = components.pixels, every.with_joint_noise(components.noise(at))
             inliers = with_whole_stops(every, inliers) if before is None else inliers
@@ -205,12 +281,12 @@ def _simpler_lenses(
     """A bundle of fewer lens terms where those of ``open_one`` stay open and explain next to nothing: the first that
     converges; ``open_one`` with its ``inliers`` (k,) where there is none.
     """
-    most = AS_GOOD * variance_factor(open_one)
+    most = AS_GOOD * open_one.determined.variance
     simpler: tuple[LensModel, ...] = ("radial_centre", "radial", "none")
     for lenses in simpler[simpler.index(open_one.lenses) + 1 if open_one.lenses in simpler else 0 :]:
         rig = straightened(open_one.rig, every)
         found, kept = refine_to_convergence(rig, every, "metric", options, lenses)
-        if found.converged and variance_factor(found) <= most:
+        if found.converged and found.determined.variance <= most:
             return found, kept
     return open_one, inliers
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from stereoservo.calibration.least_squares import NormalEquations, column_root, column_sizes
 from stereoservo.calibration.normal_equations import (
     ArrowFactor,
     Weights,
@@ -128,51 +128,46 @@ def _whitened(one: StopRows, data: Measurements) -> _Whitened:
 
 @dataclass(frozen=True)
 class StopEquations:
-    """Normal matrix (e + p + 1, e + p + 1) of whitened rows, columns of ``sizes`` (p,) scaled to unit length, shared
-    errors first and residuals last; ``cost`` at the present errors. Of each of the ``stops`` (k,): the ``information``
-    (k, n, n) on its own errors, and how these follow from the rest, ``projected`` (k, n, e + p + 1).
+    """Normal equations of whitened rows: ``marginal`` of the parameters, all errors eliminated. How errors follow from
+    a step: those that stops share by ``common`` (e, e + p + 1), residuals last; of each of the ``stops`` (k,) its own
+    by the ``information`` (k, n, n) on them and ``projected`` (k, n, e + p + 1).
     """
 
-    matrix: FloatArray
-    sizes: FloatArray
-    cost: float
+    marginal: NormalEquations
+    common: FloatArray
     stops: IntArray
     information: FloatArray
     projected: FloatArray
     data: Measurements
 
-    @cached_property
-    def _marginal(self) -> FloatArray:
-        """The normal matrix (p + 1, p + 1) with the shared errors eliminated."""
-        e = len(self.matrix) - len(self.sizes) - 1
-        if not e:
-            return self.matrix
-        half = np.linalg.solve(np.linalg.cholesky(self.matrix[:e, :e]), self.matrix[:e, e:])
-        return np.asarray(self.matrix[e:, e:] - half.T @ half)
-
     @property
     def gradient(self) -> FloatArray:
         """Gradient (p + 1,) on unit columns; its last entry is what other errors of the joints alone would gain."""
-        gain = self.cost - self._marginal[-1, -1]
-        return np.append(self._marginal[:-1, -1], max(gain, 0.0) / max(self.cost, 1.0))
+        cost = self.marginal.cost
+        gain = cost - float(self.marginal.core[-1, -1])
+        return np.append(self.marginal.gradient, max(gain, 0.0) / max(cost, 1.0))
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
-        """Damped step (p,), not on unit columns, and the decrease it predicts. Raises LinAlgError."""
-        matrix, gradient = self._marginal[:-1, :-1], self._marginal[:-1, -1]
-        root = np.linalg.cholesky(matrix + damping * np.eye(len(matrix)))
-        x = -np.linalg.solve(root.T, np.linalg.solve(root, gradient))
-        least = self._marginal[-1, -1] + 2.0 * float(gradient @ x) + float(x @ matrix @ x)
-        return x / self.sizes, self.cost - least
+        """Damped step (p,) as `NormalEquations.step`, behind it all errors of the joints after the step: those that
+        stops have in common (e,), and each stop's own (s n,).
+        """
+        x, expected = self.marginal.step(damping)
+        return np.concatenate([x, *self._errors(x)]), expected
 
-    def errors(self, x: FloatArray) -> JointErrors:
-        """Errors of the joints after a step ``x`` (p,), to first order."""
-        e = len(self.matrix) - len(self.sizes) - 1
-        step = np.append(x * self.sizes, 1.0)
-        common = -np.linalg.solve(self.matrix[:e, :e], self.matrix[:e, e:] @ step) if e else np.zeros(0)
-        whole = np.concatenate([common, x, [1.0]])
+    def errors(self) -> JointErrors:
+        """Errors of the joints without a step."""
+        own, common = self._errors(np.zeros(len(self.marginal.sizes)))[::-1]
+        return JointErrors(own.reshape(self.data.offsets.shape), common)
+
+    def _errors(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors that stops have in common (e,), and their own (s n,), after a step ``x`` (p,), to first order."""
+        e = len(self.common)
+        step = np.append(x, 1.0)
+        common = -np.linalg.solve(self.common[:, :e], self.common[:, e:] @ step) if e else np.zeros(0)
         own = np.zeros_like(self.data.offsets)
-        own[self.stops] = -np.linalg.solve(self.information, (self.projected @ whole)[:, :, None])[:, :, 0]
-        return JointErrors(own, common)
+        right = self.projected @ np.concatenate([common, step])
+        own[self.stops] = -np.linalg.solve(self.information, right[:, :, None])[:, :, 0]
+        return common, own.ravel()
 
 
 def stop_equations(
@@ -208,15 +203,20 @@ def stop_equations(
     matrix[e:, e:] += inner + prior.T @ prior
     cost += float((prior[:, -1] ** 2).sum()) + (0.0 if data.joint_errors is None else data.joint_errors.cost)
     sizes = np.sqrt(np.maximum(np.diag(matrix)[e:-1], 0.0))
-    sizes[sizes == 0.0] = 1.0
-    scale = np.concatenate([np.ones(e), sizes, [1.0]])
-    return StopEquations(matrix / np.outer(scale, scale), sizes, cost, at, information, projected, data)
+    scale = np.append(np.where(sizes > 0.0, sizes, 1.0), 1.0)
+    core = matrix[e:, e:] / np.outer(scale, scale)
+    if e:
+        half = np.linalg.solve(np.linalg.cholesky(matrix[:e, :e]), matrix[:e, e:] / scale)
+        core -= half.T @ half
+    none = np.zeros((0, 0, p + 1))
+    marginal = NormalEquations(core, none, none[..., :0], scale[:-1], cost)
+    return StopEquations(marginal, matrix[:e], at, information, projected, data)
 
 
 def estimated_errors(rig: RigModel, charts: Charts, data: Measurements) -> JointErrors:
     """Errors of the joints that ``data``, which has joint noise, shows at the parameters of ``rig``."""
     ordered, _ = by_stop(data)
-    return stop_equations(rig, charts, ordered, None).errors(np.zeros(charts.size))
+    return stop_equations(rig, charts, ordered, None).errors()
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,7 @@ def prediction_leverages(
     if isinstance(factor, ArrowFactor):
         return leverages(rig, charts, data, factor)
     ordered, order = by_stop(data)
-    root = _column_root(factor.dense()[:-1, :-1])
+    root = column_root(factor.dense()[:-1, :-1])
     out = np.empty(len(order))
     for here, block in chunks(rig, charts, ordered):
         rows = block.dense(len(rig.points))[:, :-1] @ root
@@ -309,7 +309,7 @@ def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> Float
     start[e:, e:] = prior
     stops = [(one, _whitened(one, data)) for one in stop_rows(rig, charts, ordered)]
     triangle = np.asarray(np.linalg.qr(np.vstack([start, *(white.rows for _, white in stops)]), mode="r"))
-    root = _column_root(triangle[:-1, :-1])
+    root = column_root(triangle[:-1, :-1])
     out = np.empty(len(order))
     for one, white in stops:
         # T = I - Q (I - W) Qᵀ whitens; T T is V⁻¹.
@@ -329,8 +329,7 @@ def exact_fit_factor(rig: RigModel, charts: Charts, data: Measurements, triangle
     noise, (ordered, _) = data.joint_noise, by_stop(data)
     assert noise is not None
     p = charts.size
-    sizes = np.linalg.norm(triangle, axis=0)
-    sizes[sizes == 0.0] = 1.0
+    sizes = column_sizes(triangle)
     own, common = np.zeros((p, p)), np.zeros((p, noise.common))
     for one in stop_rows(rig, charts, ordered):
         slopes = (one.rows[:, :-1] / sizes).T @ one.joints
@@ -345,10 +344,3 @@ def exact_fit_factor(rig: RigModel, charts: Charts, data: Measurements, triangle
     whole = np.eye(p + 1)
     whole[:-1, :-1] = np.linalg.solve(root, triangle)
     return StopFactor(whole, 0)
-
-
-def _column_root(triangle: FloatArray) -> FloatArray:
-    """``R⁻¹`` of a factor (p, p), by way of unit columns."""
-    sizes = np.linalg.norm(triangle, axis=0)
-    sizes[sizes == 0.0] = 1.0
-    return np.asarray(np.linalg.inv(triangle / sizes) / sizes[:, None])
