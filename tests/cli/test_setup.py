@@ -16,10 +16,10 @@ import typer
 
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor.camera_findings import CameraRecord
+from stereoservo.cli.doctor.cameras import same_camera_twice
 from stereoservo.cli.doctor.plate_motion import examine_sides, judge_turn, turn_between
-from stereoservo.cli.doctor.view_consistency import same_camera_twice
 from stereoservo.cli.output import CommandError, shipped_or_path
-from stereoservo.cli.setup.commissioning import eye_finding
+from stereoservo.cli.setup.command import eye_finding
 from stereoservo.cli.setup.dialogue import Dialogue
 from stereoservo.cli.setup.interview import (
     chosen_cameras,
