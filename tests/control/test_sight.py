@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from oracles.face_visibility import way_in_sight
-from stereoservo.control.face_visibility import way_in_sight as kernel
+from stereoservo.control.laws.cartesian3 import way_in_sight as kernel
 
 
 def problem(virtual, rng, angle=None):

@@ -10,8 +10,7 @@ import numpy as np
 
 from oracles.face_visibility import Way, way_in_sight
 from oracles.step_correction import corrected_step
-from stereoservo.control.face_visibility import APPROACH
-from stereoservo.control.laws.cartesian3 import LONGEST_STEP, STEP_OF_BOUND
+from stereoservo.control.laws.cartesian3 import APPROACH, LONGEST_STEP, STEP_OF_BOUND
 from stereoservo.geometry.homogeneous import plane_of_points
 from stereoservo.geometry.screws import exp_twist
 from stereoservo.kinematics.composition import Composition

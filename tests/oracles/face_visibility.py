@@ -1,4 +1,4 @@
-"""Visibility of a face in numpy: the readable reference of `control.face_visibility`."""
+"""Visibility of a face in numpy: the readable reference of that of `control.laws.cartesian3`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereoservo.control.face_visibility import MARGIN_OF_END, MARGIN_OF_NOW, SAMPLES
+from stereoservo.control.laws.cartesian3 import MARGIN_OF_END, MARGIN_OF_NOW, SAMPLES
 from stereoservo.numerics.arrays import FloatArray
 
 
