@@ -1,7 +1,8 @@
 """Layout of marker plates for printing: faces of dots and tags on pages [mm], with cutting, folding and scale
 marks.
 
-Page coordinates: origin at the top left, x right, y down [mm]. :mod:`stereoservo_drivers.plate_files` writes pages.
+Page coordinates: origin at the top left, x right, y down [mm]. Pages are written
+by `commands.print_plate`.
 """
 
 from __future__ import annotations

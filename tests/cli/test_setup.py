@@ -32,8 +32,7 @@ from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverError
 from stereoservo.ports.discovery import BusScan, FoundCamera, FoundDrive, JointChoice
 from stereoservo_drivers.canopen.nodes import found_buses, proposed_options, stated_limits
-from stereoservo_drivers.video.discovery import found_cameras, modes_told, usual_rate
-from stereoservo_drivers.video.driver import VideoCameraDriver
+from stereoservo_drivers.video.driver import VideoCameraDriver, found_cameras, modes_told, usual_rate
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell
 
 SIGMA_PX = 0.05

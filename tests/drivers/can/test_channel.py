@@ -10,8 +10,7 @@ import serial
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can import socketcan
-from stereoservo_drivers.can.bus_errors import BusError, bus_error
-from stereoservo_drivers.can.channel import BATCH, Channel, ChannelSettings
+from stereoservo_drivers.can.channel import BATCH, BusError, Channel, ChannelSettings, bus_error
 from stereoservo_drivers.can.frames import CanFrame
 
 FRAMES = [
@@ -115,7 +114,7 @@ def test_no_permission(monkeypatch):
     def forbidden(*args, **kwargs):
         raise serial.SerialException(errno.EACCES, "could not open port /dev/ttyACM0: Permission denied")
 
-    monkeypatch.setattr("stereoservo_drivers.can.slcan_ports.serial.Serial", forbidden)
+    monkeypatch.setattr("stereoservo_drivers.can.slcan.serial.Serial", forbidden)
     error = refused(ChannelSettings("stereoservo_slcan", "/dev/ttyACM0"))
     assert "dialout" in str(error)
 
