@@ -2,18 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import html
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
+from stereoservo.calibration.trial_data import TrialData
+from stereoservo.geometry.cameras import project_many
+from stereoservo.geometry.distortion import distort
+from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
-from stereoservo_sim.demonstration.judge import Judgement, Steady, judge_goal, read_flight
-from stereoservo_sim.demonstration.overview import write_overview
-from stereoservo_sim.demonstration.report_pages import write_pages
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.demonstration.judge import (
+    Judgement,
+    RecordedDemonstration,
+    Steady,
+    judge_goal,
+    read_flight,
+)
+from stereoservo_sim.demonstration.report_data import CalibrationPlots, GoalPlots, ReportData, check_shapes
+from stereoservo_sim.demonstration.report_figures import (
+    COLOURS,
+    draw_calibration_tracks,
+    draw_errors,
+    draw_goal_tracks,
+    draw_paths,
+    draw_residuals,
+    draw_velocities,
+    encode_png,
+)
 from stereoservo_sim.demonstration.runner import Demonstration
+from stereoservo_sim.world.rendering import Renderer, RenderSettings
+from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 MAX_ERROR_PX = 0.3
 MAX_ERROR_MM = 0.5
@@ -141,3 +168,287 @@ def _loop(demonstration: Demonstration) -> dict[str, Any]:
             "lateness_us": {"p50": 0.0, "p99": 0.0, "max": 0.0}, "virtual": True,
         }  # fmt: skip
     return {**msgspec.to_builtins(demonstration.loop), "virtual": False}
+
+
+# -- overview ------------------------------------------------------------------------------------------------
+# Overview image of a demonstration: a camera's view at the start, the markers' tracks, the decay of the errors.
+
+
+def write_overview(path: Path, goals: Sequence[Judgement], cell: SimulatedCell, tolerance_px: float) -> None:
+    """Draw the overview as a PNG. Raises OSError."""
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 3, width_ratios=(1, 1, 1))
+    for axis, camera in zip(axes[:2], cell.rig.cameras, strict=True):
+        image = Renderer(cell, camera, RenderSettings()).render(cell.base, np.random.default_rng(0))
+        axis.imshow(image, cmap="gray", vmin=0, vmax=255)
+        for k, goal in enumerate(goals):
+            tracks = goal.tracks[camera.name]
+            axis.plot(tracks[:, :, 0], tracks[:, :, 1], color=COLOURS[k], linewidth=0.8)
+            axis.plot(tracks[-1, :, 0], tracks[-1, :, 1], "x", color=COLOURS[k], markersize=4)
+        axis.set(
+            title=f"{camera.name} camera",
+            xlim=(0, camera.width),
+            ylim=(camera.height, 0),
+            xticks=[],
+            yticks=[],
+        )
+    for k, goal in enumerate(goals):
+        label = f"{goal.name}: {goal.law}, {goal.rotation_deg:.0f}°, {goal.distance_mm:.0f} mm"
+        axes[2].semilogy(goal.times_s, goal.error_px, color=COLOURS[k], label=label)
+    axes[2].axhline(tolerance_px, color="#666666", linestyle="--", linewidth=1)
+    axes[2].set(title="largest pixel error [px]", xlabel="time [s]")
+    axes[2].grid(alpha=0.3)
+    axes[2].legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+# -- pages of the report -------------------------------------------------------------------------------------
+# Collection of the demonstration report's data from the recording, the model and the evaluation.
+
+
+def write_pages(
+    path: Path, demonstration: Demonstration, flight: RecordedDemonstration, goals: Sequence[Judgement]
+) -> None:
+    """Write the report. Raises OSError."""
+    cell = demonstration.cell
+    mode = "lockstep, virtual time" if demonstration.lockstep else "real processes over zenoh"
+    facts = {
+        "mode": mode,
+        "seed": str(demonstration.seed),
+        "loop": f"{cell.servo.rate_hz:g} Hz",
+        "replay": f"identical: {flight.result.identical} over {flight.result.steps} steps",
+    }
+    if demonstration.loop is not None:
+        lateness = demonstration.loop.lateness_us
+        facts["lateness"] = (
+            f"p50 {lateness['p50']:.0f} µs, p99 {lateness['p99']:.0f} µs, max {lateness['max']:.0f} µs"
+        )
+        facts["overruns"] = f"{demonstration.loop.overruns} of {demonstration.loop.cycles} cycles"
+    data = ReportData(
+        title="stereoservo demonstration",
+        joints=demonstration.joint_names,
+        calibration=None if flight.trials is None else _calibration_page(demonstration, flight.trials),
+        goals=tuple(_goal(goal, cell.servo.gain) for goal in goals),
+        tolerance_px=cell.servo.tolerance_px,
+        velocity_limits=flight.velocity_max,
+        summary="An arm that nobody calibrated learnt itself through two cameras that nobody calibrated, and reached "
+        "goals that were only shown to it. Errors are against the simulated truth.",
+        facts=facts,
+    )
+    write_report(data, path)
+
+
+def _calibration_page(demonstration: Demonstration, trials: TrialData) -> CalibrationPlots:
+    model = demonstration.calibrated.model
+    statistics = model.statistics
+    figures = {}
+    if statistics is not None:
+        figures = {
+            "chi-square": f"{statistics.chi2:.0f} for {statistics.degrees_of_freedom} degrees of freedom "
+            f"({'as' if statistics.chi2_ok else 'not as'} the measurement noise explains)",
+            "parameters": f"{statistics.parameters} net of gauge, {statistics.measurements} measurements",
+            "stratum": model.stratum,
+        }
+    sizes = np.array([(camera.width, camera.height) for camera in trials.cameras])
+    return CalibrationPlots(
+        cameras=tuple(camera.name for camera in trials.cameras),
+        joints=trials.joint_names,
+        sizes=sizes,
+        joint=trials.trials,
+        pixels=trials.pixels,
+        residuals=residuals(model, trials),
+        rms_px=statistics.rms_px if statistics is not None else float("nan"),
+        images=statistics.images if statistics is not None else trials.images,
+        seconds=demonstration.calibrated.seconds,
+        sigma_px=float(np.sqrt(np.nanmean(trials.sigmas**2))),
+        figures=figures,
+    )
+
+
+def residuals(model: CellModel, trials: TrialData) -> FloatArray:
+    """Measured minus predicted raw pixels (c, s, m, 2), NaN where a marker was not seen."""
+    chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
+    matrices = np.array([camera.matrix for camera in model.cameras])
+    rows = [model.marker_ids.index(marker) for marker in trials.marker_ids]
+    predicted = np.array(
+        [
+            project_many(matrices, model.marker_points[rows] @ chain.displacement(q).T)
+            for q in trials.positions
+        ]
+    )
+    raw = [
+        distort(camera.lens, ideal)
+        for camera, ideal in zip(model.cameras, predicted.transpose(1, 0, 2, 3), strict=True)
+    ]
+    found: FloatArray = trials.pixels - np.array(raw)
+    return found
+
+
+def _goal(goal: Judgement, gain: float) -> GoalPlots:
+    return GoalPlots(
+        name=goal.name,
+        law=goal.law,
+        outcome=goal.outcome,
+        times_s=goal.times_s,
+        error_px=goal.error_px,
+        velocities=goal.velocities,
+        path_m=goal.path_m,
+        line_m=goal.line_m,
+        final_error_px=goal.final_error_px,
+        final_error_mm=goal.final_error_mm,
+        max_line_deviation_mm=goal.max_line_deviation_mm,
+        rotation_deg=goal.rotation_deg,
+        distance_mm=goal.distance_mm,
+        steps=goal.steps,
+        seconds=goal.seconds,
+        gain=gain,
+        tracks=goal.tracks,
+    )
+
+
+# -- how the report looks ------------------------------------------------------------------------------------
+# HTML report of a servoing session, from arrays; deterministic.
+#
+# The pictures are embedded, so that the file can be mailed as it is.
+
+
+__all__ = ["CalibrationPlots", "GoalPlots", "ReportData", "render_report", "write_report"]
+
+
+def write_report(data: ReportData, path: Path) -> Path:
+    """Write the report as one HTML file; folders are made. Raises ValueError on shapes that do not fit,
+    OSError."""
+    text = render_report(data)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def render_report(data: ReportData) -> str:
+    """The HTML text. Raises ValueError on shapes that do not fit."""
+    check_shapes(data)
+    parts = [f"<h1>{html.escape(data.title)}</h1>"]
+    if data.summary:
+        parts.append(f"<p>{html.escape(data.summary)}</p>")
+    if data.goals:
+        parts += ["<h2>Goals</h2>", goals_table(data.goals)]
+        parts += [
+            _picture(
+                draw_errors(data.goals, data.tolerance_px), "Largest pixel error of each goal over time"
+            ),
+            _picture(
+                draw_velocities(data.goals, data.joints, data.velocity_limits),
+                "Commanded joint velocities of each goal",
+            ),
+            _picture(
+                draw_paths(data.goals), "Path of the centre, its straight line, and the distance between them"
+            ),
+        ]
+        if any(goal.tracks for goal in data.goals):
+            parts.append(
+                _picture(draw_goal_tracks(data.goals), "Marker tracks in the images, from start to goal")
+            )
+    if data.calibration is not None:
+        parts += ["<h2>Self-calibration</h2>", calibration_table(data.calibration)]
+        parts += [
+            _picture(
+                draw_calibration_tracks(data.calibration),
+                "Markers at all stops of the trial motions, by joint",
+            ),
+            _picture(draw_residuals(data.calibration), "Residuals of the fit, by moving joint and camera"),
+        ]
+    if data.facts:
+        parts += ["<h2>Session</h2>", _two_columns(data.facts)]
+    return _PAGE.format(title=html.escape(data.title), body="\n".join(parts))
+
+
+def goals_table(goals: Sequence[GoalPlots]) -> str:
+    """The goals as an HTML table."""
+    head: tuple[str, ...] = (
+        "goal",
+        "law",
+        "outcome",
+        "rotation [°]",
+        "distance [mm]",
+        "final error [px]",
+        "final error [mm]",
+    )
+    head += ("off the line, at most [mm]", "steps", "time [s]")
+    rows = [
+        (
+            goal.name,
+            goal.law,
+            goal.outcome,
+            f"{goal.rotation_deg:.1f}",
+            f"{goal.distance_mm:.0f}",
+            f"{goal.final_error_px:.3f}",
+            f"{goal.final_error_mm:.3f}",
+            f"{goal.max_line_deviation_mm:.2f}",
+            str(goal.steps),
+            f"{goal.seconds:.2f}",
+        )
+        for goal in goals
+    ]
+    return _table(head, rows, text_columns=3)
+
+
+def calibration_table(c: CalibrationPlots) -> str:
+    """Residual rms by joint and camera, and the numbers of the fit, as HTML tables."""
+    rows = []
+    for j, joint in enumerate(c.joints):
+        moved = c.residuals[:, c.joint == j]
+        rows.append((joint, *(_rms(part) for part in moved), str(int((c.joint == j).sum()))))
+    by_joint = _table(
+        ("moving joint", *(f"{name}: rms [px]" for name in c.cameras), "stops"), rows, text_columns=1
+    )
+    figures = {
+        "residual rms": f"{c.rms_px:.4f} px",
+        "expected noise": "not stated" if c.sigma_px is None else f"{c.sigma_px:.4f} px",
+        "images": str(c.images),
+        "time": f"{c.seconds:.1f} s",
+        **c.figures,
+    }
+    return _two_columns(figures) + by_joint
+
+
+def _picture(figure: Figure, caption: str) -> str:
+    text = html.escape(caption)
+    data = base64.b64encode(encode_png(figure)).decode("ascii")
+    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
+
+
+def _rms(values: FloatArray) -> str:
+    finite = values[np.isfinite(values)]
+    return f"{np.sqrt(np.mean(finite**2)):.4f}" if finite.size else "–"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int) -> str:
+    """An HTML table; cells after the first ``text_columns`` are numbers."""
+
+    def cells(tag: str, row: Sequence[str]) -> str:
+        return "".join(
+            f"<{tag}{'' if i < text_columns else ' class=n'}>{html.escape(cell)}</{tag}>"
+            for i, cell in enumerate(row)
+        )
+
+    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f"<table><thead><tr>{cells('th', head)}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _two_columns(figures: Mapping[str, str]) -> str:
+    rows = "".join(f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in figures.items())
+    return f"<table><tbody>{rows}</tbody></table>"
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,
+initial-scale=1"> <title>{title}</title> <style> body {{ font: 15px/1.5 system-ui, sans-serif; color: #222;
+background: #fff; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }} h1 {{ font-size: 1.5rem; }} h2 {{
+font-size: 1.15rem; margin-top: 2.2rem; }} table {{ border-collapse: collapse; margin: .8rem 0; font-size:
+.85rem; display: block; overflow-x: auto; }} th, td {{ padding: .25rem .8rem; border-bottom: 1px solid #ddd;
+text-align: left; vertical-align: top; }} th.n, td.n {{ text-align: right; font-variant-numeric: tabular-nums;
+}} thead th {{ border-bottom: 2px solid #888; }} figure {{ margin: 1.2rem 0; }} img {{ max-width: 100%;
+height: auto; }} figcaption {{ color: #555; font-size: .85rem; }} </style></head><body> {body} </body></html>
+"""

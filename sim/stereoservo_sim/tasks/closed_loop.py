@@ -6,7 +6,8 @@ points are computed from them with the controller's model.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal, Protocol
@@ -16,13 +17,30 @@ import numpy as np
 
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
+from stereoservo.control.laws.image import image
+from stereoservo.control.laws.points import step_by_points
+from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS, held_gain, limited
+from stereoservo.control.marker_groups import with_groups
+from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
 from stereoservo.core.goals.marker_body import goal_pose
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import project_points, triangulate
-from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.goals import (
+    DEFAULT_LAW,
+    Command,
+    Enable,
+    FeatureTarget,
+    Goal,
+    LawName,
+    Request,
+    RunGoal,
+)
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import DriverError
+from stereoservo.ports.devices import CameraObservation, DriverError, JointState
 from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, mechanics_of, rx90_reach
 from stereoservo_sim.tasks.calibrations import (
     CalibrationName,
@@ -31,24 +49,11 @@ from stereoservo_sim.tasks.calibrations import (
     calibrate,
     known_at_start,
 )
-from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
-from stereoservo_sim.tasks.core_controller import CoreController
-from stereoservo_sim.tasks.ground_truth import (
-    error_px,
-    in_images,
-    line_deviations,
-    noise_floor_px,
-    sight,
-)
+from stereoservo_sim.tasks.ground_truth import error_px, in_images, line_deviations, noise_floor_px, sight
 from stereoservo_sim.tasks.marker_estimate import MarkerEstimate, PointsName
 from stereoservo_sim.tasks.options import DEFAULT_GAIN, DEFAULT_RATE_HZ
 from stereoservo_sim.tasks.planned_path import LOOK_S, NoPathError, PlannedPath, plan_task_path
-from stereoservo_sim.tasks.setting import (
-    FACE,
-    MAX_ITERATIONS,
-    MIN_DEPTH,
-    SUCCESS_PX,
-)
+from stereoservo_sim.tasks.setting import FACE, HEIGHT, MAX_ITERATIONS, MIN_DEPTH, SUCCESS_PX, WIDTH
 from stereoservo_sim.tasks.task_file import AlignmentTask
 from stereoservo_sim.tasks.twist_arm import TwistArm, twist_start
 from stereoservo_sim.world.presets import MechanicsPreset
@@ -500,3 +505,196 @@ def _unreachable(task: AlignmentTask, settings: LoopSettings) -> tuple[TaskResul
     )
     none = np.zeros(0)
     return result, Trace(task.start[None], none, none, np.zeros((0, 6)), np.zeros((0, 0)))
+
+
+# -- laws that are compared ----------------------------------------------------------------------------------
+# Control laws for comparison only: camera by camera (8.37), and on metric points of a calibrated rig (8.17).
+
+
+def stereo_block(scene: Scene, task: Task, options: Options) -> LawStep:
+    """The mean of the laws of the single cameras that see (8.37, halved for two: errata)."""
+    velocity, conditioning, seeing = np.zeros(scene.operators.shape[0]), 1.0, 0
+    for camera in range(scene.matrices.shape[0]):
+        alone = np.zeros_like(task.wanted)
+        alone[camera] = task.wanted[camera]
+        if not (scene.weights * alone > 0.0).any():
+            continue
+        step = image(scene, task._replace(wanted=alone), options)
+        velocity, conditioning, seeing = (
+            velocity + step.velocity,
+            min(conditioning, step.conditioning),
+            seeing + 1,
+        )
+    if seeing == 0:
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, 0.0)
+    return LawStep(velocity / seeing, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, conditioning)
+
+
+def euclidean_points(
+    H_projective_to_euclidean: FloatArray,
+) -> Callable[[Scene, Task, Options], LawStep]:
+    """The law on points in metric coordinates (8.17), for a calibrated rig: what others do, for comparison.
+
+    ``H_projective_to_euclidean`` (4, 4) maps the frame's points to the metric frame of that rig.
+    """
+    H = np.ascontiguousarray(H_projective_to_euclidean, dtype=np.float64)
+
+    def step(scene: Scene, task: Task, options: Options) -> LawStep:
+        X, X_star = scene.points @ H.T, task.target_points @ H.T
+        known = task.target_known > 0.0
+        X = X / X[:, 3:]
+        X_star = np.where(known[:, None], X_star / np.where(known, X_star[:, 3], 1.0)[:, None], 0.0)
+        metres = np.tile(np.eye(3, 4), (X.shape[0], 1, 1))
+        operators = np.ascontiguousarray(H @ scene.operators @ np.linalg.inv(H))
+        jacobian = (
+            JacobianChoice.CURRENT if options.jacobian == JacobianChoice.FIXED_DEPTH else options.jacobian
+        )
+        seen = (_seen(scene, task) > 0.0).astype(np.float64)
+        velocity, conditioning = step_by_points(
+            operators, (X, X_star, seen, metres), (held_gain(options), int(jacobian), options.damping)
+        )
+        return limited(scene, task, options, velocity, conditioning)
+
+    return step
+
+
+def _seen(scene: Scene, task: Task) -> FloatArray:
+    """Weights (m,) of the markers: of the camera that sees each best, 0 where the goal's point is unknown."""
+    found: FloatArray = scene.weights.max(axis=0, initial=0.0) * (task.target_known > 0.0)
+    return found
+
+
+CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {
+    "stereo-block": stereo_block,
+}
+"""By name. `euclidean_points` needs a metric frame besides."""
+
+
+# -- the core as a controller --------------------------------------------------------------------------------
+# Tasks driven by the servo core: goal, planning, law, monitors and safety stage as they run in the daemon.
+#
+# The core runs at `CORE_RATE_HZ`, the frames come at the rate of the tasks' loop; each is in hand a cycle after its
+# shutter. What the cell's operator does (a model, enable) is done before the first frame.
+
+
+CORE_RATE_HZ = 250.0
+TOLERANCE_PX = 0.6 * SUCCESS_PX
+HOLD_FRAMES = 5
+SPEED = {"revolute": 1.0, "prismatic": 0.25}
+ACCELERATION = {"revolute": 4.0, "prismatic": 1.0}
+"""Of every joint at most, by its kind: [rad/s or m/s], [rad/s² or m/s²]."""
+LEAST_SIGMA_PX = 0.01
+LOST = ("goal_aborted", "goal_cancelled", "fault")
+
+
+class CoreController:
+    """A servo core that drives an arm to a task's goal; `closed_loop.Controller` runs a law alone."""
+
+    def __init__(
+        self, model: CellModel, task: AlignmentTask, arm: TaskArm, *,
+        law: LawName, points: PointsName, gain: float, rate_hz: float, noise_px: float, time_limit_s: float,
+    ) -> None:  # fmt: skip
+        self.task_error, self.expected = np.zeros(0), None
+        self._core = ServoCore(_settings(model, arm.limits, law, points, gain, rate_hz))
+        self._period_ns = round(1e9 / CORE_RATE_HZ)
+        self._cycles = max(1, round(CORE_RATE_HZ / rate_hz))
+        self._cameras = tuple(camera.name for camera in model.cameras)
+        self._ids = np.array(model.marker_ids)
+        self._covariances = np.tile(max(noise_px, LEAST_SIGMA_PX) ** 2 * np.eye(2), (len(self._ids), 1, 1))
+        self._now_ns, self._seq, self._active = 1_000_000_000, 0, False
+        self._step(arm, model_update=ModelUpdate(with_groups(model)))
+        self._step(arm, Enable())
+        wanted = sight(task.goal).pixels
+        target = FeatureTarget(
+            {
+                name: {int(i): (float(u), float(v)) for i, (u, v) in zip(self._ids, pixels, strict=True)}
+                for name, pixels in zip(self._cameras, wanted, strict=True)
+            }
+        )
+        self._goal = RunGoal(Goal(str(uuid.UUID(int=task.id + 1)), target, time_limit_s=time_limit_s))
+        self._looks = round(LOOK_S * rate_hz)
+
+    def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
+        """Move the arm until the next frame after this one, (c, m, 2) with ``seen`` (c, m) 1 or 0; why the goal was
+        lost, or ''. Raises NoPathError where it is refused, DriverError where the arm has stopped by itself.
+        """
+        frame = self._observations(pixels, seen)
+        self._looks -= 1
+        for cycle in range(self._cycles):
+            requests = (self._goal,) if self._looks == 0 and cycle == 0 else ()
+            outputs = self._step(arm, *requests, observations=frame if cycle == 0 else ())
+            for event in outputs.events:
+                if event.kind == "reply" and not event.accepted:
+                    raise NoPathError(event.message)
+                if event.kind in LOST:
+                    return "; ".join(reason.code for reason in event.reasons) or event.kind
+        return ""
+
+    def _step(
+        self, arm: TaskArm, *commands: Command, observations: tuple[CameraObservation, ...] = (),
+        model_update: ModelUpdate | None = None,
+    ) -> StepOutputs:  # fmt: skip
+        self._now_ns += self._period_ns
+        self._seq += 1
+        requests = tuple(Request(self._seq, "task", command) for command in commands)
+        joints = JointState(self._seq, self._now_ns, arm.joints.copy(), np.zeros(len(arm.joints)))
+        outputs = self._core.step(
+            StepInputs(
+                self._now_ns, self._period_ns, joints, observations, requests, driver_active=self._active,
+                model_update=model_update,
+            )
+        )  # fmt: skip
+        if outputs.driver_request:
+            self._active = outputs.driver_request == "activate"
+        if outputs.command is not None:
+            arm.move(outputs.command, 1e-9 * self._period_ns)
+        return outputs
+
+    def _observations(self, pixels: FloatArray, seen: FloatArray) -> tuple[CameraObservation, ...]:
+        """Frames whose shutters open now, in hand in the next cycle."""
+        received = self._now_ns + self._period_ns
+        return tuple(
+            CameraObservation(
+                name,
+                self._seq,
+                self._now_ns,
+                received,
+                self._ids[there],
+                pixels[c, there],
+                self._covariances[there],
+            )
+            for c, name in enumerate(self._cameras)
+            if (there := seen[c] > 0.0).any()
+        )
+
+
+def _settings(
+    model: CellModel, limits: FloatArray, law: LawName, points: PointsName, gain: float, rate_hz: float
+) -> CoreSettings:
+    n = len(model.joint_names)
+    return CoreSettings(
+        cell="task",
+        joint_names=model.joint_names,
+        joint_kinds=model.joint_kinds,
+        cameras=tuple(
+            CameraSettings(camera.name, WIDTH, HEIGHT, rate_hz, "eye_to_hand", model.marker_ids)
+            for camera in model.cameras
+        ),
+        limits=LimitSettings(
+            limits[:, 0].copy(), limits[:, 1].copy(), np.array([SPEED[kind] for kind in model.joint_kinds]),
+            np.array([ACCELERATION[kind] for kind in model.joint_kinds]), 0.01,
+            np.zeros((0, n, 2)), (), 0.5, 0.1, 1.0,
+        ),
+        trials=None,
+        home=None,
+        rate_hz=CORE_RATE_HZ,
+        law=law,
+        points=points,
+        gain=gain,
+        tolerance_px=TOLERANCE_PX,
+        hold_frames=HOLD_FRAMES,
+        time_limit_s=1e6,
+        filter_s=0.2,
+        gate_sigma=6.0,
+        reanchor=False,
+    )  # fmt: skip
