@@ -16,9 +16,8 @@ from serial.tools import list_ports
 
 from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo.ports.discovery import BusScan, FoundBus, FoundDrive, JointChoice
-from stereoservo_drivers.can.channel import Channel, ChannelSettings
+from stereoservo_drivers.can.channel import Channel, ChannelSettings, read_state
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.socketcan import read_state
 from stereoservo_drivers.canopen.bringup import Link, Subscriptions
 from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.devices import CameraObservation, Detector, DriverContext, Frame, Prior
-from stereoservo_drivers.contracts.camera import check_observation
-from stereoservo_drivers.contracts.pacing import PacedSuite, measure, report_budget
+from stereoservo_drivers.contracts.camera import PacedSuite, check_observation, measure, report_budget
 
 
 class DetectorContract(PacedSuite):

@@ -43,7 +43,7 @@ COMMANDS: dict[str, str] = {
     "record": "record:record",
     "replay": "replay:replay",
     "export": "export:export",
-    "examine": "examine.command:examine",
+    "examine": "examine:examine",
     "ik": "ik:ik",
     "drivers": "drivers:drivers",
     "doctor": "doctor.command:doctor",

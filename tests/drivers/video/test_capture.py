@@ -18,8 +18,8 @@ import pytest
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video import sources
+from stereoservo_drivers.video.driver import Reader
 from stereoservo_drivers.video.options import Place, VideoOptions
-from stereoservo_drivers.video.reader import Reader
 from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
 from stereoservo_drivers.video.stream_monitor import Watch
 
@@ -357,7 +357,7 @@ class Hanging:
 
 @pytest.mark.parametrize("hang_in_open", [False, True])
 def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered(hang_in_open, monkeypatch):
-    monkeypatch.setattr("stereoservo_drivers.video.reader.JOIN_S", 0.05)
+    monkeypatch.setattr("stereoservo_drivers.video.driver.JOIN_S", 0.05)
     source, watch = Hanging(hang_in_open), Watch(30.0)
     place = Place("device", "/dev/video0", device=0)
     reader = Reader(source, place, options(open_timeout_s=0.05), "left", watch)

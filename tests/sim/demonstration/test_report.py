@@ -11,16 +11,14 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from stereoservo_sim.demonstration.report_figures import (
-    draw_errors,
-    draw_paths,
-    draw_residuals,
-    draw_velocities,
-)
 from stereoservo_sim.demonstration.results import (
     CalibrationPlots,
     GoalPlots,
     ReportData,
+    draw_errors,
+    draw_paths,
+    draw_residuals,
+    draw_velocities,
     render_report,
     write_report,
 )
