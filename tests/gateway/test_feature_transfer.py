@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.cli.goal.target_options import target_tree
+from stereoservo.cli.goal import target_tree
 from stereoservo.cli.output import CommandError
 from stereoservo.gateway.goal_transfer import resolve
 from stereoservo.gateway.point_alignment import TransferError, fixed_line

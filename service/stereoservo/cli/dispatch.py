@@ -25,7 +25,7 @@ COMMANDS: dict[str, str] = {
     "run": "run:run",
     "status": "status:status",
     "stop": "stop:stop",
-    "goal": "goal.command:goal",
+    "goal": "goal:goal",
     "teach": "teach:teach",
     "jog": "jog:jog",
     "auxiliary": "auxiliary:auxiliary",

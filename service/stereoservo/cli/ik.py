@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereoservo.cli.goal.target_options import make_goal, target_tree
+from stereoservo.cli.goal import make_goal, target_tree
 from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, emit
 from stereoservo.client import Client
 from stereoservo.client.errors import RefusedError

@@ -11,7 +11,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 import msgspec
 from zenoh.handlers import RingChannel
@@ -20,22 +20,29 @@ from stereoservo.client.connection import NEXT_EVENT, Connection, read_message
 from stereoservo.client.errors import ClientError, DaemonLostError, FailedError, TimedOutError
 from stereoservo.client.events import POLL_S, EventWatch, HeardEvents
 from stereoservo.client.goal_handle import GoalHandle, Lease
-from stereoservo.client.targets import GoalOptions, as_target
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import (
+    AdaptiveGain,
     Calibrate,
+    Centre,
     Disable,
     Enable,
+    FeatureTarget,
     Goal,
     Hold,
     Home,
+    JacobianName,
     Jog,
     JointTarget,
+    LawName,
     OrderAuxiliary,
+    PointSource,
+    ProfileName,
     Reset,
     Resume,
     Stop,
     Target,
+    TaughtTarget,
     Teach,
 )
 from stereoservo.messages.wire import (
@@ -417,3 +424,46 @@ def _run(
             with suppress(TimedOutError):  # the model exists; an event announces its report, if it comes
                 heard.wait(("calibration_report",), "the report", REPORT_TIMEOUT_S)
     return end
+
+
+# -- targets -------------------------------------------------------------------------------------------------
+# Short forms of a goal's target (name, joint positions or set-points) and options, converted to messages.
+
+
+class GoalOptions(TypedDict, total=False):
+    """Fields of `Goal` beside id and target; the cell's default applies to those left out."""
+
+    law: LawName | None
+    points: PointSource | None
+    jacobian: JacobianName | None
+    centre: Centre | None
+    cameras: tuple[str, ...] | None
+    profile: ProfileName | None
+    posture: dict[str, float] | None
+    gain: float | AdaptiveGain | None
+    damping: float | None
+    tolerance_px: float | None
+    hold_frames: int | None
+    speed_scale: float
+    lease_s: float | None
+    time_limit_s: float | None
+    mode: Literal["preempt", "queue"]
+    blend_px: float | None
+    acknowledge_s: float | None
+    follow_markers: tuple[int, ...]
+
+
+def as_target(target: Target | str | Mapping[str, Any]) -> Target:
+    """A target from its short form: a taught goal's name, positions by joint, or set-points by camera."""
+    if isinstance(target, str):
+        return TaughtTarget(target)
+    if isinstance(target, Mapping):
+        if all(isinstance(value, Mapping) for value in target.values()) and target:
+            return FeatureTarget(
+                {
+                    camera: {int(marker): (float(u), float(v)) for marker, (u, v) in points.items()}
+                    for camera, points in target.items()
+                }
+            )
+        return JointTarget({str(name): float(value) for name, value in target.items()})
+    return target

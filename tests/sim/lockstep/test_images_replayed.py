@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.trial_data import TrialData, load_trials
-from stereoservo.cli.calibrate.recorded_images import RecordedTrialCollector
+from stereoservo.cli.calibrate.stored_trials import RecordedTrialCollector
 from stereoservo.cli.main import invoke
 from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.daemon.jobs.recorded_set_points import SetPointError, set_points_from_images

@@ -16,12 +16,13 @@ from stereoservo_sim.emulators.nodes.drive_motion import (
     FOLLOWING_ERROR,
     PROFILE_POSITION,
     PROFILE_VELOCITY,
+    Cia402State,
     DriveMotion,
+    PowerMachine,
 )
 from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
 from stereoservo_sim.emulators.nodes.pdo import DEADLINE, ProcessData
 from stereoservo_sim.emulators.nodes.sdo_server import SdoServer
-from stereoservo_sim.emulators.nodes.state_machine import Cia402State, PowerMachine
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 
 COMMUNICATION, HEARTBEAT_LOST, SYNC_LOST, PASSIVE = 0x8100, 0x8130, 0x8700, 0x8120

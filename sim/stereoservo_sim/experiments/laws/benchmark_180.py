@@ -18,7 +18,15 @@ from stereoservo.planning.three_point_decomposition import decompose
 from stereoservo_sim.experiments.laws.benchmark_figures import draw_benchmark_180
 from stereoservo_sim.experiments.laws.driven_tasks import decay, image_errors, images, thinned
 from stereoservo_sim.progress import ProgressCall
-from stereoservo_sim.tasks.arms import MID_RANGE, PLATE_ON_FLANGE, RX90_LIMITS, ArmName, free_cell, rx90_cell
+from stereoservo_sim.tasks.arms import (
+    MID_RANGE,
+    PLATE_ON_FLANGE,
+    RX90_LIMITS,
+    ArmName,
+    free_cell,
+    inverse_kinematics,
+    rx90_cell,
+)
 from stereoservo_sim.tasks.calibrations import (
     Knowledge,
     TaskCalibration,
@@ -30,7 +38,6 @@ from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, Trace, r
 from stereoservo_sim.tasks.ground_truth import line_deviations, sight
 from stereoservo_sim.tasks.setting import FACE, HOMOGENEOUS_MARKERS, camera_poses, cartesian_twists
 from stereoservo_sim.tasks.task_file import AlignmentTask
-from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SyntheticCell, rotation, translation
 
