@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     ABORT_OPTION,
@@ -51,6 +50,7 @@ from stereoservo_drivers.canopen.cia402_words import (
     error_words,
     is_communication_error,
 )
+from stereoservo_drivers.canopen.codec import Link, listening, until
 from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.option_checks import check_load
 from stereoservo_drivers.canopen.options import CanOptions, CanOutput, CommandMode

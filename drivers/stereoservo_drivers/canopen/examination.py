@@ -16,9 +16,9 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import DriverError, ExaminationFinding, JointDriver, MayMove
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Bringup, listening
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
+from stereoservo_drivers.canopen.codec import Bringup, listening
 from stereoservo_drivers.canopen.master import Master
 from stereoservo_drivers.canopen.nodes import examine_nodes, other_bitrate, scan
 from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup

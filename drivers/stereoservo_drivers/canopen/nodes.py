@@ -18,7 +18,6 @@ from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo.ports.discovery import BusScan, FoundBus, FoundDrive, JointChoice
 from stereoservo_drivers.can.channel import Channel, ChannelSettings, read_state
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Link, Subscriptions
 from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     GUARD_TIME,
@@ -34,6 +33,7 @@ from stereoservo_drivers.canopen.cia402_configuration import (
 from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
+from stereoservo_drivers.canopen.codec import Link, Subscriptions
 from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions

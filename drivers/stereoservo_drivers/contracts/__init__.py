@@ -11,8 +11,6 @@ Subclass one in your own tests, override the factory of your driver, and run pyt
 Needs pytest, which the service itself does not.
 """
 
-from stereoservo_drivers.contracts.camera import CameraDriverContract
-from stereoservo_drivers.contracts.detector import DetectorContract
-from stereoservo_drivers.contracts.joints import JointDriverContract
+from stereoservo_drivers.contracts.suites import CameraDriverContract, DetectorContract, JointDriverContract
 
 __all__ = ["CameraDriverContract", "DetectorContract", "JointDriverContract"]

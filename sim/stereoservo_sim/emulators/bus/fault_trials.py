@@ -17,7 +17,7 @@ import numpy as np
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Subscriptions
+from stereoservo_drivers.canopen.codec import Subscriptions
 from stereoservo_drivers.canopen.driver import make_bringup, make_codec
 from stereoservo_drivers.canopen.master import Master, MasterFault, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions

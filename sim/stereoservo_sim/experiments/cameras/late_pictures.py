@@ -18,7 +18,7 @@ from rich.console import Console
 
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.kinematics.shutter_stamps import ShutterOffset
+from stereoservo.kinematics.model import ShutterOffset
 from stereoservo_sim.experiments.experiment import draw_sorted, show_rows
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.summaries import count_row
