@@ -609,10 +609,6 @@ def _wait_for_others() -> None:
     fcntl.flock(lock, fcntl.LOCK_EX)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 # -- kernels of laws -----------------------------------------------------------------------------------------
 # Compilation of the numba kernels of control laws, incidences, mobility and self-motion: each runs once on an example
 # arm, so that the servo loop compiles none.
@@ -751,3 +747,7 @@ def _request() -> PlanRequest:
 
 def _of_height_1(points: FloatArray) -> FloatArray:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -352,10 +352,6 @@ def main() -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 # -- light of pictures ---------------------------------------------------------------------------------------
 # Why no marker is seen: a picture that is too dark, or too bright.
 
@@ -410,3 +406,7 @@ class LightWatch:
         code = "" if found is None else found[0]
         new, self._code = code != self._code, code or self._code
         return (code, f"sees no marker: {found[1]}") if found is not None and new else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
