@@ -10,6 +10,7 @@ from pathlib import Path
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.options import CanJoint
+from stereoservo_sim.emulators.nodes.communication import DEADLINE, ProcessData, SdoServer
 from stereoservo_sim.emulators.nodes.dictionary import Abort, Dictionary, SdoError, Value
 from stereoservo_sim.emulators.nodes.drive_motion import (
     CYCLIC_VELOCITY,
@@ -21,8 +22,6 @@ from stereoservo_sim.emulators.nodes.drive_motion import (
     PowerMachine,
 )
 from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
-from stereoservo_sim.emulators.nodes.pdo import DEADLINE, ProcessData
-from stereoservo_sim.emulators.nodes.sdo_server import SdoServer
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 
 COMMUNICATION, HEARTBEAT_LOST, SYNC_LOST, PASSIVE = 0x8100, 0x8130, 0x8700, 0x8120

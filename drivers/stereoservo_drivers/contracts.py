@@ -1,4 +1,15 @@
-"""Contract tests of camera drivers, detectors and joint drivers."""
+"""Contract tests, as pytest classes: what every joint driver, camera driver and detector must fulfil.
+
+Subclass one in your own tests, override the factory of your driver, and run pytest::
+
+    from stereoservo_drivers.contracts import JointDriverContract
+
+    class TestMyArm(JointDriverContract):
+        def make_driver(self, context):
+            return MyArm({"port": "/dev/ttyUSB0"}, context)
+
+Needs pytest, which the service itself does not.
+"""
 
 from __future__ import annotations
 
