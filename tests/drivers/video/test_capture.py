@@ -175,7 +175,7 @@ def device(monkeypatch):
     made.kernel = Kernel()
     monkeypatch.setattr(sources.cv2, "VideoCapture", lambda *_: made)
     monkeypatch.setattr(CaptureSource, "_check_device", lambda self: None)
-    monkeypatch.setattr(sources.v4l2, "opened", lambda _path: nullcontext(made.kernel))
+    monkeypatch.setattr(sources, "opened", lambda _path: nullcontext(made.kernel))
     return made
 
 
