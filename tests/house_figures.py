@@ -32,11 +32,11 @@ TODAY = {
     "files in a core step as read, stereo": 21,
     "files in the goal-accepting step, stereo": 27,
     "files in a core step as run, cartesian3": 16,
-    "files in a core step as read, cartesian3": 27,
+    "files in a core step as read, cartesian3": 26,
     "hops in a core step, cartesian3": 44,
     "files in the goal-accepting step, cartesian3": 27,
-    "files from image to velocity as run": 30,
-    "files from image to velocity as read": 45,
+    "files from image to velocity as run": 29,
+    "files from image to velocity as read": 43,
 }
 """Figures that are beyond what is asked: they may only fall, and whoever makes one smaller lowers it here."""
 MODULE_LINES, FUNCTION_LINES = 900, 80
