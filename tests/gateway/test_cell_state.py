@@ -23,8 +23,8 @@ from stereoservo.daemon.heartbeat import (
     HeartbeatWriter,
 )
 from stereoservo.daemon.seqlock import create_slot
+from stereoservo.gateway.intake import NAMELESS, sender
 from stereoservo.gateway.process import CameraWatch, CellState
-from stereoservo.gateway.stop_thread import NAMELESS, sender
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Stop
 from stereoservo.messages.reasons import Reason

@@ -24,13 +24,18 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.ports.discovery import FoundCamera
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
-from stereoservo_drivers.video.genicam import GenicamSource
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, Place, VideoOptions, decode_video_options, frozen_frames
 from stereoservo_drivers.video.pictures import check_size, one_channel
 from stereoservo_drivers.video.playback import Playback
 from stereoservo_drivers.video.server_clock import ServerClock
-from stereoservo_drivers.video.sources import CaptureSource, LiveSource, Settings, SourcePicture
+from stereoservo_drivers.video.sources import (
+    CaptureSource,
+    GenicamSource,
+    LiveSource,
+    Settings,
+    SourcePicture,
+)
 from stereoservo_drivers.video.stream_monitor import Watch
 
 LIVE_BUDGET_US = 1000.0

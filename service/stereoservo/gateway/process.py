@@ -44,11 +44,10 @@ from stereoservo.daemon.ipc_messages import (
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
-from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
-from stereoservo.gateway.intake import Intake, payload_of
+from stereoservo.gateway.intake import Intake, StopThread, payload_of
 from stereoservo.gateway.model_updates import RefinementJobs, RelocalizationJobs
 from stereoservo.gateway.observation_cache import ObservationCache
-from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
+from stereoservo.gateway.persistence import HandledEvents, Journal, ModelStore, OpenGoalRecord, TaughtStore
 from stereoservo.gateway.publisher import (
     SILENT,
     EventLog,
@@ -61,7 +60,6 @@ from stereoservo.gateway.publisher import (
 )
 from stereoservo.gateway.recordings import CannotRecordError, Recordings
 from stereoservo.gateway.servo_connection import ServoConnection
-from stereoservo.gateway.stop_thread import StopThread
 from stereoservo.gateway.teaching import TaughtGoalRegistry
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.gateway.zenoh_config import (

@@ -33,9 +33,8 @@ from stereoservo.messages.goals import Goal, GoalId, Name, StreamedTarget, Updat
 from stereoservo.messages.wire import MessageError, Reply, decode
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, refusal
-from stereoservo.web.leases import LEASE_S
 from stereoservo.web.model_view import ModelView, drag_answer
-from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
+from stereoservo.web.rights import LEASE_S, ArmHolder, RightsError, allowed_hosts, check_host, check_origin
 
 FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
