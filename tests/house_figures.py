@@ -42,6 +42,10 @@ MODULE_LINES, FUNCTION_LINES = 900, 80
 KERNEL_ARGUMENTS = 6
 PARAMETERS, VERBS = 10, 4
 """Parameters of a function; and verbs of the command line that have more, one for each option."""
+ONE_IMPORTER, ONE_IN_FOLDER = 111, 65
+"""Modules that one other module alone imports, and those of them in its own folder: a piece that is not read without
+its importer stands in it. They may only become fewer, and whoever joins one lowers them here.
+"""
 LAWS = ("stereo", "cartesian3")
 LAW_NAMES = re.compile(r"""["'](stereo|cartesian3|cartesian2)["']""")
 """Names that are nothing but laws: `image`, `points` and `trajectory` are words of other things, too."""
@@ -501,6 +505,32 @@ def circle_figure() -> Figure:
     return Figure("import circles", len(circles), 0, circles)
 
 
+def importer_figures() -> list[Figure]:
+    """Modules that exactly one other module imports, wherever in it, and those in its folder. What pyproject.toml names
+    as an entry point has an importer more; packages are no modules of their own.
+    """
+    paths = {_dotted(path): path for path in modules()}
+    importers: dict[str, set[str]] = defaultdict(set)
+    for name, path in paths.items():
+        for imported in _imported_by(ast.walk(ast.parse(path.read_text())), set(paths)) - {name}:
+            importers[imported].add(name)
+    for group in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"].values():
+        for entry in group.values():
+            importers[entry.partition(":")[0]].add("pyproject.toml")
+    single = {
+        name: next(iter(importers[name]))
+        for name, path in paths.items()
+        if path.name != "__init__.py" and len(importers[name]) == 1
+    }
+    single = {name: importer for name, importer in single.items() if importer in paths}
+    beside = {name: one for name, one in single.items() if paths[one].parent == paths[name].parent}
+    title = "modules with one importer"
+    return [
+        Figure(title, len(single), ONE_IMPORTER, tuple(f"{name} <- {one}" for name, one in single.items())),
+        Figure(f"{title} in the same folder", len(beside), ONE_IN_FOLDER, tuple(sorted(beside))),
+    ]
+
+
 def _dotted(path: Path) -> str:
     folder = next(folder for folder in PRODUCT if folder in path.parents)
     parts = (folder.name, *path.relative_to(folder).with_suffix("").parts)
@@ -508,8 +538,13 @@ def _dotted(path: Path) -> str:
 
 
 def _imported(path: Path, known: set[str]) -> set[str]:
+    """Modules that are imported when the one at ``path`` is loaded."""
+    return _imported_by(_module_level(ast.parse(path.read_text()).body), known)
+
+
+def _imported_by(nodes: Iterable[ast.AST], known: set[str]) -> set[str]:
     found = set()
-    for node in _module_level(ast.parse(path.read_text()).body):
+    for node in nodes:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -577,7 +612,9 @@ def modules_with_law_names() -> list[str]:
 def main() -> int:
     """Print all figures; 1 where one is beyond its limit."""
     sizes = [module_figure(), function_figure(), *parameter_figures(), argument_figure()]
-    figures = [*sizes, circle_figure(), *path_figures()]
+    importers = importer_figures()
+    figures = [*sizes, circle_figure(), *importers, *path_figures()]
+    print(f"     files: {sum(1 for _ in modules())}")
     for figure in figures:
         print(f"{'ok  ' if figure.within else 'OVER'} {figure.name}: {figure.value} (limit {figure.limit})")
         for item in figure.items:

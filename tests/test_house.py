@@ -23,6 +23,28 @@ def test_modules_do_not_import_each_other_in_circles():
     assert house.circle_figure().items == ()
 
 
+def test_few_modules_have_one_importer():
+    """These only become fewer: whoever joins one to its importer lowers `ONE_IMPORTER` and `ONE_IN_FOLDER`."""
+    for figure in house.importer_figures():
+        assert figure.within, (figure.name, figure.value, figure.items)
+
+
+def test_importers_are_counted_in_functions_and_as_entry_points(product_of, tmp_path):
+    (tmp_path / "pyproject.toml").write_text('[project.entry-points."a"]\nb = "stereoservo.plugin:make"\n')
+    product_of(
+        "one/user.py", "def late():\n    from stereoservo.one import piece\nimport stereoservo.plugin\n"
+    )
+    product_of("one/piece.py", "")
+    product_of("plugin.py", "from stereoservo import shared\n")
+    product_of("shared.py", "")
+    product_of("other.py", "from stereoservo.shared import name\nimport stereoservo.one.user\n")
+    single, beside = house.importer_figures()
+    assert set(single.items) == {
+        "stereoservo.one.piece <- stereoservo.one.user", "stereoservo.one.user <- stereoservo.other",
+    }  # fmt: skip
+    assert beside.items == ("stereoservo.one.piece",)
+
+
 def test_modules_are_not_longer_than_the_limit():
     assert house.module_figure().items == ()
 
@@ -44,7 +66,7 @@ def product_of(tmp_path, monkeypatch):
 
     def product(path, text):
         module = tmp_path / "service/stereoservo" / path
-        module.parent.mkdir(parents=True)
+        module.parent.mkdir(parents=True, exist_ok=True)
         module.write_text(text)
         monkeypatch.setattr(house, "ROOT", tmp_path)
         monkeypatch.setattr(house, "PRODUCT", (tmp_path / "service/stereoservo",))

@@ -17,7 +17,7 @@ from stereoservo.ports.devices import CameraDescription, DriverContext, DriverEr
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.simulated_arm import ArmOptions, SimulatedArm, cell_of_context
 from stereoservo_drivers.simulated_camera import ArmByRow, CameraOptions, SimulatedCamera
-from stereoservo_sim.world.scenery.lighting import Lighting
+from stereoservo_sim.world.lighting import Lighting
 from stereoservo_sim.world.velocity_drives import Plant
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from stereoservo.cli.doctor.camera_findings import (
     mean_observations,
     near_border,
 )
-from stereoservo.cli.doctor.view_consistency import examine_views, reprojection_rms
+from stereoservo.cli.doctor.cameras import examine_views, reprojection_rms
 from stereoservo.geometry.cameras import project_many
 from stereoservo.kinematics.model import CameraModel
 from stereoservo.ports.devices import (

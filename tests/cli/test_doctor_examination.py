@@ -14,7 +14,7 @@ import pytest
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor import command
 from stereoservo.cli.doctor import joints as examination_module
-from stereoservo.cli.setup.commissioning import in_fault
+from stereoservo.cli.setup.command import in_fault
 from stereoservo.daemon.cell_preparation import make_plan
 from stereoservo.daemon.ipc_messages import RunPlan
 from stereoservo.daemon.plant_driver import make_driver

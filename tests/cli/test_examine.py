@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.examination.recorded_views import RecordedViews
-from stereoservo.cli.examine.folder import read_folder
+from stereoservo.cli.examine import read_folder
 from stereoservo.cli.main import invoke
 from stereoservo_sim.experiments.examined_recordings import examined_case
 

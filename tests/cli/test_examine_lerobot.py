@@ -28,7 +28,7 @@ from lerobot_sets import (
     write_by_lerobot,
     write_in_av1,
 )
-from stereoservo.cli.examine.lerobot import read_data_set
+from stereoservo.cli.examine import read_data_set
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
 from stereoservo.ports.lerobot import DataSetError, Feature, Info, camera_features

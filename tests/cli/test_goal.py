@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from stereoservo.cli.goal import target_options
-from stereoservo.cli.goal.command import plan_table
-from stereoservo.cli.goal.target_options import adaptive, make_goal, stream_lines, target_tree
+from stereoservo.cli import target_options
+from stereoservo.cli.goal import plan_table
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
 from stereoservo.cli.status import progress_words
+from stereoservo.cli.target_options import adaptive, make_goal, stream_lines, target_tree
 from stereoservo.cli.teach import read_drawing
 from stereoservo.messages.goals import (
     AdaptiveGain,

@@ -26,7 +26,7 @@ PROGRAM = """
 import sys
 from pathlib import Path
 import msgspec
-from stereoservo.cli.local_state import newest_state
+from stereoservo.cli.status import newest_state
 from stereoservo.messages.directories import CellDirectories
 
 state = newest_state(CellDirectories("bench", Path(sys.argv[1]), Path(sys.argv[1])))

@@ -11,9 +11,8 @@ import pytest
 from typer.main import get_command
 
 from stereoservo.cli.calibrate.command import _lines, _telling
-from stereoservo.cli.dispatch import COMMANDS, app
+from stereoservo.cli.dispatch import COMMANDS, EXAMPLES, GROUPS, OTHERS, app, grouped
 from stereoservo.cli.output import cells_beginning, coloured
-from stereoservo.cli.verb_groups import EXAMPLES, GROUPS, OTHERS, grouped
 from stereoservo.messages.directories import state_root
 from stereoservo.messages.wire import EventMessage
 from stereoservo.ports import plugins

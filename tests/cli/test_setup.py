@@ -16,10 +16,10 @@ import typer
 
 from stereoservo.cli import main as cli
 from stereoservo.cli.doctor.camera_findings import CameraRecord
+from stereoservo.cli.doctor.cameras import same_camera_twice
 from stereoservo.cli.doctor.plate_motion import examine_sides, judge_turn, turn_between
-from stereoservo.cli.doctor.view_consistency import same_camera_twice
 from stereoservo.cli.output import CommandError, shipped_or_path
-from stereoservo.cli.setup.commissioning import eye_finding
+from stereoservo.cli.setup.command import eye_finding
 from stereoservo.cli.setup.dialogue import Dialogue
 from stereoservo.cli.setup.interview import (
     chosen_cameras,
@@ -32,8 +32,7 @@ from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverError
 from stereoservo.ports.discovery import BusScan, FoundCamera, FoundDrive, JointChoice
 from stereoservo_drivers.canopen.nodes import found_buses, proposed_options, stated_limits
-from stereoservo_drivers.video.discovery import found_cameras, modes_told, usual_rate
-from stereoservo_drivers.video.driver import VideoCameraDriver
+from stereoservo_drivers.video.driver import VideoCameraDriver, found_cameras, modes_told, usual_rate
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell
 
 SIGMA_PX = 0.05

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from stereoservo.cli import record
-from stereoservo.client import Client, FailedError, calibration_requests, client, events
+from stereoservo.client import Client, FailedError, client, events
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.keys import KeySpace
@@ -223,4 +223,4 @@ def test_a_report_that_does_not_come_is_not_waited_for_without_end(monkeypatch: 
     made = ScriptedClient([[CALIBRATED]])
     monkeypatch.setattr(events, "time", made)
     assert made.calibrate(report=True, lease_s=None) == RESULT
-    assert made.now - 100.0 == pytest.approx(calibration_requests.REPORT_TIMEOUT_S, abs=1.0)
+    assert made.now - 100.0 == pytest.approx(client.REPORT_TIMEOUT_S, abs=1.0)

@@ -13,7 +13,7 @@ from stereoservo.control.incidence import (
     joint_task,
 )
 from stereoservo.control.law import Options, Scene
-from stereoservo.control.law_warmup import warm_up_incidences
+from stereoservo.daemon.kernel_compilation import warm_up_incidences
 from stereoservo.kinematics import kernels
 from stereoservo.numerics import linear
 

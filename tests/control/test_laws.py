@@ -9,10 +9,10 @@ from oracles.points import points_velocity
 from oracles.trajectory import trajectory_velocity
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.control.law_warmup import warm_up_laws
+from stereoservo.daemon.kernel_compilation import warm_up_laws
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.numerics.compilation import overloads
-from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
+from stereoservo_sim.tasks.closed_loop import CLASSICAL, euclidean_points
 
 PERIOD = 0.04
 FREE, SERIAL = Composition.SIMULTANEOUS, Composition.BASE_FIRST

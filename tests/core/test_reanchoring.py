@@ -15,7 +15,7 @@ from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import PoseMeasurement
 from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, relocalize_from_events
-from stereoservo.kinematics.shutter_stamps import ShutterOffset
+from stereoservo.kinematics.model import ShutterOffset
 from stereoservo.messages.goals import (
     Calibrate,
     CancelGoal,

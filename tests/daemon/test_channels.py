@@ -20,7 +20,7 @@ from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT
 from stereoservo.daemon.ipc_messages import Received, Report, event_decoder, report_decoder
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot
 from stereoservo.daemon.servo_links import ProcessLinks
-from stereoservo.gateway.crash_records import HandledEvents
+from stereoservo.gateway.persistence import HandledEvents
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Hold

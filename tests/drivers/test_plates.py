@@ -15,10 +15,9 @@ from typer.testing import CliRunner
 
 from stereoservo.ports.devices import DriverContext, Frame
 from stereoservo.ports.dot_plates import FACES
-from stereoservo_drivers.commands.print_plate import print_plate
+from stereoservo_drivers.commands.print_plate import DotPlates, PlateError, faces_named, lay_out, print_plate
 from stereoservo_drivers.detectors.aruco import TagDetector
 from stereoservo_drivers.detectors.dots import DotDetector
-from stereoservo_drivers.plates import DotPlates, PlateError, faces_named, lay_out
 
 app = typer.Typer()
 app.command()(print_plate)

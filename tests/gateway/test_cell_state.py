@@ -23,8 +23,8 @@ from stereoservo.daemon.heartbeat import (
     HeartbeatWriter,
 )
 from stereoservo.daemon.seqlock import create_slot
-from stereoservo.gateway.cell_state import CameraWatch, CellState
-from stereoservo.gateway.stop_thread import NAMELESS, sender
+from stereoservo.gateway.intake import NAMELESS, sender
+from stereoservo.gateway.process import CameraWatch, CellState
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Stop
 from stereoservo.messages.reasons import Reason
@@ -123,7 +123,7 @@ class Halted:
         self.state = CellState(plan, "b", servo)
         self.state.newest = SimpleNamespace()  # type: ignore[assignment]
         monkeypatch.setattr(
-            "stereoservo.gateway.cell_state.state_message",
+            "stereoservo.gateway.process.state_message",
             lambda *_, **__: msgspec.structs.replace(STATE, reasons=self.reasons),
         )
 

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from stereoservo.core.cycle import Event
-from stereoservo.gateway import crash_records
-from stereoservo.gateway.crash_records import HandledEvents, OpenGoalRecord
+from stereoservo.gateway import persistence
+from stereoservo.gateway.persistence import HandledEvents, OpenGoalRecord
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.run_record import OpenGoal, begin_run, end_run, read_goals, run_is_up
@@ -140,15 +140,15 @@ class FullDisk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.full, self.now = True, 100.0
-        write = crash_records.write_goals
+        write = persistence.write_goals
 
         def write_goals(directories: CellDirectories, goals: tuple[OpenGoal, ...]) -> None:
             if self.full:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             write(directories, goals)
 
-        monkeypatch.setattr(crash_records, "write_goals", write_goals)
-        monkeypatch.setattr(crash_records, "time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(persistence, "write_goals", write_goals)
+        monkeypatch.setattr(persistence, "time", SimpleNamespace(monotonic=lambda: self.now))
 
 
 def with_a_goal_on_a_full_disk(

@@ -21,10 +21,9 @@ from stereoservo.daemon.kernel_compilation import example_model, example_setting
 from stereoservo.daemon.supervisor import record_run
 from stereoservo.gateway import persistence, recordings
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
-from stereoservo.gateway.crash_records import OpenGoalRecord
 from stereoservo.gateway.model_updates import RelocalizationJobs
 from stereoservo.gateway.observation_cache import ObservationCache
-from stereoservo.gateway.persistence import Journal, ModelStore, TaughtStore
+from stereoservo.gateway.persistence import Journal, ModelStore, OpenGoalRecord, TaughtStore
 from stereoservo.gateway.publisher import EventLog, KeeperNotes
 from stereoservo.gateway.recordings import Recordings
 from stereoservo.gateway.servo_connection import ServoConnection

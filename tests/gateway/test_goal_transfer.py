@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.gateway.cad_goals import synthesise
 from stereoservo.gateway.goal_transfer import resolve
 from stereoservo.gateway.marker_views import taught_views
 from stereoservo.gateway.point_alignment import TransferError
+from stereoservo.gateway.teaching import synthesise
 from stereoservo.geometry.distortion import distort
 from stereoservo.messages.goals import TaughtTarget
 from stereoservo.messages.wire import Synthesise

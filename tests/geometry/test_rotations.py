@@ -17,12 +17,13 @@ from oracles.jordan_frames import (
 )
 from stereoservo.geometry.cameras import project_many, triangulate
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.rotation_fit import bundle_rotation, rotation_motion
-from stereoservo.geometry.rotations import (
+from stereoservo.geometry.rotation_fit import (
     RotationChart,
+    bundle_rotation,
     rotation_chart,
     rotation_frame,
     rotation_from_parameters,
+    rotation_motion,
     rotation_parameter_derivatives,
     rotation_parameters,
 )

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from oracles.subspace_algebra import included, join, meet
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.subspaces import basis, coincident, dimension, dual, incidence_matrix, relation
+from stereoservo.geometry.incidences import basis, coincident, dimension, dual, incidence_matrix, relation
 
 seeds = st.integers(0, 2**32 - 1)
 spaces = st.integers(2, 6)

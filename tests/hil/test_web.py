@@ -28,7 +28,7 @@ pytest.importorskip("websockets", reason="the page's server needs websockets (ex
 from websockets.sync.client import connect
 
 from stereoservo.web.cell_link import CellLink
-from stereoservo.web.leases import LEASE_S
+from stereoservo.web.rights import LEASE_S
 
 
 class Page:

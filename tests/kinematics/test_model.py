@@ -19,13 +19,13 @@ from stereoservo.kinematics.model import (
     JointStatistics,
     MarkerGroup,
     ModelFileError,
+    ShutterOffset,
     check_model,
     decode_model,
     encode_model,
     load_model,
     save_model,
 )
-from stereoservo.kinematics.shutter_stamps import ShutterOffset
 from stereoservo.messages.files import write_atomically
 
 SCENE = (901, 902, 903, 904)

@@ -1,4 +1,4 @@
-"""Visibility of a face in numpy: the readable reference of the visibility in `control.laws.cartesian3`."""
+"""Visibility of a face in numpy: the readable reference of that of `control.laws.cartesian3`."""
 
 from __future__ import annotations
 

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.geometry.subspaces import (
-    TOLERANCE,
-    _same_space,
-    basis,
-    dual,
-    relation,
-)
+from stereoservo.geometry.incidences import TOLERANCE, _same_space, basis, dual, relation
 from stereoservo.numerics.arrays import FloatArray
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 import stereoservo.kinematics
 import stereoservo.planning
+from stereoservo.daemon.kernel_compilation import warm_up_planner
 from stereoservo.planning.planner import plan
-from stereoservo.planning.planner_warmup import warm_up_planner
 from stereoservo.planning.tracking import advance, sample_plan
 
 

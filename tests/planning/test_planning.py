@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from oracles.path_visibility import joint_rooms, keep_out_rooms
 from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.kinematics.composition import Composition
+from stereoservo.planning.path_search import sample_times
 from stereoservo.planning.planner import (
     MISSING_FREEDOMS,
     Planning,
@@ -17,7 +18,6 @@ from stereoservo.planning.planner import (
     start_planning,
 )
 from stereoservo.planning.primitives import TRANSLATION
-from stereoservo.planning.time_scaling import sample_times
 
 
 def dense_rooms(virtual, cells, world, joints, count=400):

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stereoservo.planning.path_search import sample_times
 from stereoservo.planning.plan import Plan
-from stereoservo.planning.time_scaling import sample_times
 from stereoservo.planning.tracking import sample_plan
 
 K = 65

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stereoservo.ports.picture_light import LightWatch, judge_light
+from stereoservo.daemon.vision import LightWatch, judge_light
 
 GOOD = np.tile(np.linspace(5, 200, 640).astype(np.uint8), (480, 1))
 

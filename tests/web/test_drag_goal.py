@@ -5,7 +5,7 @@ import pytest
 
 from core.conftest import BASE, Truth, make_truth
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.web.drag_goal import DragModel
+from stereoservo.web.model_view import DragModel
 
 START = BASE + np.array([0.0, -0.2, 0.4, 0.0, -0.2, 0.0])
 """At `BASE` the arm is nearly stretched out."""

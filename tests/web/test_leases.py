@@ -5,7 +5,7 @@ import zenoh
 
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.wire import EventMessage
-from stereoservo.web.leases import Leases
+from stereoservo.web.rights import Leases
 
 
 class Session:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from core.conftest import BASE, ROWS, link, make_truth
-from stereoservo.web.scene import Scene
+from stereoservo.web.model_view import Scene
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -21,7 +21,7 @@ from stereoservo.client import Client, ClientError
 from stereoservo.messages.goals import Goal, TaughtTarget
 from stereoservo.messages.wire import Reply
 from stereoservo.web import server as page_server
-from stereoservo.web.requests import PageRequest
+from stereoservo.web.server import PageRequest
 from web.page_bench import serving
 
 EXAMPLE = Client.make_goal(TaughtTarget("a"))

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import difflib
 import errno
+import json
+import shutil
 import socket
+import subprocess
 import termios
 import time
 from collections import deque
@@ -16,8 +19,6 @@ import msgspec
 
 from stereoservo.messages.addresses import Address
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.can import socketcan
-from stereoservo_drivers.can.bus_errors import BUS_OFF, BusError, bus_error
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.messages import from_message, to_message
 from stereoservo_drivers.can.slcan import SlcanBus, SlcanGarbledError, SlcanRefusedError
@@ -188,16 +189,16 @@ class Channel:
         except Exception as error:  # interfaces of others, without their maker's library, raise anything
             raise self._not_opened(error) from error
         if options.interface == "socketcan":
-            socketcan.enlarge_receive_buffer(bus)
+            enlarge_receive_buffer(bus)
         return bus
 
     def _check_socketcan(self, channel: str) -> None:
         if not hasattr(socket, "AF_CAN"):
             raise self._error("can_open", "this system has no socketcan; use another interface")
-        state = socketcan.read_state(channel)
+        state = read_state(channel)
         if state is None:
             return
-        reason = socketcan.objection(state, channel, self._options.bitrate)
+        reason = objection(state, channel, self._options.bitrate)
         if reason is not None:
             raise self._error("can_open", reason, retry=True)
         if state.restart_ms:
@@ -308,3 +309,142 @@ def _errno(error: BaseException | None) -> int | None:
 def _wrong(error: BaseException) -> bool:
     """Whether the configuration is at fault, and not the hardware."""
     return isinstance(error, (TypeError, ValueError, ImportError, can.CanInterfaceNotImplementedError))
+
+
+# -- errors of the bus ---------------------------------------------------------------------------------------
+# Decoding of a CAN controller's error frames into text.
+
+
+BUS_OFF = "bus_off"
+
+_CLASSES: tuple[tuple[int, str, str], ...] = (
+    (0x040, BUS_OFF, "the controller has left the bus (bus-off)"),
+    (0x020, "no_acknowledge", "no node acknowledges: cable, terminators, bit rate, is any drive powered?"),
+    (0x008, "protocol", "a frame breaks the protocol: bit rate, terminators, cable, two nodes with one id?"),
+    (0x010, "transceiver", "the transceiver reports a fault: wires short-circuited or torn?"),
+    (0x001, "transmit_timeout", "the controller could not send in time"),
+    (0x100, "restarted", "the controller was restarted after bus-off"),
+    (0x002, "arbitration_lost", "arbitration lost"),
+    (0x080, "bus_error", "bus error"),
+)
+"""Bits of the id of an error frame: Linux, include/uapi/linux/can/error.h."""
+
+_CONTROLLER = 0x004
+_CONTROLLER_WORDS: tuple[tuple[int, str, str], ...] = (
+    (0x01, "overflow", "receive buffer overflow: frames are lost"),
+    (0x02, "overflow", "transmit buffer overflow"),
+    (0x10, "error_passive", "receive errors: the controller is error-passive"),
+    (0x20, "error_passive", "transmit errors: the controller is error-passive"),
+    (0x04, "error_warning", "receive errors have reached the warning level"),
+    (0x08, "error_warning", "transmit errors have reached the warning level"),
+    (0x40, "error_active", "the controller is error-active again"),
+)
+"""Bits of data byte 1."""
+
+
+class BusError(msgspec.Struct, frozen=True):
+    """An error reported by the controller or the line. ``code``: stable; ``message``: for people."""
+
+    code: str
+    message: str
+
+
+def bus_error(message: can.Message) -> BusError:
+    """Decode an error frame; the most severe error where it reports several."""
+    number, data = message.arbitration_id, bytes(message.data)
+    for bit, code, words in _CLASSES[:1]:
+        if number & bit:
+            return BusError(code, words)
+    if number & _CONTROLLER and len(data) > 1:
+        for bit, code, words in _CONTROLLER_WORDS:
+            if data[1] & bit:
+                return BusError(code, words + _counters(data))
+    for bit, code, words in _CLASSES[1:]:
+        if number & bit:
+            return BusError(code, words + _counters(data))
+    return BusError("bus_error", f"error frame 0x{number:X} [{data.hex(' ')}]")
+
+
+def _counters(data: bytes) -> str:
+    if len(data) < 8 or not (data[6] or data[7]):
+        return ""
+    return f" (error counters: {data[6]} transmit, {data[7]} receive)"
+
+
+# -- SocketCAN -----------------------------------------------------------------------------------------------
+# State of a Linux CAN network interface (SocketCAN).
+
+
+RECEIVE_BUFFER = 1 << 20
+"""[bytes] of the socket; the default holds some 300 frames, the kernel drops what comes beyond (python-can #657)."""
+_SO_RCVBUFFORCE = 33
+
+
+class SocketcanState(msgspec.Struct, frozen=True):
+    """State as `ip -details link show` reports it; None: not reported (a virtual interface has no bit rate)."""
+
+    kind: str
+    up: bool
+    state: str | None = None
+    bitrate: int | None = None
+    restart_ms: int | None = None
+    queue_length: int | None = None
+
+
+def read_state(channel: str) -> SocketcanState | None:
+    """State of ``channel``; None where `ip` is missing or does not know the interface."""
+    command = shutil.which("ip") or shutil.which("ip", path="/usr/sbin:/sbin")
+    if command is None:
+        return None
+    try:
+        answer = subprocess.run(
+            [command, "-json", "-details", "link", "show", "dev", channel],
+            capture_output=True,
+            timeout=2.0,
+            check=False,
+        )
+        links = json.loads(answer.stdout or b"[]")
+    except (OSError, ValueError, subprocess.TimeoutExpired):
+        return None
+    return state_of(links[0]) if answer.returncode == 0 and links else None
+
+
+def state_of(link: dict[str, Any]) -> SocketcanState:
+    """State from ``link``: one element of what `ip -json -details link show` prints."""
+    about = link.get("linkinfo", {})
+    facts = about.get("info_data", {})
+    return SocketcanState(
+        kind=about.get("info_kind", ""),
+        up="UP" in link.get("flags", ()),
+        state=facts.get("state"),
+        bitrate=facts.get("bittiming", {}).get("bitrate"),
+        restart_ms=facts.get("restart_ms", 0) if about.get("info_kind") == "can" else None,
+        queue_length=link.get("txqlen"),
+    )
+
+
+def objection(state: SocketcanState, channel: str, bitrate: int) -> str | None:
+    """Text: why ``channel`` cannot be used at ``bitrate`` [bit/s], with the remedy; None where it can."""
+    if state.kind not in ("can", "vcan", "vxcan", "slcan"):
+        return f"it is a network interface of kind {state.kind or 'unknown'!r}, not of CAN"
+    remedy = f"ip link set {channel} down; ip link set {channel} up type can bitrate {bitrate} restart-ms 0"
+    if not state.up:
+        return f"the interface is down. Cure: {remedy}, or the units in deploy/can"
+    if state.bitrate is not None and state.bitrate != bitrate:
+        return f"it runs at {state.bitrate} bit/s, the cell says {bitrate}. Cure: {remedy}"
+    if state.state == "BUS-OFF":
+        return f"its controller is in bus-off. Find the cause (cable, terminators, bit rate), then: {remedy}"
+    return None
+
+
+def enlarge_receive_buffer(bus: can.BusABC) -> int:
+    """Enlarge the receive buffer for bursts while the receiving thread is delayed; returns the size granted
+    [bytes].
+    """
+    channel: socket.socket = bus.socket  # type: ignore[attr-defined]
+    try:
+        channel.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
+    except PermissionError:
+        # Without CAP_NET_ADMIN, up to net.core.rmem_max.
+        channel.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    return channel.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Subscriptions
+from stereoservo_drivers.canopen.codec import Subscriptions
 from stereoservo_drivers.canopen.master import Master, MasterFault
 
 PUMP_WAIT_S = 0.002
@@ -37,7 +37,7 @@ class ThreadStatistics:
 
 
 class BusThread(Subscriptions):
-    """The bus thread, a :class:`~stereoservo_drivers.canopen.bringup.Link` that can also run the master's cycle.
+    """The bus thread, a :class:`~stereoservo_drivers.canopen.codec.Link` that can also run the master's cycle.
 
     It ends by itself when the connection is lost or something unforeseen is raised in it: that fault is latched in the
     master, the heartbeat ends, and the drives stop by their own monitoring of it. ``error`` holds the cause.

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Link, listening, until
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
+from stereoservo_drivers.canopen.codec import Link, listening, until
 from stereoservo_drivers.canopen.options import CanOptions
 
 if TYPE_CHECKING:

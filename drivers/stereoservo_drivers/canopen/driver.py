@@ -29,12 +29,11 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.ports.discovery import BusScan, FoundBus, JointChoice
 from stereoservo_drivers.can.channel import Channel
-from stereoservo_drivers.canopen.auxiliary.gripper import Gripper
-from stereoservo_drivers.canopen.bringup import Bringup
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import Cia402Codec
 from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
-from stereoservo_drivers.canopen.codec import Codec
+from stereoservo_drivers.canopen.codec import Bringup, Codec
+from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFault, MasterSettings, Mode
 from stereoservo_drivers.canopen.odrive import OdriveCodec
 from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup

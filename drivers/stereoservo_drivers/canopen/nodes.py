@@ -16,11 +16,8 @@ from serial.tools import list_ports
 
 from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo.ports.discovery import BusScan, FoundBus, FoundDrive, JointChoice
-from stereoservo_drivers.can.channel import Channel, ChannelSettings
+from stereoservo_drivers.can.channel import Channel, ChannelSettings, read_state
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.socketcan import read_state
-from stereoservo_drivers.canopen.auxiliary.gripper import Gripper
-from stereoservo_drivers.canopen.bringup import Link, Subscriptions
 from stereoservo_drivers.canopen.cia402 import Cia402Codec, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     GUARD_TIME,
@@ -36,6 +33,8 @@ from stereoservo_drivers.canopen.cia402_configuration import (
 from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
+from stereoservo_drivers.canopen.codec import Link, Subscriptions
+from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale

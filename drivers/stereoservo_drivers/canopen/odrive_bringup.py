@@ -20,7 +20,7 @@ from stereoservo.messages.decoding import decoding
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen import odrive
-from stereoservo_drivers.canopen.bringup import Link, listening, until
+from stereoservo_drivers.canopen.codec import Link, listening, until
 from stereoservo_drivers.canopen.odrive import OdriveCodec, frame_id
 from stereoservo_drivers.canopen.options import CanOptions
 

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo_drivers.detectors.centroids import smaller_half_axis
 from stereoservo_drivers.detectors.components import (
+    AREA,
+    BACKGROUND,
     BRIGHT,
     BXX,
     BYY,
     CONTRAST,
     CXX,
     CYY,
+    DARK,
     EXX,
+    EXY,
     EYY,
+    FLUX,
+    FLUX_NOISE,
+    LIT,
     LOPSIDED,
     LOPSIDED_NOISE,
     NOISE,
+    PULL,
     QXX,
     QXY,
     QYY,
+    SLOPE,
+    SLOPE_XX,
+    SLOPE_XY,
+    SLOPE_YY,
+    Matrix2,
+    Symmetric2,
 )
 from stereoservo_drivers.detectors.homographies import (
     OutlierGates,
@@ -29,8 +46,7 @@ from stereoservo_drivers.detectors.homographies import (
     outlier_dot,
     reject_outliers,
 )
-from stereoservo_drivers.detectors.levels import UNEVEN_INSIDE
-from stereoservo_drivers.detectors.lighting import flat_field
+from stereoservo_drivers.detectors.levels import EVEN, UNEVEN_INSIDE
 
 THINNEST = 1.0
 """Half axis [px] below which a dot is too thin to measure."""
@@ -206,3 +222,285 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
     for i in range(n):
         count += 1 if used[i] else 0
     return count
+
+
+# -- lighting ------------------------------------------------------------------------------------------------
+# Correction of the dots' centres for uneven light (shading). Numba kernels; no state.
+#
+# Light falls on a dot as background b(x) and contrast g(x); to first order a slope of either moves the centroid, by
+# the columns DARK and LIT of its measurement. Both slopes are those of planes through the face's dots, whose predicted
+# areas turn flux into contrast; a single dot that fits badly (cut, dirty) does not count. How far the others lie off
+# the plane tells how much the light may bend, and so how uncertain its slope at a dot is; where that is much (bands of
+# mains light, the edge of a shadow), the slope inside the dot itself is believed more, by their variances.
+
+
+BEND = 0.24
+"""Length over which light bends as much as it lies off its plane, in rms distances of a face's dots."""
+PRINT_CONTRAST = 0.001
+"""Relative standard deviation of the light of alike dots, before anything is seen of it; also of predicted areas."""
+PRINT_BACKGROUND = 0.03
+"""The same of backgrounds [grey levels]."""
+ODD_NOISE, ODD_REST = 25.0, 150.0
+"""A dot is odd beyond so many variances: of noise, and of what the others differ by (F of 1 and 3 degrees of freedom,
+0.999)."""
+SAMPLED_SLOPE = 0.018
+"""Standard deviation of a slope seen inside a dot by the sampling of its edge, times the root of its area
+(measured)."""
+BLURRED_SLOPE = 0.12
+"""Part by which blur may have changed a slope seen inside a dot."""
+PRIOR_WEIGHT = 2.0
+"""How many degrees of freedom the two count."""
+
+
+class DotReadings(NamedTuple):
+    """What the ``dots`` (n, FIELDS) of a face show: ``values`` (n,), which count where ``used`` (n,)."""
+
+    dots: FloatArray
+    values: FloatArray
+    used: BoolArray
+
+
+@kernel
+def _plane(readings, out):
+    """Least-squares plane a + b·x of `DotReadings` over the dots.
+
+    ``out``: middle (2), a, slope (2), its covariance (3) and the squared sum of residuals, both for unit noise; rms
+    distance from the middle. False where it is undetermined.
+    """
+    dots, values, used = readings
+    n = 0
+    out[:] = 0.0
+    for i in range(used.size):
+        if used[i]:
+            n += 1
+            out[0] += dots[i, 0]
+            out[1] += dots[i, 1]
+            out[2] += values[i]
+    if n < 4:
+        return False
+    out[0] /= n
+    out[1] /= n
+    out[2] /= n
+    xx = xy = yy = xi = yi = 0.0
+    for i in range(used.size):
+        if used[i]:
+            x, y, value = dots[i, 0] - out[0], dots[i, 1] - out[1], values[i] - out[2]
+            xx += x * x
+            xy += x * y
+            yy += y * y
+            xi += x * value
+            yi += y * value
+    det = xx * yy - xy * xy
+    if det < 1e-6 * (xx + yy) ** 2:
+        return False
+    out[3] = (yy * xi - xy * yi) / det
+    out[4] = (xx * yi - xy * xi) / det
+    out[5], out[6], out[7] = yy / det, -xy / det, xx / det
+    out[9] = np.sqrt((xx + yy) / n)
+    for i in range(used.size):
+        if used[i]:
+            out[8] += _residual(dots[i], values[i], out) ** 2
+    return True
+
+
+@kernel
+def _residual(dot, value, plane):
+    return value - plane[2] - plane[3] * (dot[0] - plane[0]) - plane[4] * (dot[1] - plane[1])
+
+
+@kernel
+def _outlier(readings, variance, plane):
+    """The dot whose value the plane of the others contradicts, -1 for none; ``plane`` becomes that of the others."""
+    dots, values, used = readings
+    n = 0
+    for i in range(used.size):
+        n += 1 if used[i] else 0
+    if n < 6:
+        return -1
+    worst, largest = -1, 1.0
+    for i in range(used.size):
+        if used[i]:
+            x, y = dots[i, 0] - plane[0], dots[i, 1] - plane[1]
+            leverage = 1.0 / n + plane[5] * x * x + 2.0 * plane[6] * x * y + plane[7] * y * y
+            if leverage > 0.95:
+                continue
+            square = _residual(dots[i], values[i], plane) ** 2 / (1.0 - leverage)
+            rest = max(plane[8] - square, 0.0) / (n - 4)
+            limit = ODD_NOISE * variance + ODD_REST * max(rest - variance, 0.0)
+            if square > largest * limit:
+                largest = square / limit
+                worst = i
+    if worst >= 0:
+        used[worst] = False
+        if not _plane(readings, plane):
+            used[worst] = True
+            _plane(readings, plane)
+            return -1
+    return worst
+
+
+@kernel
+def _known(readings, variance, typical, plane, slope):
+    """Slope (2) of `DotReadings` and its covariance (3) at any of the dots into ``slope``; the outlier dot, -1 for
+    none.
+
+    ``variance`` of a value by noise; ``typical`` standard deviation beside it. -2 where there is no plane.
+    """
+    mine = readings.used.copy()
+    own_readings = DotReadings(readings.dots, readings.values, mine)
+    if not _plane(own_readings, plane):
+        return -2
+    outlier = _outlier(own_readings, variance + typical * typical, plane)
+    n = 0
+    for i in range(mine.size):
+        n += 1 if mine[i] else 0
+    own = max(plane[8] - (n - 3) * variance, 0.0) + PRIOR_WEIGHT * typical * typical
+    bend = own / (n - 3 + PRIOR_WEIGHT)
+    local = bend / (BEND * plane[9]) ** 2
+    slope[0], slope[1] = plane[3], plane[4]
+    slope[2] = local + (bend + variance) * plane[5]
+    slope[3] = (bend + variance) * plane[6]
+    slope[4] = local + (bend + variance) * plane[7]
+    return outlier
+
+
+@kernel
+def _as_bright_as_its_light(dots, areas, used, i, away):
+    """Whether the flux of dot ``i``, which differs by ``away`` (relative) from the others', is explained by its
+    light and not its shape.
+    """
+    others = 0.0
+    count = 0
+    for k in range(used.size):
+        if used[k] and k != i:
+            others += dots[k, FLUX] / (areas[k] * dots[k, CONTRAST])
+            count += 1
+    shape = dots[i, FLUX] / (areas[i] * dots[i, CONTRAST]) * count / others - 1.0
+    return abs(shape) < 0.4 * abs(away)
+
+
+@kernel
+def _bend_inside(dots, used, slope, noise):
+    """Variance [1/px²] of the dots' own slopes about their face's; 0 where it may be noise (3 sigma) or sampling."""
+    n = squares = variances = largest = sampled = 0.0
+    for i in range(used.size):
+        if used[i] and dots[i, SLOPE_XX] < 0.5 * EVEN:
+            n += 2.0
+            squares += (dots[i, SLOPE] - slope[0]) ** 2 + (dots[i, SLOPE + 1] - slope[1]) ** 2
+            sampled += 2.0 * SAMPLED_SLOPE * SAMPLED_SLOPE / dots[i, AREA]
+            variances += noise * (dots[i, SLOPE_XX] + dots[i, SLOPE_YY])
+            largest = max(largest, noise * max(dots[i, SLOPE_XX], dots[i, SLOPE_YY]))
+    if n < 6.0:
+        return 0.0
+    excess = squares - variances
+    return excess / n if excess > 3.0 * max(np.sqrt(2.0 * variances * largest), sampled) else 0.0
+
+
+@kernel
+def _add_covariance(dot, M, P):
+    """Add M P Mᵀ to a dot's covariance, of a `Matrix2` and a `Symmetric2`."""
+    a, b, c, d = M
+    p, q, r = P
+    dot[EXX] += a * a * p + 2.0 * a * b * q + b * b * r
+    dot[EXY] += a * c * p + (a * d + b * c) * q + b * d * r
+    dot[EYY] += c * c * p + 2.0 * c * d * q + d * d * r
+
+
+@kernel
+def _follow(dot, slope, noise, ground, moved):
+    """Remove the slope of the light at one dot; ``slope`` (5,) is that of its face, ``noise`` inside the dot,
+    ``ground`` the part of the background that slopes with it.
+    """
+    p, q, r = slope[2], slope[3], slope[4]
+    sampled = SAMPLED_SLOPE * SAMPLED_SLOPE / dot[AREA]
+    sxx, sxy, syy = noise * dot[SLOPE_XX] + sampled, noise * dot[SLOPE_XY], noise * dot[SLOPE_YY] + sampled
+    a, b, d = p + sxx, q + sxy, r + syy
+    det = a * d - b * b
+    s0, s1 = slope[0], slope[1]
+    k00 = k01 = k10 = k11 = 0.0
+    if dot[BRIGHT] >= 0.0 and sxx < 0.5 * EVEN and det > 0.0:
+        # gain P (P + S)⁻¹ of the dot's own slope over its face's
+        k00, k01 = (p * d - q * b) / det, (q * a - p * b) / det
+        k10, k11 = (q * d - r * b) / det, (r * a - q * b) / det
+        e0, e1 = dot[SLOPE] - s0, dot[SLOPE + 1] - s1
+        s0 += k00 * e0 + k01 * e1
+        s1 += k10 * e0 + k11 * e1
+    ground *= dot[BACKGROUND]
+    g00, g01 = dot[LIT] + ground * dot[DARK], dot[LIT + 1] + ground * dot[DARK + 1]
+    g10, g11 = dot[LIT + 2] + ground * dot[DARK + 2], dot[LIT + 3] + ground * dot[DARK + 3]
+    G = Matrix2(g00, g01, g10, g11)
+    if ground > 0.0:
+        t0, t1 = BLURRED_SLOPE * s0, BLURRED_SLOPE * s1
+        _add_covariance(dot, G, Symmetric2(t0 * t0, t0 * t1, t1 * t1))
+    # (1 - K) P
+    _add_covariance(
+        dot, G, Symmetric2(p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r)
+    )  # fmt: skip
+    # the dot's own slope has noise in common with its centre: -(X Kᵀ Gᵀ + G K Xᵀ)
+    m00, m01 = g00 * k00 + g01 * k10, g00 * k01 + g01 * k11
+    m10, m11 = g10 * k00 + g11 * k10, g10 * k01 + g11 * k11
+    x00, x01 = noise * dot[PULL], noise * dot[PULL + 1]
+    x10, x11 = noise * dot[PULL + 2], noise * dot[PULL + 3]
+    dot[EXX] -= 2.0 * (m00 * x00 + m01 * x01)
+    dot[EXY] -= m00 * x10 + m01 * x11 + m10 * x00 + m11 * x01
+    dot[EYY] -= 2.0 * (m10 * x10 + m11 * x11)
+    moved[0] -= g00 * s0 + g01 * s1
+    moved[1] -= g10 * s0 + g11 * s1
+
+
+@kernel
+def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
+    """Correct the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) for uneven light.
+
+    ``areas`` (n,) [px²] as the face's homography predicts them. Adds to EXX .. EYY what remains uncertain: the slopes,
+    and for a dot whose light does not fit the others' as much as the missing part of its rim would move it. Returns
+    that dot's row, -1 where there is none.
+    """
+    n = used.size
+    values = np.zeros(n)
+    slope = np.zeros(5)
+    plane = np.zeros(10)
+    total = flux_noise = 0.0
+    count = 0
+    for i in range(n):
+        if used[i]:
+            values[i] = dots[i, FLUX] / areas[i]
+            total += values[i]
+            flux_noise += (dots[i, FLUX_NOISE] / dots[i, FLUX]) ** 2
+            count += 1
+    if count == 0 or total <= 0.0:
+        return -1
+    for i in range(n):
+        values[i] *= count / total
+    readings = DotReadings(dots, values, used)
+    outlier = _known(readings, dark_noise * flux_noise / count, PRINT_CONTRAST, plane, slope)
+    if outlier >= 0 and _as_bright_as_its_light(
+        dots, areas, used, outlier, _residual(dots[outlier], values[outlier], plane)
+    ):
+        outlier = -1
+    if outlier >= -1:
+        bend = _bend_inside(dots, used, slope, bright_noise)
+        slope[2] += bend
+        slope[4] += bend
+        for i in range(n):
+            if used[i]:
+                _follow(dots[i], slope, bright_noise, 1.0 if bend > 0.0 else 0.0, moved[i])
+        if outlier >= 0:
+            away = _residual(dots[outlier], values[outlier], plane) ** 2 * dots[outlier, AREA] / np.pi
+            dots[outlier, EXX] += away
+            dots[outlier, EYY] += away
+        if bend > 0.0:
+            # light that bends within a dot's size does so on black as on white
+            return max(outlier, -1)
+    for i in range(n):
+        values[i] = dots[i, BACKGROUND]
+    # the level of some sixty pixels
+    if _known(readings, dark_noise / 60.0, PRINT_BACKGROUND, plane, slope) >= -1:
+        for i in range(n):
+            if used[i]:
+                dot = dots[i]
+                moved[i, 0] -= dot[DARK] * slope[0] + dot[DARK + 1] * slope[1]
+                moved[i, 1] -= dot[DARK + 2] * slope[0] + dot[DARK + 3] * slope[1]
+                shift = Matrix2(dot[DARK], dot[DARK + 1], dot[DARK + 2], dot[DARK + 3])
+                _add_covariance(dot, shift, Symmetric2(slope[2], slope[3], slope[4]))
+    return max(outlier, -1)

@@ -6,16 +6,26 @@ poses of the part, so that edges that it hides are not looked for. What is repor
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, Frame, Prior
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.ports.devices import (
+    CameraObservation,
+    DetectorDescription,
+    DriverContext,
+    DriverError,
+    Frame,
+    Prior,
+)
 from stereoservo_drivers.edges.line_measurement import (
     MeasuredLine,
     compile_kernels,
@@ -23,16 +33,8 @@ from stereoservo_drivers.edges.line_measurement import (
     measure_lines,
     take_profiles,
 )
-from stereoservo_drivers.edges.part_file import LEAST_START, load_part
-from stereoservo_drivers.edges.part_pose import (
-    PartPose,
-    line_distances,
-    pose_from_lines,
-    pose_from_pixels,
-    segments_in_sight,
-)
 from stereoservo_drivers.frame_images import sized_image
-from stereoservo_drivers.options import decode_options
+from stereoservo_drivers.options import decode_options, invalid
 
 Positive = Annotated[float, Meta(gt=0)]
 FINE_PX = 4.0
@@ -269,3 +271,335 @@ class EdgeDetector:
             self.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, ids[order],
             np.ascontiguousarray(pixels), np.ascontiguousarray(0.5 * (covariances + covariances.transpose(0, 2, 1))),
         )  # fmt: skip
+
+
+# -- pose of the part ----------------------------------------------------------------------------------------
+# Pose of a part before a pinhole of unknown focal length, from pixels of its vertices or from measured lines.
+#
+# It only tells which edges are in sight and where about; what is reported are the lines themselves. Square pixels
+# about the image's centre are assumed, and a focal length near the image's width.
+
+
+FOCAL_WIDTHS = 1.25
+"""Focal length at first, in widths of the image."""
+FOCAL_SIGMA = 0.4
+"""Of its logarithm."""
+ITERATIONS = 12
+CONVERGED = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PartPose:
+    """``R`` (3, 3), ``t`` (3,) from the part to the camera, ``focal`` [px], ``centre`` (2,) [px] of the image."""
+
+    R: FloatArray
+    t: FloatArray
+    focal: float
+    centre: FloatArray
+
+    def pixels(self, points: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3) of the part; NaN behind the camera."""
+        X = points @ self.R.T + self.t
+        depth = np.where(X[:, 2:] > 1e-6, X[:, 2:], np.nan)
+        pixels: FloatArray = self.focal * X[:, :2] / depth + self.centre
+        return pixels
+
+    def in_sight(self, part: Part) -> BoolArray:
+        """Which edges of the part (e,) border a face that is turned to the camera."""
+        eye = -self.R.T @ self.t
+        facing = (part.normals @ eye - part.offsets > 0.0).astype(np.float64)
+        seen: BoolArray = part.sides @ facing > 0.0
+        return seen
+
+    def slopes(self, points: FloatArray) -> FloatArray:
+        """Derivatives (n, 2, 7) of the pixels by a turn about the part's middle, a shift, and the focal's logarithm."""
+        turned = points @ self.R.T
+        X = turned + self.t
+        z = X[:, 2]
+        by_point = np.zeros((len(points), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = self.focal / z
+        by_point[:, :, 2] = -self.focal * X[:, :2] / z[:, None] ** 2
+        turn = np.zeros((len(points), 3, 3))
+        turn[:, 0, 1], turn[:, 0, 2], turn[:, 1, 2] = turned[:, 2], -turned[:, 1], turned[:, 0]
+        turn -= turn.transpose(0, 2, 1)
+        J = np.empty((len(points), 2, 7))
+        J[:, :, :3], J[:, :, 3:6] = by_point @ turn, by_point
+        J[:, :, 6] = self.focal * X[:, :2] / z[:, None]
+        return J
+
+    def stepped(self, step: FloatArray) -> PartPose:
+        """The pose after a step (7,) along `slopes`."""
+        turn = np.asarray(cv2.Rodrigues(step[:3].reshape(3, 1))[0], dtype=np.float64)
+        return replace(
+            self,
+            R=turn @ self.R,
+            t=self.t + step[3:6],
+            focal=self.focal * float(np.exp(np.clip(step[6], -1, 1))),
+        )
+
+
+def pose_from_pixels(
+    points: FloatArray, pixels: FloatArray, size: tuple[int, int], start: PartPose | None
+) -> tuple[PartPose, float] | None:
+    """Pose that shows points (n, 3) at pixels (n, 2) of an image of ``size`` (width, height), n >= 4, and the rms
+    distance [px] that is left; from ``start`` where it is given. None where no pose with all points before the camera
+    is found.
+    """
+    width, height = size
+    centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
+    starts = [] if start is None else [start]
+    focal = FOCAL_WIDTHS * width
+    K = np.array([[focal, 0.0, centre[0]], [0.0, focal, centre[1]], [0.0, 0.0, 1.0]])
+    try:
+        found, turn, shift = cv2.solvePnP(
+            points.reshape(-1, 1, 3), pixels.reshape(-1, 1, 2), K, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:
+        found = False
+    if found:
+        starts.append(PartPose(np.asarray(cv2.Rodrigues(turn)[0]), np.ravel(shift), focal, centre))
+    best: tuple[PartPose, float] | None = None
+    for pose in starts:
+        fitted = _descend(pose, points, pixels)
+        if fitted is not None and (best is None or fitted[1] < best[1]):
+            best = fitted
+    return best
+
+
+def _descend(pose: PartPose, points: FloatArray, pixels: FloatArray) -> tuple[PartPose, float] | None:
+    for _ in range(ITERATIONS):
+        left = pixels - pose.pixels(points)
+        if not np.isfinite(left).all():
+            return None
+        step = _solve(pose, pose.slopes(points).reshape(-1, 7), left.ravel(), np.ones(left.size), 1.0)
+        pose = pose.stepped(step)
+        if float(np.abs(step).max()) < CONVERGED:
+            break
+    left = pixels - pose.pixels(points)
+    return (pose, float(np.sqrt((left**2).sum(axis=1).mean()))) if np.isfinite(left).all() else None
+
+
+def _solve(pose: PartPose, J: FloatArray, left: FloatArray, weights: FloatArray, sigma: float) -> FloatArray:
+    """Step (7,) of weighted least squares, with what is expected of the focal length."""
+    expected = np.log(FOCAL_WIDTHS * (2.0 * pose.centre[0] + 1.0) / pose.focal) / FOCAL_SIGMA * sigma
+    A = np.concatenate([J * weights[:, None], np.eye(7)[6:] * sigma / FOCAL_SIGMA])
+    step: FloatArray = np.linalg.lstsq(A, np.append(left * weights, expected), rcond=1e-9)[0]
+    return step
+
+
+def line_distances(
+    part: Part, pose: PartPose, lines: dict[int, MeasuredLine]
+) -> tuple[FloatArray, FloatArray]:
+    """Distances (n, 2) [px] of the ends of n measured lines from the part's edges in the pose, and their derivatives
+    (n, 2, 7) by the pose, as `PartPose.slopes` has them.
+    """
+    rows = np.array(list(lines), dtype=np.int64)
+    a, b = part.points[part.edges[rows, 0]], part.points[part.edges[rows, 1]]
+    u, v = pose.pixels(a), pose.pixels(b)
+    Ju, Jv = pose.slopes(a), pose.slopes(b)
+    along = v - u
+    squared = np.maximum((along**2).sum(axis=1), 1e-12)
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.sqrt(squared)[:, None]
+    ends = np.array([[line.at(line.span[0]), line.at(line.span[1])] for line in lines.values()])
+    s = ((ends - u[:, None]) * along[:, None]).sum(axis=2) / squared[:, None]
+    distances = ((ends - u[:, None]) * normal[:, None]).sum(axis=2)
+    by_pose = (1.0 - s)[..., None] * np.einsum("ni,nij->nj", normal, Ju)[:, None] + s[..., None] * np.einsum(
+        "ni,nij->nj", normal, Jv
+    )[:, None]
+    return distances, by_pose
+
+
+def pose_from_lines(
+    part: Part, pose: PartPose, lines: dict[int, MeasuredLine], scale_px: float
+) -> PartPose | None:
+    """Pose of least distance from measured lines, those far from it (beside ``scale_px``) counted little; None where
+    the part would come behind the camera.
+    """
+    for _ in range(ITERATIONS):
+        distances, J = line_distances(part, pose, lines)
+        if not np.isfinite(distances).all():
+            return None
+        worst = np.abs(distances).max(axis=1, keepdims=True)
+        weights = np.sqrt(1.0 / (1.0 + (worst / scale_px) ** 2)) * np.ones((1, 2))
+        step = _solve(pose, J.reshape(-1, 7), distances.ravel(), weights.ravel(), scale_px)
+        # A step beyond a quarter turn, or the part's distance, is no refinement.
+        step = step / max(
+            1.0, float(np.abs(step[:3]).max()) / 0.3, float(np.abs(step[3:6]).max()) / (0.3 * pose.t[2])
+        )
+        pose = pose.stepped(step)
+        if float(np.abs(step).max()) < CONVERGED:
+            break
+    return pose if np.isfinite(pose.pixels(part.points)).all() else None
+
+
+def segments_in_sight(part: Part, pose: PartPose) -> tuple[IntArray, FloatArray]:
+    """Numbers (k,) of the edges in sight and their ends (k, 2, 2) [px]."""
+    rows = np.flatnonzero(pose.in_sight(part))
+    return rows, pose.pixels(part.points)[part.edges[rows]]
+
+
+# -- files of parts ------------------------------------------------------------------------------------------
+# Part files: a convex part without markers, as vertices with ids and faces, and where pictures show it at first.
+
+
+FLAT = 1e-3
+"""Largest distance of a face's vertices from its plane, and of others beyond it, as a share of the part's size."""
+LEAST_ANGLE = float(np.deg2rad(10.0))
+"""Least angle of the two edges that cross most squarely in a vertex."""
+LEAST_START = 4
+"""Vertices that a start must name: their pixels then determine a pose."""
+
+
+class PartVertex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A vertex: its marker ``id`` and where it is on the part, in any unit of length."""
+
+    id: Annotated[int, Meta(ge=0, le=2**31 - 1)]
+    at: tuple[float, float, float]
+
+
+class PartFace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A plane face: the ids of its vertices along its border, either way round."""
+
+    vertices: Annotated[tuple[int, ...], Meta(min_length=3, max_length=64)]
+
+
+class PartFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A part file. ``start``: by camera, raw pixels of four vertices or more in a picture of the part at its start."""
+
+    vertex: Annotated[tuple[PartVertex, ...], Meta(min_length=4, max_length=200)]
+    face: Annotated[tuple[PartFace, ...], Meta(min_length=1, max_length=200)]
+    start: dict[str, dict[int, tuple[float, float]]]
+    schema: Annotated[int, Meta(ge=1, le=1)] = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part: ``ids`` (n,), ``points`` (n, 3) about their middle in units of their spread, ``normals`` (f, 3) outward
+    and ``offsets`` (f,) of its faces, ``edges`` (e, 2) as rows of points, ``sides`` (e, f): which faces meet there.
+    """
+
+    ids: IntArray
+    points: FloatArray
+    normals: FloatArray
+    offsets: FloatArray
+    edges: IntArray
+    sides: FloatArray
+
+
+def load_part(path: Path, camera: str) -> tuple[Part, IntArray, FloatArray]:
+    """The part of a file, and of the camera's start the rows (k,) of its vertices and their pixels (k, 2).
+
+    Raises DriverError (``part``), which names the file, the key, the value and what would be valid.
+    """
+
+    def refuse(text: str) -> DriverError:
+        return DriverError("part", f"{path}: {text}", path=str(path))
+
+    try:
+        tree: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
+        file = msgspec.convert(tree, PartFile, strict=True, str_keys=True)
+    except OSError as error:
+        raise refuse(f"the part file cannot be read: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise refuse(f"no TOML: {error}") from error
+    except msgspec.ValidationError as error:
+        raise refuse(invalid(PartFile, tree, error)) from error
+    part = make_part(file, refuse)
+    return part, *_start_of(file, part, camera, refuse)
+
+
+def make_part(file: PartFile, refuse: Any = ValueError) -> Part:
+    """The part of decoded vertices and faces. Raises what ``refuse`` makes of a text."""
+    ids = [vertex.id for vertex in file.vertex]
+    if len(set(ids)) < len(ids):
+        twice = next(marker for marker in ids if ids.count(marker) > 1)
+        raise refuse(f"vertex {twice} is there twice; every vertex has an id of its own")
+    points = np.array([vertex.at for vertex in file.vertex])
+    if not np.isfinite(points).all():
+        raise refuse("a vertex is not finite")
+    points = points - points.mean(axis=0)
+    size = float(np.sqrt((points**2).sum(axis=1).mean()))
+    if not np.linalg.svd(points, compute_uv=False)[-1] > FLAT * size:
+        raise refuse("all vertices lie in one plane; a solid part is needed")
+    points = points / size
+    normals, offsets, edges = [], [], dict[tuple[int, int], list[int]]()
+    for k, face in enumerate(file.face):
+        unknown = [marker for marker in face.vertices if marker not in ids]
+        if unknown or len(set(face.vertices)) < len(face.vertices):
+            raise refuse(
+                f"face {k + 1} = {list(face.vertices)}: "
+                + (f"no vertex {unknown[0]}" if unknown else "a vertex is there twice")
+                + f"; vertices are {ids}"
+            )
+        rows = [ids.index(marker) for marker in face.vertices]
+        normal, offset = _face_plane(points, rows, f"face {k + 1} = {list(face.vertices)}", ids, refuse)
+        normals.append(normal)
+        offsets.append(offset)
+        for a, b in zip(rows, [*rows[1:], rows[0]], strict=True):
+            edges.setdefault((min(a, b), max(a, b)), []).append(k)
+    for (a, b), faces in edges.items():
+        if len(faces) > 2:
+            raise refuse(f"{len(faces)} faces meet in the edge of vertices {ids[a]} and {ids[b]}; two do")
+    sides = np.zeros((len(edges), len(normals)))
+    for row, faces in enumerate(edges.values()):
+        sides[row, faces] = 1.0
+    part = Part(
+        np.array(ids, np.int64), points, np.array(normals), np.array(offsets), np.array(list(edges)), sides
+    )
+    _require_crossings(part, refuse)
+    return part
+
+
+def _face_plane(
+    points: FloatArray, rows: list[int], name: str, ids: list[int], refuse: Any
+) -> tuple[FloatArray, float]:
+    """Outward unit normal and offset of a face's plane."""
+    middle = points[rows].mean(axis=0)
+    _, singular, axes = np.linalg.svd(points[rows] - middle)
+    if not singular[1] > FLAT:
+        raise refuse(f"{name}: its vertices lie on one line")
+    normal = axes[2] if axes[2] @ middle > 0.0 else -axes[2]
+    off = np.abs((points[rows] - middle) @ normal)
+    if off.max() > FLAT:
+        raise refuse(f"{name}: vertex {ids[rows[int(off.argmax())]]} is off the plane of the others")
+    beyond = (points - middle) @ normal
+    if beyond.max() > FLAT:
+        raise refuse(
+            f"{name}: vertex {ids[int(beyond.argmax())]} lies beyond it; only convex parts are supported: leave out "
+            "what is behind, or describe a convex part of it"
+        )
+    return normal, float(middle @ normal)
+
+
+def _require_crossings(part: Part, refuse: Any) -> None:
+    """Refuse vertices in which no two edges cross at an angle."""
+    for row, marker in enumerate(part.ids.tolist()):
+        own = part.edges[(part.edges == row).any(axis=1)]
+        if len(own) < 2:
+            raise refuse(f"vertex {marker} is in {len(own)} edges; two that cross there are needed")
+        along = part.points[own[:, 1]] - part.points[own[:, 0]]
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        cosines = np.abs(along @ along.T)
+        if not cosines.min() < np.cos(LEAST_ANGLE):
+            raise refuse(
+                f"vertex {marker}: its edges cross at {np.rad2deg(np.arccos(min(1.0, cosines.min()))):.1f} degrees at "
+                f"most, {np.rad2deg(LEAST_ANGLE):.0f} are needed"
+            )
+
+
+def _start_of(file: PartFile, part: Part, camera: str, refuse: Any) -> tuple[IntArray, FloatArray]:
+    if camera not in file.start:
+        raise refuse(
+            f"start.{camera} is missing: pixels of {LEAST_START} vertices or more in a picture of camera {camera!r}; "
+            f"given: {', '.join(sorted(file.start)) or 'none'}"
+        )
+    start, ids = file.start[camera], part.ids.tolist()
+    unknown = [marker for marker in start if marker not in ids]
+    if unknown:
+        raise refuse(f"start.{camera}: no vertex {unknown[0]}; vertices are {ids}")
+    if len(start) < LEAST_START:
+        raise refuse(f"start.{camera} names {len(start)} vertices; {LEAST_START} or more are needed")
+    pixels = np.array(list(start.values()), dtype=np.float64)
+    if not np.isfinite(pixels).all():
+        raise refuse(f"start.{camera}: a pixel is not finite")
+    return np.array([ids.index(marker) for marker in start]), pixels

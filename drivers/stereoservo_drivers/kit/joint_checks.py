@@ -2,23 +2,291 @@
 
 from __future__ import annotations
 
+import math
+import os
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
 
-from stereoservo_drivers.kit import lifecycle_checks as lifecycle
+from stereoservo.ports.devices import DriverError, JointDriver, JointSpec
 from stereoservo_drivers.kit import motion_checks as motion
 from stereoservo_drivers.kit.bench import (
+    FRESH_SHARE,
     RUNAWAY_REMEDY,
     CheckFailedError,
     CheckNotRunError,
     JointBench,
     JointDriverSetup,
+    call_stop,
+    refused,
+    require,
+    resolutions,
+    told,
+    zero,
 )
 from stereoservo_drivers.kit.watchdog import StallWatch
+
+# -- of the life cycle ---------------------------------------------------------------------------------------
+# Checks of joint drivers that hardly move the arm: description, lifecycle, samples.
+
+
+WIDEST_RAD, FASTEST_RAD, WIDEST_M, FASTEST_M = 16.0 * math.pi, 30.0, 20.0, 10.0
+"""Range and velocity beyond which limits look like degrees or millimetres."""
+FINEST = 0.6e-3
+"""[rad or m] Encoders with coarser steps must state them."""
+GONE_S = 1.0
+"""Time for threads to end."""
+
+# -- without the device ----------------------------------------------------------------------------------------
+
+
+def describes_itself(bench: JointBench) -> str:
+    """The description is there before anything connects, and makes sense; suspicious limits are told."""
+    driver = bench.new()
+    require(
+        isinstance(driver, JointDriver),
+        f"{type(driver).__name__} lacks methods of JointDriver",
+        "all its methods",
+    )
+    description = driver.describe()
+    names = [joint.name for joint in description.joints]
+    require(bool(names) and len(set(names)) == len(names), f"joints are called {names}")
+    for joint in description.joints:
+        require(joint.position_min < joint.position_max, f"{joint.name}: empty range of positions")
+        require(
+            joint.velocity_max > 0 and joint.acceleration_max > 0, f"{joint.name}: limits must be above 0"
+        )
+        require(
+            joint.resolution < joint.position_max - joint.position_min,
+            f"{joint.name}: resolution above its range",
+        )
+    for name in ("rate_hz", "command_timeout_s", "call_budget_us"):
+        require(getattr(description, name) > 0, f"{name} must be above 0")
+    require(len(description.effort_units) in (0, len(names)), "effort_units: none, or one for each joint")
+    doubts = "".join(doubt for joint in description.joints if (doubt := _doubt(joint)))
+    return f"{len(names)} joints at {description.rate_hz:g} Hz, time-out {description.command_timeout_s:g} s{doubts}"
+
+
+def _doubt(joint: JointSpec) -> str:
+    """What looks like another unit than [rad, m, s] in a joint's limits, as a text; empty: nothing."""
+    revolute = joint.kind == "revolute"
+    widest, fastest, unit = (WIDEST_RAD, FASTEST_RAD, "rad") if revolute else (WIDEST_M, FASTEST_M, "m")
+    if joint.position_max - joint.position_min <= widest and joint.velocity_max <= fastest:
+        return ""
+    return (
+        f"; WARNING: {joint.name} goes from {joint.position_min:g} to {joint.position_max:g} {unit} at "
+        f"{joint.velocity_max:g} {unit}/s: {'degrees' if revolute else 'millimetres'}?"
+    )
+
+
+def refuses_before_configure(bench: JointBench) -> str:
+    """Calls before configure() raise DriverError."""
+    driver = bench.new()
+    codes = [
+        refused(call, f"{name}() before configure()")
+        for name, call in (
+            ("read_state", driver.read_state),
+            ("activate", driver.activate),
+            ("write_velocity", lambda: driver.write_velocity(zero(driver))),
+        )
+    ]
+    return ", ".join(dict.fromkeys(codes))
+
+
+def stops_unconnected(bench: JointBench) -> str:
+    """stop() and close() do nothing where nothing is connected."""
+    driver = bench.new()
+    for state in ("before configure()", "after close()"):
+        for _ in range(2):
+            call_stop(driver, state)
+        driver.close()
+    return "stop() and close(), twice each"
+
+
+# -- lifecycle ---------------------------------------------------------------------------------------------------
+
+
+def keeps_its_description(bench: JointBench) -> str:
+    """The description stays the same from state to state."""
+    driver = bench.new()
+    before = driver.describe()
+    bench.setup.configure(driver)
+    require(driver.describe() == before, "describe() changes with configure()")
+    driver.activate()
+    require(driver.describe() == before, "describe() changes with activate()")
+    return "the same in three states"
+
+
+def refuses_unless_active(bench: JointBench) -> str:
+    """Commands are refused before activate() and after deactivate(); then it is configured and activated again."""
+    driver = bench.configured()
+    codes = [refused(lambda: driver.write_velocity(zero(driver)), "write_velocity() before activate()")]
+    driver.activate()
+    driver.deactivate()
+    driver.deactivate()
+    codes.append(refused(lambda: driver.write_velocity(zero(driver)), "write_velocity() after deactivate()"))
+    try:
+        bench.setup.configure(driver)
+    except DriverError as error:
+        raise CheckFailedError(
+            f"configure() after deactivate(), as the command `reset` calls it, raised {told(error)}",
+            'DriverLifecycle.require("configure()", CREATED, CONFIGURED): connected already, it checks the device anew',
+        ) from error
+    driver.activate()
+    bench.drive(driver, zero(driver), 0.05)
+    return f"{codes[0]}, {codes[1]}; configured and activated again"
+
+
+def refuses_once_closed(bench: JointBench) -> str:
+    """Calls after close() raise DriverError."""
+    driver = bench.active()
+    driver.close()
+    driver.close()
+    codes = [refused(driver.read_state, "read_state() after close()")]
+    codes.append(refused(lambda: driver.write_velocity(zero(driver)), "write_velocity() after close()"))
+    return ", ".join(dict.fromkeys(codes))
+
+
+def is_silent_once_closed(bench: JointBench) -> str:
+    """Nothing reaches the device after close()."""
+    driver = bench.active()
+    bench.drive(driver, bench.slow(driver), 0.05)
+    driver.close()
+    bench.wait(0.1)
+    before = bench.setup.device_writes(driver)
+    if before is None:
+        raise CheckNotRunError("nobody counts what the device receives: override device_writes()")
+    driver.stop()
+    driver.close()
+    bench.wait(0.2)
+    after = bench.setup.device_writes(driver)
+    require(after == before, f"{(after or 0) - before} writes reach the device after close()")
+    return f"{before} writes before close(), none after"
+
+
+def leaves_nothing_behind(bench: JointBench) -> str:
+    """No threads and file descriptors are left after close()."""
+    for first in (True, False):  # what is loaded once, by the first driver, is no leak
+        threads, files = set(threading.enumerate()), _open_files()
+        driver = bench.active()
+        bench.drive(driver, zero(driver), 0.05)
+        driver.close()
+        if not first:
+            break
+    end = time.monotonic() + GONE_S
+
+    def left() -> tuple[list[str], int]:
+        alive = [thread.name for thread in threading.enumerate() if thread not in threads]
+        return alive, _open_files() - files
+
+    while any(left()) and time.monotonic() < end:
+        time.sleep(0.01)
+    alive, descriptors = left()
+    require(not alive, f"threads still run after close(): {', '.join(alive)}")
+    require(descriptors <= 0, f"{descriptors} file descriptors are still open after close()")
+    return "no thread, no descriptor"
+
+
+def _open_files() -> int:
+    folder = Path("/proc/self/fd")
+    return len(os.listdir(folder)) if folder.is_dir() else 0
+
+
+# -- samples -----------------------------------------------------------------------------------------------------
+
+
+def numbers_its_samples(bench: JointBench) -> str:
+    """Samples are numbered, and stamped young enough for the cell."""
+    driver = bench.active()
+    description = driver.describe()
+    period = 1.0 / description.rate_hz
+    states, ages = [], []
+    for _ in range(20):
+        bench.wait(period)
+        states.append(bench.read(driver))
+        ages.append((bench.now_ns() - states[-1].t_ns) * 1e-9)
+    require(states[-1].t_ns > states[0].t_ns, "stamps stand still")
+    require(states[-1].seq > states[0].seq, "sequence numbers stand still")
+    age, timeout = float(np.median(ages)), bench.setup.joint_timeout_s
+    most = min(FRESH_SHARE * timeout, timeout - period)
+    require(
+        age <= most,
+        f"samples are {age * 1e3:.1f} ms old when they are read (median), {max(most, 0.0) * 1e3:.1f} ms are allowed at "
+        f"{description.rate_hz:g} Hz: cells stop the arm at {timeout * 1e3:g} ms (safety.joint_timeout_s)",
+    )
+    return f"age {age * 1e3:.2f} ms (median), {most * 1e3:.1f} allowed"
+
+
+def keeps_samples_apart(bench: JointBench) -> str:
+    """Samples and reports own their arrays."""
+    driver = bench.active()
+    velocity = bench.slow(driver)
+    state = bench.read(driver)
+    positions = state.positions.copy()
+    bench.drive(driver, velocity, 0.2)
+    require(
+        np.array_equal(state.positions, positions), "a later read changes the arrays of an earlier sample"
+    )
+    report = bench.write(driver, velocity)
+    asked = velocity.copy()
+    velocity[:] = 0.0
+    require(np.array_equal(report.asked, asked), "the report keeps the caller's array, which changes")
+    return "samples and reports own their arrays"
+
+
+def agrees_with_its_velocities(bench: JointBench) -> str:
+    """Velocities of the samples are the change of their positions."""
+    driver = bench.active()
+    states = bench.drive(driver, bench.slow(driver), 0.6)
+    states = states[len(states) // 2 :]
+    seconds = np.diff([state.t_ns for state in states]) * 1e-9
+    # Not where this machine stood still, and the arm, too.
+    led = seconds < driver.describe().command_timeout_s
+    elapsed = float(seconds[led].sum())
+    require(elapsed > 0.0, "stamps stand still while the arm moves")
+    travelled = np.diff([state.positions for state in states], axis=0)[led].sum(axis=0) / elapsed
+    speeds = np.mean([state.velocities for state in states], axis=0)
+    steps = resolutions(driver)
+    error = np.abs(speeds - travelled)
+    allowed = 0.3 * np.abs(travelled) + 2.0 * steps / elapsed + bench.setup.rest_velocity
+    worst = int(np.argmax(error / allowed))
+    require(
+        bool(error[worst] <= allowed[worst]),
+        f"joint {worst}: velocities say {speeds[worst]:.4g}, positions {travelled[worst]:.4g} rad/s or m/s",
+    )
+    return f"velocities within {float(error.max()):.2g} rad/s or m/s of the positions' change"
+
+
+def states_its_resolution(bench: JointBench) -> str:
+    """Positions change by no more than the stated resolution at a time."""
+    driver = bench.active()
+    description = driver.describe()
+    period = 1.0 / description.rate_hz
+    stated = resolutions(driver)
+    slow = bench.slow(driver)
+    creep = np.minimum(0.15 * np.maximum(stated, FINEST) / period, np.abs(slow))
+    bench.drive(driver, np.sign(slow) * creep, 0.2)
+    states = bench.drive(driver, np.sign(slow) * creep, max(0.6, 60 * period))
+    changes = np.abs(np.diff([state.positions for state in states], axis=0))
+    steps = np.array(
+        [np.median(column[column > 0.0]) if (column > 0.0).any() else 0.0 for column in changes.T]
+    )
+    if not steps.all():
+        raise CheckNotRunError("a joint does not move when it is commanded to creep; its steps are unknown")
+    allowed = np.maximum(1.6 * np.maximum(stated, FINEST), 3.0 * creep * period)
+    worst = int(np.argmax(steps / allowed))
+    require(
+        bool(steps[worst] <= allowed[worst]),
+        f"joint {worst} changes by {steps[worst]:.3g} rad or m at a time, resolution states {stated[worst]:.3g}",
+    )
+    return f"steps of {', '.join(f'{step:.2g}' for step in steps)} rad or m"
+
 
 Verdict = Literal["passed", "failed", "not run"]
 
@@ -89,36 +357,32 @@ def _verdict(check: JointCheck, bench: JointBench, run: Callable[[JointBench], s
 JOINT_CHECKS = (
     JointCheck(
         "describes itself",
-        lifecycle.describes_itself,
+        describes_itself,
         "fill in JointDriverDescription before anything connects",
         False,
     ),
     JointCheck(
         "refuses calls before configure",
-        lifecycle.refuses_before_configure,
+        refuses_before_configure,
         "DriverLifecycle.require() at the beginning of each call",
         False,
     ),
-    JointCheck(
-        "stop raises nothing unconnected", lifecycle.stops_unconnected, "stop() must do nothing there", False
-    ),
-    JointCheck("keeps its description", lifecycle.keeps_its_description, "read limits before configure()"),
+    JointCheck("stop raises nothing unconnected", stops_unconnected, "stop() must do nothing there", False),
+    JointCheck("keeps its description", keeps_its_description, "read limits before configure()"),
     JointCheck(
         "refuses commands unless active",
-        lifecycle.refuses_unless_active,
+        refuses_unless_active,
         "DriverLifecycle.require(); activate() again after deactivate()",
     ),
-    JointCheck(
-        "refuses calls once closed", lifecycle.refuses_once_closed, "DriverLifecycle.require(); close() twice"
-    ),
+    JointCheck("refuses calls once closed", refuses_once_closed, "DriverLifecycle.require(); close() twice"),
     JointCheck(
         "leaves nothing behind",
-        lifecycle.leaves_nothing_behind,
+        leaves_nothing_behind,
         "join threads, close ports and sockets in close()",
     ),
     JointCheck(
         "numbers and stamps its samples",
-        lifecycle.numbers_its_samples,
+        numbers_its_samples,
         "stamp with context.clock when the device was read, and read it often enough; count each sample",
     ),
     JointCheck(
@@ -157,23 +421,23 @@ JOINT_CHECKS = (
     ),
     JointCheck(
         "agrees with its velocities",
-        lifecycle.agrees_with_its_velocities,
+        agrees_with_its_velocities,
         "units [rad/s, m/s] and sign of the velocities; of a Cartesian arm, whether its three angles are a rotation "
         "vector or turns in some order",
     ),
     JointCheck(
         "states its resolution",
-        lifecycle.states_its_resolution,
+        states_its_resolution,
         "JointSpec(resolution=encoder step at the joint)",
     ),
     JointCheck(
         "keeps samples apart",
-        lifecycle.keeps_samples_apart,
+        keeps_samples_apart,
         "new arrays in every JointState and CommandReport",
     ),
     JointCheck(
         "is silent once closed",
-        lifecycle.is_silent_once_closed,
+        is_silent_once_closed,
         "end threads in close(); stop() only while open",
     ),
     JointCheck(

@@ -17,8 +17,7 @@ import numpy as np
 from stereoservo.calibration.trial_data import WayObservations
 from stereoservo.geometry.distortion import undistort
 from stereoservo.kinematics.covariance import predicted_pixels
-from stereoservo.kinematics.model import CellModel
-from stereoservo.kinematics.shutter_stamps import ShutterOffset
+from stereoservo.kinematics.model import CellModel, ShutterOffset
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 LEAST_WAY = {"revolute": 0.01, "prismatic": 0.002}

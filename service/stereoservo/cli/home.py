@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from stereoservo.cli import interruption
-from stereoservo.cli.goal.command import follow
+from stereoservo.cli.goal import follow
 from stereoservo.cli.ik import OWN_SIGMA_PX, LearntArm, learnt_arm
 from stereoservo.cli.output import (
     CellArgument,

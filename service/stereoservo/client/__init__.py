@@ -3,7 +3,7 @@
 It needs zenoh and msgspec only. Goals, targets and messages are in `stereoservo.messages`.
 """
 
-from stereoservo.client.client import Client
+from stereoservo.client.client import Client, GoalOptions, as_target
 from stereoservo.client.errors import (
     ClientError,
     DaemonLostError,
@@ -16,7 +16,6 @@ from stereoservo.client.errors import (
 from stereoservo.client.events import EventWatch, HeardEvents
 from stereoservo.client.goal_handle import GoalHandle, GoalProgress, GoalResult
 from stereoservo.client.session import SessionError
-from stereoservo.client.targets import GoalOptions, as_target
 
 __all__ = [
     "Client",

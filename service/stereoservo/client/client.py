@@ -10,31 +10,39 @@ import itertools
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Unpack
+from contextlib import suppress
+from typing import Any, Literal, TypedDict, Unpack
 
 import msgspec
 from zenoh.handlers import RingChannel
 
-from stereoservo.client import calibration_requests
 from stereoservo.client.connection import NEXT_EVENT, Connection, read_message
 from stereoservo.client.errors import ClientError, DaemonLostError, FailedError, TimedOutError
-from stereoservo.client.events import POLL_S, EventWatch
-from stereoservo.client.goal_handle import GoalHandle
-from stereoservo.client.targets import GoalOptions, as_target
+from stereoservo.client.events import POLL_S, EventWatch, HeardEvents
+from stereoservo.client.goal_handle import GoalHandle, Lease
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import (
+    AdaptiveGain,
+    Calibrate,
+    Centre,
     Disable,
     Enable,
+    FeatureTarget,
     Goal,
     Hold,
     Home,
+    JacobianName,
     Jog,
     JointTarget,
+    LawName,
     OrderAuxiliary,
+    PointSource,
+    ProfileName,
     Reset,
     Resume,
     Stop,
     Target,
+    TaughtTarget,
     Teach,
 )
 from stereoservo.messages.wire import (
@@ -263,7 +271,7 @@ class Client(Connection):
         The motion has a lease that this client renews (``lease_s=None``: none): a client that dies stops it.
         Raises RefusedError, FailedError (``code``: of the fit that failed, or of the reason that ended the motion).
         """
-        return calibration_requests.calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
+        return calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
 
     def check_model(
         self,
@@ -273,7 +281,7 @@ class Client(Connection):
         lease_s: float | None = 5.0,
     ) -> CheckReport:
         """Run a short check motion and test whether the model in use still holds. Raises RefusedError, FailedError."""
-        return calibration_requests.check_model(self, progress, timeout_s, lease_s)
+        return check_model(self, progress, timeout_s, lease_s)
 
     def reset_zeros(
         self,
@@ -288,7 +296,7 @@ class Client(Connection):
         ``progress`` is called with the ``checked`` event, too. Raises RefusedError, FailedError (its event's ``name``:
         ``check_holds``, ``other_cause``, ``not_observable`` or the code of a check that failed).
         """
-        return calibration_requests.reset_zeros(self, progress, timeout_s, lease_s)
+        return reset_zeros(self, progress, timeout_s, lease_s)
 
     # -- watching -------------------------------------------------------------------------------------------
 
@@ -339,3 +347,123 @@ def with_newest_markers(arrived: list[tuple[str, Any, type[Any]]]) -> list[tuple
         for k, (key, payload, kind) in enumerate(arrived)
         if kind is not FeaturesMessage or last[key] == k
     ]
+
+
+# -- calibration requests ------------------------------------------------------------------------------------
+# Requests of a client to calibrate a cell, check its model or reset joint zeros: runs the motion under a lease and
+# waits for the result.
+
+
+REPORT_TIMEOUT_S = 120.0
+Progress = Callable[[EventMessage], None]
+
+
+def calibrate(
+    connection: Connection,
+    progress: Progress | None,
+    timeout_s: float,
+    *,
+    report: bool,
+    lease_s: float | None,
+) -> CalibrationResult:
+    """Implementation of `Client.calibrate`."""
+    command = Calibrate(str(uuid.uuid4()), lease_s=lease_s)
+    event = _run(connection, command, "calibrated", progress, timeout_s, report)
+    if event.calibration is None:
+        raise FailedError("calibration", event)
+    return event.calibration
+
+
+def check_model(
+    connection: Connection, progress: Progress | None, timeout_s: float, lease_s: float | None
+) -> CheckReport:
+    """Implementation of `Client.check_model`."""
+    command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s)
+    event = _run(connection, command, "checked", progress, timeout_s, False)
+    if event.check is None:
+        raise FailedError("check", event)
+    return event.check
+
+
+def reset_zeros(
+    connection: Connection, progress: Progress | None, timeout_s: float, lease_s: float | None
+) -> ZeroReset:
+    """Implementation of `Client.reset_zeros`."""
+    command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s, reset_zeros=True)
+    event = _run(connection, command, "zeros_reset", progress, timeout_s, False)
+    if event.reset is None:
+        raise FailedError("reset of joint zeros", event)
+    return event.reset
+
+
+def _run(
+    connection: Connection,
+    command: Calibrate,
+    success: str,
+    progress: Progress | None,
+    timeout_s: float,
+    report: bool,
+) -> EventMessage:
+    lease: Lease | None = None
+
+    def hear(event: EventMessage) -> None:
+        if lease is not None and event.kind in ("calibration_finished", "check_finished"):
+            lease.end()
+        if progress is not None:
+            progress(event)
+
+    with EventWatch(connection) as watch:
+        heard = HeardEvents(watch, lambda event: event.id == command.id, hear)
+        connection.command("calibrate", command)
+        lease = Lease(connection, command.id, command.lease_s)
+        try:
+            end = heard.wait((success, "calibration_failed", "calibration_aborted"), "calibration", timeout_s)
+        finally:
+            lease.end()
+        if report and end.kind != "calibration_aborted":
+            with suppress(TimedOutError):  # the model exists; an event announces its report, if it comes
+                heard.wait(("calibration_report",), "the report", REPORT_TIMEOUT_S)
+    return end
+
+
+# -- targets -------------------------------------------------------------------------------------------------
+# Short forms of a goal's target (name, joint positions or set-points) and options, converted to messages.
+
+
+class GoalOptions(TypedDict, total=False):
+    """Fields of `Goal` beside id and target; the cell's default applies to those left out."""
+
+    law: LawName | None
+    points: PointSource | None
+    jacobian: JacobianName | None
+    centre: Centre | None
+    cameras: tuple[str, ...] | None
+    profile: ProfileName | None
+    posture: dict[str, float] | None
+    gain: float | AdaptiveGain | None
+    damping: float | None
+    tolerance_px: float | None
+    hold_frames: int | None
+    speed_scale: float
+    lease_s: float | None
+    time_limit_s: float | None
+    mode: Literal["preempt", "queue"]
+    blend_px: float | None
+    acknowledge_s: float | None
+    follow_markers: tuple[int, ...]
+
+
+def as_target(target: Target | str | Mapping[str, Any]) -> Target:
+    """A target from its short form: a taught goal's name, positions by joint, or set-points by camera."""
+    if isinstance(target, str):
+        return TaughtTarget(target)
+    if isinstance(target, Mapping):
+        if all(isinstance(value, Mapping) for value in target.values()) and target:
+            return FeatureTarget(
+                {
+                    camera: {int(marker): (float(u), float(v)) for marker, (u, v) in points.items()}
+                    for camera, points in target.items()
+                }
+            )
+        return JointTarget({str(name): float(value) for name, value in target.items()})
+    return target

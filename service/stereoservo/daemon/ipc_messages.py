@@ -83,7 +83,7 @@ class RunPlan(msgspec.Struct, frozen=True):
 
 
 class Received(msgspec.Struct, frozen=True, tag="received"):
-    """What a receiver has: a sender's messages up to ``number`` (see `outbox`). The servo process sends no event over a
+    """What a receiver has: a sender's messages up to ``number`` (see `Outbox`). The servo process sends no event over a
     connection before the gateway has said this.
     """
 

@@ -32,10 +32,18 @@ import numba
 import numpy as np
 
 from stereoservo.control.faces import spread_in_images
+from stereoservo.control.incidence import (
+    image_task,
+    incidence_freedoms,
+    incidence_step,
+    incidence_task,
+    limits_task,
+)
+from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
-from stereoservo.control.law_warmup import warm_up_incidences, warm_up_laws
 from stereoservo.control.laws.cartesian3 import cartesian_step
 from stereoservo.control.marker_groups import FLAT_PX, find_groups
+from stereoservo.control.mobility import mobility
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
 from stereoservo.core.monitors.moving_camera import rehearse as rehearse_mobile
@@ -46,8 +54,10 @@ from stereoservo.core.sources.law import adaptive_gain
 from stereoservo.core.state import Holding, IncidenceGoal
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import distort
+from stereoservo.geometry.screws import twist_matrix
+from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
-from stereoservo.kinematics.kernels import distort_pixel
+from stereoservo.kinematics.kernels import distort_pixel, project_points
 from stereoservo.kinematics.model import MODEL_SCHEMA, CameraModel, CellModel, ModelCovariance
 from stereoservo.messages.cell_file import Mount
 from stereoservo.messages.compilation_progress import CompilationProgress, progress_path
@@ -71,7 +81,9 @@ from stereoservo.messages.goals import (
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import KERNELS, Overload, load, overloads, tell_compiled
 from stereoservo.numerics.kernel_cache import SHIPPED, file_hash, shipped_folder
-from stereoservo.planning.planner_warmup import warm_up_planner
+from stereoservo.planning.plan import PlanLimits, PlanRequest
+from stereoservo.planning.planner import plan
+from stereoservo.planning.tracking import advance, sample_plan
 from stereoservo.ports.devices import CameraObservation, JointState
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 600.0
@@ -595,6 +607,146 @@ def _wait_for_others() -> None:
     lock = os.open(_lock_path(), os.O_RDWR | os.O_CREAT, 0o600)
     os.set_inheritable(lock, True)  # it is kept by what this process becomes
     fcntl.flock(lock, fcntl.LOCK_EX)
+
+
+# -- kernels of laws -----------------------------------------------------------------------------------------
+# Compilation of the numba kernels of control laws, incidences, mobility and self-motion: each runs once on an example
+# arm, so that the servo loop compiles none.
+
+
+def warm_up_laws(*, own: bool = True) -> None:
+    """Compile, or load from numba's cache, the kernels of all laws, limited rates included; without ``own``: of those
+    of other distributions.
+    """
+    operators = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
+    K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+    matrices = np.stack([K @ np.hstack([np.eye(3), np.array([[x], [0], [1.0]])]) for x in (0.1, -0.1)])
+    eyes = np.array([[-0.1, 0, -1, 1], [0.1, 0, -1, 1.0]])
+    points = np.array([[0, 0, 0, 1], [0.1, 0, 0, 1], [0, 0.1, 0, 1.0]])
+    targets = points + np.array([0.01, 0.02, 0.03, 0.0])
+    pixels, wanted = project_points(matrices, points)[0], project_points(matrices, targets)[0]
+    ones = np.ones((2, 3))
+    scene = Scene(operators, int(Composition.BASE_FIRST), matrices, eyes, points, pixels, ones)
+    task = Task(
+        wanted, ones, np.zeros_like(wanted), targets, np.ones(3), points.mean(axis=0), targets.mean(axis=0),
+        np.arange(3),
+    )  # fmt: skip
+    for name, law in list(LAWS.items()):
+        if not own and law.step.__module__.startswith("stereoservo."):
+            continue
+        try:
+            law.step(scene, task, Options(1.0, 0.004, rotation_rate=1e-3, translation_rate=1e-3))
+        except (
+            Exception
+        ) as error:  # a third party's law that cannot step: listed with its error, the others go on
+            LAWS.disable(name, f"its step raised {type(error).__name__}: {error}")
+
+
+def warm_up_incidences() -> None:
+    """Compile, or load from numba's cache, the kernels of incidences, mobility and self-motion."""
+    operators = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
+    K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+    matrices = np.stack([K @ np.hstack([np.eye(3), np.array([[x], [0], [1.0]])]) for x in (0.1, -0.1)])
+    points = np.array([[0, 0, 0, 1], [0.1, 0, 0, 1], [0, 0.1, 0, 1.0]])
+    infinity = np.array([0, 0, 0, 1.0])
+    pixels = np.einsum("cij,mj->cmi", matrices, points)
+    pixels = pixels[..., :2] / pixels[..., 2:]
+    eyes = np.array([[-0.1, 0, -1, 1], [0.1, 0, -1, 1.0]])
+    scene = Scene(operators, int(Composition.BASE_FIRST), matrices, eyes, points, pixels, np.ones((2, 3)))
+    task = incidence_task(
+        ["plane-on-plane"],
+        [[0, 1, 2]],
+        [points + [0.0, 0.0, 0.01, 0.0] * np.array([[1], [2], [3]])],
+        infinity,
+        0.1,
+    )
+    positions = np.zeros(6)
+    for second in (
+        limits_task(positions, positions - 1.0, positions + 2.0, 0.5),
+        image_task(operators, matrices, points, pixels, np.ones((2, 3)), 1.0),
+    ):
+        incidence_step(scene, task, Options(1.0, 0.004), second)
+    slides = scene._replace(operators=operators[:3].copy())
+    incidence_freedoms(slides, task, infinity, anywhere=True)
+    mobility(slides.operators, matrices, points, infinity)
+    self_motion_from_limits(np.zeros((12, 6)), positions, positions - 1.0, positions + 2.0, 0.5)
+
+
+# -- kernels of the planner ----------------------------------------------------------------------------------
+# Compilation of the path planner's numba kernels by planning example paths (straight, around a keep-out, unreachable),
+# so that the servo loop compiles none.
+
+
+AWAY = 0.2
+"""Distance of the example goal [m]."""
+
+
+def warm_up_planner() -> None:
+    """Plan a straight path, detours around a keep-out and an unreachable goal; sample the first."""
+    request = _request()
+    found = plan(request).plan
+    if found is None:
+        raise RuntimeError("the example cell's straight path must be feasible")
+    sample_plan(found, advance(found, 0.1, 0.004, 0.0))
+    box = np.full((1, 6, 2), [-np.inf, np.inf])
+    box[0, 0] = 0.4 * AWAY, 0.6 * AWAY
+    box[0, 1, 0] = -0.03
+    plan(_limited(request, keep_outs=box))
+    beyond = np.full(6, np.inf)
+    beyond[0] = 0.7 * AWAY
+    plan(_limited(request, position_max=beyond))
+    gantry = request.operators.copy()
+    gantry[3:] = 0.0  # it cannot turn: the refusal says which freedom it lacks
+    plan(msgspec.structs.replace(request, operators=gantry))
+    plan(msgspec.structs.replace(request, targets=request.points, centre_target=request.centre))
+
+
+def _limited(request: PlanRequest, **limits: FloatArray) -> PlanRequest:
+    return msgspec.structs.replace(request, limits=msgspec.structs.replace(request.limits, **limits))
+
+
+def _request() -> PlanRequest:
+    start = np.array([-0.5 * AWAY, 0.0, 1.0])
+    operators = np.zeros((6, 4, 4))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        operators[k, k, 3] = 1.0
+        operators[3 + k, j, i], operators[3 + k, i, j] = 1.0, -1.0
+        operators[3 + k, j, 3], operators[3 + k, i, 3] = -start[i], start[j]
+    camera = np.array([[600.0, 0.0, 320.0, 0.0], [0.0, 600.0, 240.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+    matrices = np.stack([camera, camera])
+    matrices[:, 0, 3] = 60.0, -60.0
+    eyes = np.array([[-0.1, 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 1.0]])
+    corners = 0.05 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    turned = np.stack([-corners[:, 1], corners[:, 0], corners[:, 2]], axis=1)
+    aside = np.array([AWAY, 0.0, 0.0])
+    return PlanRequest(
+        operators=operators,
+        composition=0,
+        joints=np.zeros(6),
+        matrices=matrices,
+        camera_centres=eyes,
+        points=_of_height_1(start + corners),
+        targets=_of_height_1(start + aside + turned),
+        kept=np.ones(4),
+        centre=np.append(start, 1.0),
+        centre_target=np.append(start + aside, 1.0),
+        faces=np.array([[0, 1, 2]]),
+        limits=PlanLimits(
+            position_min=np.full(6, -np.inf),
+            position_max=np.full(6, np.inf),
+            velocity_max=np.ones(6),
+            acceleration_max=np.full(6, 4.0),
+            keep_outs=np.zeros((0, 6, 2)),
+            sizes=np.array([[640.0, 480.0], [640.0, 480.0]]),
+            lenses=np.array([[0.01, 320.0, 240.0, 320.0], [0.01, 320.0, 240.0, 320.0]]),
+            view_margin_px=4.0,
+        ),
+    )
+
+
+def _of_height_1(points: FloatArray) -> FloatArray:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,7 @@ import select
 import msgspec
 
 from stereoservo.core.cycle import Event, ModelUpdate, encode
-from stereoservo.daemon.channels.outbox import Outbox
-from stereoservo.daemon.channels.seqpacket import ChannelServer, PacketChannel
+from stereoservo.daemon.channels.seqpacket import ChannelServer, Outbox, PacketChannel
 from stereoservo.daemon.ipc_messages import (
     OBSERVATION_LAYOUT,
     PRIOR_CAPACITY,

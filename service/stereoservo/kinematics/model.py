@@ -4,6 +4,7 @@ checks, and its versioned JSON file.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +13,6 @@ import msgspec
 import numpy as np
 
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
-from stereoservo.kinematics.shutter_stamps import ShutterOffset, offset_faults
 from stereoservo.messages.cell_file import MAX_CAMERAS, MAX_JOINTS, MAX_MARKERS, Mount
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.files import read_bounded, verify_checksum, with_checksum, write_atomically
@@ -592,3 +592,32 @@ def load_model(path: Path) -> CellModel:
     """Read and check a model file. Raises ModelFileError."""
     with decoding(partial(ModelFileError, path, "")):
         return decode_model(read_bounded(path, MAX_MODEL_BYTES), path)
+
+
+# -- stamps of the shutters ----------------------------------------------------------------------------------
+# Offsets of the cameras' shutter stamps that a model states.
+
+
+LONGEST_OFFSET_S = 1.0
+"""Largest offset of shutter stamps that a model may state."""
+
+
+class ShutterOffset(msgspec.Struct, frozen=True):
+    """By how much later than its stamps tell the shutter of ``camera`` opens [s], and its standard deviation [s]."""
+
+    camera: str
+    offset_s: float
+    deviation_s: float
+
+
+def offset_faults(offsets: Sequence[ShutterOffset], cameras: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """What is wrong with the offsets of a model's ``cameras``, by key: they are of these, once each, and bounded."""
+    for k, offset in enumerate(offsets):
+        key = f"shutter_offsets[{k}]"
+        if offset.camera not in cameras or any(other.camera == offset.camera for other in offsets[:k]):
+            yield key, f"is of camera {offset.camera!r}; once each of {', '.join(cameras)} is valid"
+        if not (abs(offset.offset_s) <= LONGEST_OFFSET_S and 0.0 <= offset.deviation_s <= LONGEST_OFFSET_S):
+            yield (
+                key,
+                f"is {offset.offset_s} s ± {offset.deviation_s} s; up to {LONGEST_OFFSET_S:g} s is taken",
+            )

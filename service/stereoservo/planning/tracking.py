@@ -44,7 +44,7 @@ class PlannedJoints(NamedTuple):
 
 @kernel
 def _pace_at(times: FloatArray, k: int) -> float:
-    """Samples per second at sample ``k``: the mean at two neighbours is one over the time between (`time_scaling`)."""
+    """Samples per second at sample ``k``: the mean at two neighbours is one over the time between (`sample_times`)."""
     before = 0.0
     for i in range(k):
         between = 1.0 / (times[i + 1] - times[i])

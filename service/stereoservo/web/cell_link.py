@@ -26,8 +26,8 @@ from stereoservo.messages.discovery import NotRunningError
 from stereoservo.messages.goals import Calibrate, FeatureTarget, Goal, TaughtTarget, UpdateGoal
 from stereoservo.messages.wire import CellInfo, EventMessage, FeaturesMessage, Reply, StateMessage, encode
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.web.leases import LEASE_S, Leases
 from stereoservo.web.model_view import ModelView
+from stereoservo.web.rights import LEASE_S, Leases
 
 POLL_S = 0.004
 AGAIN_S = 0.25

@@ -15,10 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -28,14 +29,12 @@ from websockets.http11 import Request, Response
 from stereoservo.client import ClientError, SessionError
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.messages.discovery import NotRunningError
-from stereoservo.messages.goals import Goal, UpdateGoal
-from stereoservo.messages.wire import MessageError, Reply
+from stereoservo.messages.goals import Goal, GoalId, Name, StreamedTarget, UpdateGoal
+from stereoservo.messages.wire import MessageError, Reply, decode
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.web import requests as ask
 from stereoservo.web.cell_link import CellLink, LinkDownError, Publish, refusal
-from stereoservo.web.leases import LEASE_S
 from stereoservo.web.model_view import ModelView, drag_answer
-from stereoservo.web.rights import ArmHolder, RightsError, allowed_hosts, check_host, check_origin
+from stereoservo.web.rights import LEASE_S, ArmHolder, RightsError, allowed_hosts, check_host, check_origin
 
 FILES = {
     "/": ("index.html", "text/html; charset=utf-8"),
@@ -303,15 +302,15 @@ class PageServer:
         n = 0
         try:
             data = message.encode() if isinstance(message, str) else message
-            n = ask.number_of(data)
-            request = ask.decode_request(data)
+            n = number_of(data)
+            request = decode_request(data)
             if self.link.recording is True:
                 answer = {"ok": True} | _playback(self.link, request)
                 page.tell({"answer": {"n": n, **answer}})
                 return
-            if not isinstance(request, ask.OPEN):
+            if not isinstance(request, OPEN):
                 self.holder.require(page, str(request.__struct_config__.tag))
-            if isinstance(request, ask.Stop):
+            if isinstance(request, Stop):
                 answer = {"ok": True} | await self._run(self._stops, page, request)
             else:
                 with page.under_way(str(request.__struct_config__.tag)):
@@ -323,7 +322,7 @@ class PageServer:
         self._let_go(page)
         page.tell({"answer": {"n": n, **answer}})
 
-    async def _run(self, pool: ThreadPoolExecutor, page: Page, request: ask.PageRequest) -> dict[str, Any]:
+    async def _run(self, pool: ThreadPoolExecutor, page: Page, request: PageRequest) -> dict[str, Any]:
         assert self._loop is not None
         return await self._loop.run_in_executor(pool, self._do, page, request)
 
@@ -334,52 +333,52 @@ class PageServer:
         if not self.holder.taken:  # else its leases are another page's by now
             self.link.end_leases()
 
-    def _do(self, page: Page, request: ask.PageRequest) -> dict[str, Any]:
+    def _do(self, page: Page, request: PageRequest) -> dict[str, Any]:
         """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
         link = self._cell_link
         match request:
-            case ask.Stop():
+            case Stop():
                 operator = self.holder.operator
                 return _told(link.stop(operator if operator and self.holder.holds(page) else page.name))
-            case ask.Take():
+            case Take():
                 self.holder.take(page, request.token)
                 self._rights_changed()
                 return {"message": f"this page holds the arm as {self.holder.operator}"}
-            case ask.Release():
+            case Release():
                 if self.holder.release(page):
                     link.end_leases()
                 self._rights_changed()
                 return {"message": "this page does not hold the arm"}
-            case ask.Enable():
+            case Enable():
                 link.client.enable()
                 return {"message": "enabled: the arm may move"}
-            case ask.Disable():
+            case Disable():
                 return _told(link.client.disable())
-            case ask.Hold():
+            case Hold():
                 return _told(link.client.hold())
-            case ask.Resume():
+            case Resume():
                 return _told(link.client.resume())
-            case ask.Reset():
+            case Reset():
                 link.client.reset()
                 return {"message": "the fault is cleared; enable switches on"}
-            case ask.Teach():
+            case Teach():
                 return {"message": link.client.teach(request.name).message}
-            case ask.Calibrate():
+            case Calibrate():
                 return _told(link.calibrate(request.check))
-            case ask.Cancel():
+            case Cancel():
                 return _told(link.cancel())
-            case ask.Drag():
+            case Drag():
                 return self._drag(page, request)
-            case ask.Check():
+            case Check():
                 return self._check(page, request)
-            case ask.Go():
+            case Go():
                 return self._go(page)
-            case ask.Send():
+            case Send():
                 return self._send_goal(msgspec.structs.replace(request.goal, lease_s=LEASE_S, check=False))
-            case ask.Update():
+            case Update():
                 link.update(UpdateGoal(request.id, request.target, request.stamp_s))
                 return {"message": "moved"}
-            case ask.Play() | ask.Seek():
+            case Play() | Seek():
                 raise RightsError(
                     "a live cell is shown, which has no past: `stereoservo web --flight FILE` plays one"
                 )
@@ -394,7 +393,7 @@ class PageServer:
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self._tell_all_rights)
 
-    def _drag(self, page: Page, request: ask.Drag) -> dict[str, Any]:
+    def _drag(self, page: Page, request: Drag) -> dict[str, Any]:
         model = self._cell_link.view.model
         if model is None:
             raise LinkDownError("there is no model of the arm yet: calibrate first")
@@ -410,7 +409,7 @@ class PageServer:
             page.draft, page.base = found.joints, None
         return drag_answer(model, found.joints, request.camera, found.left_px)
 
-    def _check(self, page: Page, request: ask.Check) -> dict[str, Any]:
+    def _check(self, page: Page, request: Check) -> dict[str, Any]:
         page.changes += 1
         page.checked, change = None, page.changes
         link = self._cell_link
@@ -461,12 +460,12 @@ async def _send(connection: ServerConnection, page: Page) -> None:
         return
 
 
-def _playback(link: RecordedLink, request: ask.PageRequest) -> dict[str, Any]:
+def _playback(link: RecordedLink, request: PageRequest) -> dict[str, Any]:
     """Do what a page asks of a recording. Raises RightsError for what would be asked of an arm."""
     match request:
-        case ask.Play():
+        case Play():
             return link.play(request.playing, request.speed)
-        case ask.Seek():
+        case Seek():
             return link.seek(request.at)
     verb = request.__struct_config__.tag
     raise RightsError(
@@ -501,3 +500,187 @@ def _response(status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=
         }
     )
     return Response(status.value, status.phrase, headers, body)
+
+
+# -- what pages may ask --------------------------------------------------------------------------------------
+# What a page may ask of the server, as strict structs: one JSON object a WebSocket message, with ``do`` and a number
+# ``n`` that the answer repeats.
+
+
+Number = Annotated[int, Meta(ge=0, le=2**53)]
+Offset = Annotated[float, Meta(ge=-1e5, le=1e5)]
+
+
+class Stop(msgspec.Struct, frozen=True, tag="stop", tag_field="do", forbid_unknown_fields=True):
+    """Stop the arm. Every page may."""
+
+    n: Number = 0
+
+
+class Take(msgspec.Struct, frozen=True, tag="take", tag_field="do", forbid_unknown_fields=True):
+    """Hold the arm, with the one-time token of the terminal."""
+
+    token: Annotated[str, Meta(max_length=200)]
+    n: Number = 0
+
+
+class Release(msgspec.Struct, frozen=True, tag="release", tag_field="do", forbid_unknown_fields=True):
+    """Hold the arm no longer."""
+
+    n: Number = 0
+
+
+class Enable(msgspec.Struct, frozen=True, tag="enable", tag_field="do", forbid_unknown_fields=True):
+    """Let the arm move."""
+
+    n: Number = 0
+
+
+class Disable(msgspec.Struct, frozen=True, tag="disable", tag_field="do", forbid_unknown_fields=True):
+    """Stop the arm and switch its drives off."""
+
+    n: Number = 0
+
+
+class Hold(msgspec.Struct, frozen=True, tag="hold", tag_field="do", forbid_unknown_fields=True):
+    """Decelerate and hold; the goal is kept."""
+
+    n: Number = 0
+
+
+class Resume(msgspec.Struct, frozen=True, tag="resume", tag_field="do", forbid_unknown_fields=True):
+    """Continue after hold or stop."""
+
+    n: Number = 0
+
+
+class Reset(msgspec.Struct, frozen=True, tag="reset", tag_field="do", forbid_unknown_fields=True):
+    """Leave a fault whose cause is gone."""
+
+    n: Number = 0
+
+
+class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="do", forbid_unknown_fields=True):
+    """Store what the cameras see as goal ``name``."""
+
+    name: Name
+    n: Number = 0
+
+
+class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="do", forbid_unknown_fields=True):
+    """Run the trial motions and fit a model; ``check``: the short check motion instead."""
+
+    check: bool = False
+    n: Number = 0
+
+
+class Drag(msgspec.Struct, frozen=True, tag="drag", tag_field="do", forbid_unknown_fields=True):
+    """Move the outline of the marker body in the picture of ``camera`` by ``shift`` [px] and ``turn`` [rad]; ``nearer``
+    multiplies its depth.
+
+    From where the last drag ended (``draft``) or from where the arm is. ``done``: the next drag goes on from here.
+    Nothing moves.
+    """
+
+    camera: Name
+    shift: tuple[Offset, Offset]
+    turn: Annotated[float, Meta(ge=-7.0, le=7.0)] = 0.0
+    nearer: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0
+    draft: bool = False
+    done: bool = False
+    n: Number = 0
+
+
+class Check(msgspec.Struct, frozen=True, tag="check", tag_field="do", forbid_unknown_fields=True):
+    """Plan the taught goal ``name``, or ``goal``, or without either the dragged goal. Nothing moves."""
+
+    name: Name | None = None
+    goal: Goal | None = None
+    n: Number = 0
+
+
+class Go(msgspec.Struct, frozen=True, tag="go", tag_field="do", forbid_unknown_fields=True):
+    """Send the goal that was checked last."""
+
+    n: Number = 0
+
+
+class Send(msgspec.Struct, frozen=True, tag="send", tag_field="do", forbid_unknown_fields=True):
+    """Send ``goal``, of any kind; its lease is the server's, which renews it while the page is open."""
+
+    goal: Goal
+    n: Number = 0
+
+
+class Update(msgspec.Struct, frozen=True, tag="update", tag_field="do", forbid_unknown_fields=True):
+    """Move the set-points of the goal ``id``; ``stamp_s``: the page's own time of them."""
+
+    id: GoalId
+    target: StreamedTarget
+    stamp_s: float | None = None
+    n: Number = 0
+
+
+class Cancel(msgspec.Struct, frozen=True, tag="cancel", tag_field="do", forbid_unknown_fields=True):
+    """Cancel the active goal."""
+
+    n: Number = 0
+
+
+class Play(msgspec.Struct, frozen=True, tag="play", tag_field="do", forbid_unknown_fields=True):
+    """Of a recording: play it, ``speed`` times as fast, or pause."""
+
+    playing: bool = True
+    speed: Annotated[float, Meta(ge=0.05, le=50.0)] | None = None
+    n: Number = 0
+
+
+class Seek(msgspec.Struct, frozen=True, tag="seek", tag_field="do", forbid_unknown_fields=True):
+    """Of a recording: go to ``at`` [s] after its begin."""
+
+    at: Annotated[float, Meta(ge=0.0, le=1e7)]
+    n: Number = 0
+
+
+PageRequest = (
+    Stop
+    | Take
+    | Release
+    | Enable
+    | Disable
+    | Hold
+    | Resume
+    | Reset
+    | Teach
+    | Calibrate
+    | Drag
+    | Check
+    | Go
+    | Send
+    | Update
+    | Cancel
+    | Play
+    | Seek
+)
+OPEN = (Stop, Take, Release)
+"""What a page may ask that does not hold the arm."""
+PLAYBACK = (Play, Seek)
+"""What a page may ask of a recording, and of nothing else."""
+
+
+class _Numbered(msgspec.Struct):
+    n: Number = 0
+
+
+def decode_request(data: bytes) -> PageRequest:
+    """A page's request. Raises MessageError, whatever the bytes."""
+    kind: type[PageRequest] = PageRequest  # type: ignore[assignment]
+    return decode(data, kind)
+
+
+def number_of(data: bytes) -> int:
+    """The number of a request that is not valid, which its answer repeats; 0 where it has none."""
+    try:
+        return msgspec.json.decode(data, type=_Numbered).n
+    except Exception:  # bytes of any kind
+        return 0

@@ -24,8 +24,7 @@ from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.can.channel import Channel, ChannelSettings
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.can.load import cycle_load, frame_bits
-from stereoservo_drivers.canopen.bringup import Subscriptions
-from stereoservo_drivers.canopen.codec import NOT_CYCLIC, Codec
+from stereoservo_drivers.canopen.codec import NOT_CYCLIC, Codec, Subscriptions
 from stereoservo_drivers.canopen.driver import CanJointDriver, make_bringup, make_codec
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.benchmarks.can_peer import ANSWERS, AXES, COMMANDS, LOOP_PRIORITY, SYNC, peer, real_time

@@ -162,7 +162,7 @@ def _serve(
 
 
 def _cameras(settings: _Settings, termination: Termination) -> None:
-    from stereoservo_sim.emulators.cameras.camera_console import serve_cameras
+    from stereoservo_sim.emulators.cameras.stream_server import serve_cameras
     from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
     if settings.bit_time is not None:

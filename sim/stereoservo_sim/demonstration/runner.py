@@ -10,13 +10,19 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from stereoservo.client import Client
+import numpy as np
+import numpy.typing as npt
+
+from stereoservo.client import Client, ClientError, FailedError, GoalHandle
+from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.daemon.lockstep import LockstepCell
-from stereoservo.kinematics.model import save_model
+from stereoservo.daemon.servo import SILENCE
+from stereoservo.kinematics.model import load_model, save_model
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.messages.discovery import DaemonProcess
-from stereoservo.messages.wire import LoopInfo
+from stereoservo.messages.goals import JointTarget, LawName
+from stereoservo.messages.wire import EventMessage, FeaturesMessage, LoopInfo
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.demonstration.belt import Belt
 from stereoservo_sim.demonstration.emulated import (
@@ -27,10 +33,18 @@ from stereoservo_sim.demonstration.emulated import (
     move_to_channel,
     move_to_server,
 )
-from stereoservo_sim.demonstration.live_demonstrator import LiveDemonstrator
-from stereoservo_sim.demonstration.lockstep_demonstrator import LockstepDemonstrator
+from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.demonstration.progress import DemoFailedError, DemonstrationProgress
-from stereoservo_sim.demonstration.scenario import Calibrated, ShownGoal, perform, shown_goals
+from stereoservo_sim.demonstration.scenario import (
+    SIGHT_S,
+    Calibrated,
+    MarkerSights,
+    ShownGoal,
+    SightCollection,
+    VisualTarget,
+    perform,
+    shown_goals,
+)
 from stereoservo_sim.demonstration.truth import TruthLog, shown_positions, true_cell
 from stereoservo_sim.emulators.emulator_process import EmulatorProcess
 from stereoservo_sim.world.conveyor import Conveyor, conveyor_of
@@ -205,3 +219,224 @@ def _emulate_cameras(
     folder = scratch / "streams"
     folder.mkdir()
     return move_to_server(cell_path, folder, channel)
+
+
+# -- the live demonstrator -----------------------------------------------------------------------------------
+# The demonstration with real processes: a daemon, and a client over zenoh.
+
+
+LOOK_EVERY_S = 2.0
+RECENT_EVENTS = 50
+LOOKS = 3
+"""For the event that tells why a cell is held: state and events come by ways of their own."""
+MOST_HOLDS = 20
+BUSY_COMPUTER = frozenset({"JOINT_STAMP", "LOOP_GAP"})
+"""Codes of the stops of a simulated cell whose computer was busy."""
+
+
+class LiveDemonstrator:
+    """``scenario.Operator`` as a goal client of a running daemon.
+
+    As an operator would, it resumes an arm that was held or stopped since the computer was busy, ``MOST_HOLDS`` times
+    at most, tells so, and begins anew what a stop ended; any other hold ends what it waits for.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        progress: Callable[[float], None],
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._client = client
+        self._progress = progress
+        self._tell = tell
+        self._looked_s = time.monotonic()
+        self._holds = self._looks = 0
+        client.while_waiting = self._look
+
+    def enable(self) -> None:
+        """Enable the arm."""
+        self._client.enable()
+
+    def calibrate(self) -> Calibrated:
+        """Calibrate; the model is read from the daemon's file."""
+        while True:
+            start = time.monotonic()
+            try:
+                result = self._client.calibrate(self._hear)
+            except FailedError as error:
+                if not self._goes_on(error.code in BUSY_COMPUTER, str(error)):
+                    raise
+            else:
+                return Calibrated(load_model(Path(result.model)), time.monotonic() - start)
+
+    def _hear(self, event: EventMessage) -> None:
+        if event.progress is not None:
+            self._progress(event.progress)
+
+    def move(self, joints: dict[str, float]) -> None:
+        """Execute a joint goal."""
+        self._drive(lambda: self._client.goal(JointTarget(joints))).reached()
+
+    def teach(self, name: str, frames: int) -> None:
+        """Teach the current view."""
+        self._client.teach(name, frames)
+
+    def home(self) -> None:
+        """Move home."""
+        self._drive(self._client.home).reached()
+
+    def joints(self) -> npt.NDArray[np.float64]:
+        """Measured joint positions (n,)."""
+        return np.array(list(self._client.joints().values()))
+
+    def sights(self, frames: int) -> MarkerSights:
+        """What the cameras see, so many frames of each."""
+        found = SightCollection((camera.name for camera in self._client.info().cameras), frames)
+        until_s = time.monotonic() + SIGHT_S
+        for message in self._client.watch(features=True):
+            if time.monotonic() > until_s:
+                raise ClientError(found.missing)
+            if isinstance(message, FeaturesMessage):
+                found.add(message.camera, message.ids, message.pixels)
+            if found.complete:
+                break
+        return found.sights
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that the goal's plan needs."""
+        plan = self._client.check(self._client.make_goal(target, law=law)).plan
+        assert plan is not None  # a goal of the images is planned
+        return plan.seconds
+
+    def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
+        """Execute a goal to its end, under a lease."""
+        result = self._drive(
+            lambda: self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow)
+        ).wait()
+        return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
+
+    def _look(self) -> None:
+        """Every ``LOOK_EVERY_S``: whether the cell is held. Raises ClientError where nobody would resume it."""
+        if time.monotonic() - self._looked_s < LOOK_EVERY_S:
+            return
+        self._looked_s = time.monotonic()
+        state = self._client.status()
+        if not any(reason.code == "HELD" for reason in state.reasons):
+            return
+        told = [
+            event
+            for event in self._client.events(max(1, state.last_event - RECENT_EVENTS)).events
+            if event.kind in ("held", "resumed")
+        ]
+        known = bool(told) and told[-1].kind == "held"
+        self._looks += 1
+        if not known and self._looks < LOOKS:
+            return
+        self._looks = 0
+        cause = told[-1].message if known else "no event says why"
+        if not self._goes_on(SILENCE in cause, cause):
+            raise ClientError(f"the cell was held and nobody resumed it: {cause}")
+
+    def _goes_on(self, was_busy: bool, cause: str) -> bool:
+        """Whether the cell was resumed, since the computer ``was_busy``, and not too often yet."""
+        self._holds += was_busy
+        if not was_busy or self._holds > MOST_HOLDS:
+            return False
+        self._tell(f"{cause}: resumed")
+        self._client.resume()
+        return True
+
+    def _drive(self, send: Callable[[], GoalHandle]) -> GoalHandle:
+        """A goal that has ended, sent anew where a busy computer ended it."""
+        while True:
+            handle = send()
+            result = handle.wait()
+            codes = {reason.code for reason in result.reasons}
+            if result.outcome == "reached" or not self._goes_on(bool(codes & BUSY_COMPUTER), result.message):
+                return handle
+
+    def rest(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+# -- the demonstrator in lockstep ----------------------------------------------------------------------------
+# The demonstration in one process on a virtual clock.
+
+
+class LockstepDemonstrator:
+    """``scenario.Operator`` of a cell in lockstep."""
+
+    def __init__(self, cell: LockstepCell, seed: int, progress: Callable[[float], None]) -> None:
+        self._cell = cell
+        self._operator = LockstepOperator(cell, seed=seed)
+        self._progress = progress
+
+    def enable(self) -> None:
+        """Wait for the first joint samples and frames, then enable."""
+        self._cell.run_for(0.5)
+        self._operator.enable()
+
+    def calibrate(self) -> Calibrated:
+        """Run trial motions and fit; ``seconds`` are virtual."""
+        start_ns = self._cell.clock.now_ns()
+        model = self._operator.calibrate(lambda _, fraction: self._progress(fraction))
+        return Calibrated(model, (self._cell.clock.now_ns() - start_ns) * 1e-9)
+
+    def move(self, joints: dict[str, float]) -> None:
+        """Execute a joint goal."""
+        event = self._operator.goal(JointTarget(joints))
+        if event.kind != "goal_reached":
+            raise RuntimeError(f"the arm did not reach the pose to be shown: {event.message}")
+
+    def teach(self, name: str, frames: int) -> None:
+        """Teach the current view."""
+        self._operator.teach(name, frames)
+
+    def home(self) -> None:
+        """Move home."""
+        self._operator.home()
+
+    def joints(self) -> npt.NDArray[np.float64]:
+        """Measured joint positions (n,), a step later."""
+        return self._cell.step().status.positions
+
+    def sights(self, frames: int) -> MarkerSights:
+        """What the cameras see, so many frames of each; virtual time passes."""
+        found = SightCollection((camera.name for camera in self._cell.settings.cameras), frames)
+        before = self._cell.on_step
+
+        def collect(inputs: StepInputs, outputs: StepOutputs) -> None:
+            for seen in inputs.observations:
+                found.add(seen.camera, seen.ids.tolist(), seen.pixels.tolist())
+            if before is not None:
+                before(inputs, outputs)
+
+        self._cell.on_step = collect
+        try:
+            until_ns = self._cell.clock.now_ns() + round(SIGHT_S * 1e9)
+            while not found.complete:
+                if self._cell.clock.now_ns() > until_ns:
+                    raise RuntimeError(found.missing)
+                self._cell.step()
+        finally:
+            self._cell.on_step = before
+        return found.sights
+
+    def planned_s(self, target: VisualTarget, law: LawName) -> float:
+        """Seconds that the goal's plan needs."""
+        return self._operator.planned(target, law=law).seconds
+
+    def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
+        """Execute a goal to its end."""
+        event = self._operator.goal(target, law=law, follow_markers=follow)
+        return (
+            "reached"
+            if event.kind == "goal_reached"
+            else f"{event.kind.removeprefix('goal_')}: {event.message}"
+        )
+
+    def rest(self, seconds: float) -> None:
+        """Let virtual time pass."""
+        self._cell.run_for(seconds)

@@ -20,7 +20,15 @@ from stereoservo_sim.experiments.driven_tasks import decay, image_errors, images
 from stereoservo_sim.experiments.experiment import Comparison, of_statement
 from stereoservo_sim.experiments.figures import COLOURS, Figures, draw_images, labelled, picture
 from stereoservo_sim.progress import ProgressCall
-from stereoservo_sim.tasks.arms import MID_RANGE, PLATE_ON_FLANGE, RX90_LIMITS, ArmName, free_cell, rx90_cell
+from stereoservo_sim.tasks.arms import (
+    MID_RANGE,
+    PLATE_ON_FLANGE,
+    RX90_LIMITS,
+    ArmName,
+    free_cell,
+    inverse_kinematics,
+    rx90_cell,
+)
 from stereoservo_sim.tasks.calibrations import (
     Knowledge,
     TaskCalibration,
@@ -39,7 +47,6 @@ from stereoservo_sim.tasks.setting import (
     cartesian_twists,
 )
 from stereoservo_sim.tasks.task_file import AlignmentTask
-from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SyntheticCell, rotation, translation
 

@@ -49,8 +49,8 @@ from stereoservo_sim.world.body import SolidBody, part_text
 from stereoservo_sim.world.camera_rig import PinholeCamera
 from stereoservo_sim.world.exact_model import exact_simulated_model
 from stereoservo_sim.world.history import TrueJointHistory
+from stereoservo_sim.world.lighting import Lighting
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
-from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.simulated_cell import SimulatedCell, demo_cell, solid_cell
 
 STEPS = ((1.0, 0.45), (2.5, 1.1), (4.0, 0.6), (6.0, 1.0), (8.0, 0.5), (11.0, 1.0), (14.0, 0.6), (17.0, 1.1))

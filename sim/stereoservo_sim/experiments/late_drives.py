@@ -28,8 +28,7 @@ import numpy as np
 
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.kinematics.model import CellModel
-from stereoservo.kinematics.shutter_stamps import ShutterOffset
+from stereoservo.kinematics.model import CellModel, ShutterOffset
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.experiment import cases, crossed
 from stereoservo_sim.experiments.figures import drawing_sorted

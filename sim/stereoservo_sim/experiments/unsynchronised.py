@@ -18,7 +18,7 @@ from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.cells import demo_cell_path
 from stereoservo_sim.demonstration.judge import Course, Judgement, judge_goal
-from stereoservo_sim.demonstration.lockstep_demonstrator import LockstepDemonstrator
+from stereoservo_sim.demonstration.runner import LockstepDemonstrator
 from stereoservo_sim.demonstration.scenario import ShownGoal, perform
 from stereoservo_sim.demonstration.truth import TruthLog, true_cell
 from stereoservo_sim.experiments.experiment import crossed

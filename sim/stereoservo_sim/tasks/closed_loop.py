@@ -6,7 +6,8 @@ points are computed from them with the controller's model.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal, Protocol
@@ -16,13 +17,33 @@ import numpy as np
 
 from stereoservo.control.law import JacobianChoice, LawStep, Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
+from stereoservo.control.laws.image import image
+from stereoservo.control.laws.points import step_by_points
+from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS, held_gain, limited
+from stereoservo.control.marker_groups import with_groups
+from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
 from stereoservo.core.goals.marker_body import goal_pose
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.servo_core import ServoCore
+from stereoservo.core.settings import CameraSettings, CoreSettings, LimitSettings
 from stereoservo.kinematics.composition import Composition
-from stereoservo.kinematics.kernels import project_points, triangulate
-from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo.kinematics.kernels import project_points, transform_points, triangulate
+from stereoservo.kinematics.model import CellModel, pinhole
+from stereoservo.messages.goals import (
+    DEFAULT_LAW,
+    Command,
+    Enable,
+    FeatureTarget,
+    Goal,
+    LawName,
+    Request,
+    RunGoal,
+)
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.ports.devices import DriverError
+from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanRequest
+from stereoservo.planning.planner import plan
+from stereoservo.planning.tracking import advance, planned_joints, sample_plan
+from stereoservo.ports.devices import CameraObservation, DriverError, JointState
 from stereoservo_sim.tasks.arms import ArmName, FreeArm, SerialArm, TaskArm, mechanics_of, rx90_reach
 from stereoservo_sim.tasks.calibrations import (
     CalibrationName,
@@ -31,27 +52,14 @@ from stereoservo_sim.tasks.calibrations import (
     calibrate,
     known_at_start,
 )
-from stereoservo_sim.tasks.comparison_laws import CLASSICAL, euclidean_points
-from stereoservo_sim.tasks.core_controller import CoreController
-from stereoservo_sim.tasks.ground_truth import (
-    error_px,
-    in_images,
-    line_deviations,
-    noise_floor_px,
-    sight,
-)
+from stereoservo_sim.tasks.ground_truth import error_px, in_images, line_deviations, noise_floor_px, sight
 from stereoservo_sim.tasks.marker_estimate import MarkerEstimate, PointsName
 from stereoservo_sim.tasks.options import DEFAULT_GAIN, DEFAULT_RATE_HZ
-from stereoservo_sim.tasks.planned_path import LOOK_S, NoPathError, PlannedPath, plan_task_path
-from stereoservo_sim.tasks.setting import (
-    FACE,
-    MAX_ITERATIONS,
-    MIN_DEPTH,
-    SUCCESS_PX,
-)
+from stereoservo_sim.tasks.setting import FACE, HEIGHT, MAX_ITERATIONS, MIN_DEPTH, SUCCESS_PX, WIDTH
 from stereoservo_sim.tasks.task_file import AlignmentTask
 from stereoservo_sim.tasks.twist_arm import TwistArm, twist_start
 from stereoservo_sim.world.presets import MechanicsPreset
+from stereoservo_sim.world.synthetic import Kind
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
@@ -500,3 +508,300 @@ def _unreachable(task: AlignmentTask, settings: LoopSettings) -> tuple[TaskResul
     )
     none = np.zeros(0)
     return result, Trace(task.start[None], none, none, np.zeros((0, 6)), np.zeros((0, 0)))
+
+
+# -- laws that are compared ----------------------------------------------------------------------------------
+# Control laws for comparison only: camera by camera (8.37), and on metric points of a calibrated rig (8.17).
+
+
+def stereo_block(scene: Scene, task: Task, options: Options) -> LawStep:
+    """The mean of the laws of the single cameras that see (8.37, halved for two: errata)."""
+    velocity, conditioning, seeing = np.zeros(scene.operators.shape[0]), 1.0, 0
+    for camera in range(scene.matrices.shape[0]):
+        alone = np.zeros_like(task.wanted)
+        alone[camera] = task.wanted[camera]
+        if not (scene.weights * alone > 0.0).any():
+            continue
+        step = image(scene, task._replace(wanted=alone), options)
+        velocity, conditioning, seeing = (
+            velocity + step.velocity,
+            min(conditioning, step.conditioning),
+            seeing + 1,
+        )
+    if seeing == 0:
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, 0.0)
+    return LawStep(velocity / seeing, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, conditioning)
+
+
+def euclidean_points(
+    H_projective_to_euclidean: FloatArray,
+) -> Callable[[Scene, Task, Options], LawStep]:
+    """The law on points in metric coordinates (8.17), for a calibrated rig: what others do, for comparison.
+
+    ``H_projective_to_euclidean`` (4, 4) maps the frame's points to the metric frame of that rig.
+    """
+    H = np.ascontiguousarray(H_projective_to_euclidean, dtype=np.float64)
+
+    def step(scene: Scene, task: Task, options: Options) -> LawStep:
+        X, X_star = scene.points @ H.T, task.target_points @ H.T
+        known = task.target_known > 0.0
+        X = X / X[:, 3:]
+        X_star = np.where(known[:, None], X_star / np.where(known, X_star[:, 3], 1.0)[:, None], 0.0)
+        metres = np.tile(np.eye(3, 4), (X.shape[0], 1, 1))
+        operators = np.ascontiguousarray(H @ scene.operators @ np.linalg.inv(H))
+        jacobian = (
+            JacobianChoice.CURRENT if options.jacobian == JacobianChoice.FIXED_DEPTH else options.jacobian
+        )
+        seen = (_seen(scene, task) > 0.0).astype(np.float64)
+        velocity, conditioning = step_by_points(
+            operators, (X, X_star, seen, metres), (held_gain(options), int(jacobian), options.damping)
+        )
+        return limited(scene, task, options, velocity, conditioning)
+
+    return step
+
+
+def _seen(scene: Scene, task: Task) -> FloatArray:
+    """Weights (m,) of the markers: of the camera that sees each best, 0 where the goal's point is unknown."""
+    found: FloatArray = scene.weights.max(axis=0, initial=0.0) * (task.target_known > 0.0)
+    return found
+
+
+CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {
+    "stereo-block": stereo_block,
+}
+"""By name. `euclidean_points` needs a metric frame besides."""
+
+
+# -- the core as a controller --------------------------------------------------------------------------------
+# Tasks driven by the servo core: goal, planning, law, monitors and safety stage as they run in the daemon.
+#
+# The core runs at `CORE_RATE_HZ`, the frames come at the rate of the tasks' loop; each is in hand a cycle after its
+# shutter. What the cell's operator does (a model, enable) is done before the first frame.
+
+
+CORE_RATE_HZ = 250.0
+TOLERANCE_PX = 0.6 * SUCCESS_PX
+HOLD_FRAMES = 5
+SPEED = {"revolute": 1.0, "prismatic": 0.25}
+ACCELERATION = {"revolute": 4.0, "prismatic": 1.0}
+"""Of every joint at most, by its kind: [rad/s or m/s], [rad/s² or m/s²]."""
+LEAST_SIGMA_PX = 0.01
+LOST = ("goal_aborted", "goal_cancelled", "fault")
+
+
+class CoreController:
+    """A servo core that drives an arm to a task's goal; `closed_loop.Controller` runs a law alone."""
+
+    def __init__(
+        self, model: CellModel, task: AlignmentTask, arm: TaskArm, *,
+        law: LawName, points: PointsName, gain: float, rate_hz: float, noise_px: float, time_limit_s: float,
+    ) -> None:  # fmt: skip
+        self.task_error, self.expected = np.zeros(0), None
+        self._core = ServoCore(_settings(model, arm.limits, law, points, gain, rate_hz))
+        self._period_ns = round(1e9 / CORE_RATE_HZ)
+        self._cycles = max(1, round(CORE_RATE_HZ / rate_hz))
+        self._cameras = tuple(camera.name for camera in model.cameras)
+        self._ids = np.array(model.marker_ids)
+        self._covariances = np.tile(max(noise_px, LEAST_SIGMA_PX) ** 2 * np.eye(2), (len(self._ids), 1, 1))
+        self._now_ns, self._seq, self._active = 1_000_000_000, 0, False
+        self._step(arm, model_update=ModelUpdate(with_groups(model)))
+        self._step(arm, Enable())
+        wanted = sight(task.goal).pixels
+        target = FeatureTarget(
+            {
+                name: {int(i): (float(u), float(v)) for i, (u, v) in zip(self._ids, pixels, strict=True)}
+                for name, pixels in zip(self._cameras, wanted, strict=True)
+            }
+        )
+        self._goal = RunGoal(Goal(str(uuid.UUID(int=task.id + 1)), target, time_limit_s=time_limit_s))
+        self._looks = round(LOOK_S * rate_hz)
+
+    def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
+        """Move the arm until the next frame after this one, (c, m, 2) with ``seen`` (c, m) 1 or 0; why the goal was
+        lost, or ''. Raises NoPathError where it is refused, DriverError where the arm has stopped by itself.
+        """
+        frame = self._observations(pixels, seen)
+        self._looks -= 1
+        for cycle in range(self._cycles):
+            requests = (self._goal,) if self._looks == 0 and cycle == 0 else ()
+            outputs = self._step(arm, *requests, observations=frame if cycle == 0 else ())
+            for event in outputs.events:
+                if event.kind == "reply" and not event.accepted:
+                    raise NoPathError(event.message)
+                if event.kind in LOST:
+                    return "; ".join(reason.code for reason in event.reasons) or event.kind
+        return ""
+
+    def _step(
+        self, arm: TaskArm, *commands: Command, observations: tuple[CameraObservation, ...] = (),
+        model_update: ModelUpdate | None = None,
+    ) -> StepOutputs:  # fmt: skip
+        self._now_ns += self._period_ns
+        self._seq += 1
+        requests = tuple(Request(self._seq, "task", command) for command in commands)
+        joints = JointState(self._seq, self._now_ns, arm.joints.copy(), np.zeros(len(arm.joints)))
+        outputs = self._core.step(
+            StepInputs(
+                self._now_ns, self._period_ns, joints, observations, requests, driver_active=self._active,
+                model_update=model_update,
+            )
+        )  # fmt: skip
+        if outputs.driver_request:
+            self._active = outputs.driver_request == "activate"
+        if outputs.command is not None:
+            arm.move(outputs.command, 1e-9 * self._period_ns)
+        return outputs
+
+    def _observations(self, pixels: FloatArray, seen: FloatArray) -> tuple[CameraObservation, ...]:
+        """Frames whose shutters open now, in hand in the next cycle."""
+        received = self._now_ns + self._period_ns
+        return tuple(
+            CameraObservation(
+                name,
+                self._seq,
+                self._now_ns,
+                received,
+                self._ids[there],
+                pixels[c, there],
+                self._covariances[there],
+            )
+            for c, name in enumerate(self._cameras)
+            if (there := seen[c] > 0.0).any()
+        )
+
+
+def _settings(
+    model: CellModel, limits: FloatArray, law: LawName, points: PointsName, gain: float, rate_hz: float
+) -> CoreSettings:
+    n = len(model.joint_names)
+    return CoreSettings(
+        cell="task",
+        joint_names=model.joint_names,
+        joint_kinds=model.joint_kinds,
+        cameras=tuple(
+            CameraSettings(camera.name, WIDTH, HEIGHT, rate_hz, "eye_to_hand", model.marker_ids)
+            for camera in model.cameras
+        ),
+        limits=LimitSettings(
+            limits[:, 0].copy(), limits[:, 1].copy(), np.array([SPEED[kind] for kind in model.joint_kinds]),
+            np.array([ACCELERATION[kind] for kind in model.joint_kinds]), 0.01,
+            np.zeros((0, n, 2)), (), 0.5, 0.1, 1.0,
+        ),
+        trials=None,
+        home=None,
+        rate_hz=CORE_RATE_HZ,
+        law=law,
+        points=points,
+        gain=gain,
+        tolerance_px=TOLERANCE_PX,
+        hold_frames=HOLD_FRAMES,
+        time_limit_s=1e6,
+        filter_s=0.2,
+        gate_sigma=6.0,
+        reanchor=False,
+    )  # fmt: skip
+
+
+# -- planned paths -------------------------------------------------------------------------------------------
+# The law ``trajectory`` in a campaign: the path is planned before the motion, or refused, and then tracked.
+
+
+LOOK_S = 0.4
+"""The controller looks at the plate for so long before it plans."""
+VIEW_MARGIN_PX = 2.0
+"""Planned distance from the images' borders: for noise and what the body lags."""
+JOINT_MARGIN = 0.02
+"""Planned distance from the joints' limits [rad], likewise."""
+LARGEST_LAG_PX = 20.0
+"""Distance behind its path at which the plan waits for the body."""
+SPEED_M, SPEED_RAD = 0.1, 0.6
+"""[m/s], [rad/s]; accelerations reach them in half a second."""
+ACCELERATION_S = 0.5
+
+
+class NoPathError(Exception):
+    """There is no path. ``reason``: why, and where on the path."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class PlannedPath:
+    """A planned path during its execution."""
+
+    def __init__(self, planned: Plan, start: FloatArray, task: Task) -> None:
+        self.plan = planned
+        self._start = start
+        self._task = task
+        self._time_s = 0.0
+
+    def task_now(self, scene: Scene, task: Task, joints: FloatArray, dt_s: float) -> Task:
+        """Current set-points of the plan, with their velocities as a difference over ``dt_s``.
+
+        The same of its joints, for an arm at ``joints`` (n,).
+        The plan's time advances by ``dt_s``, or less where the body lags.
+        """
+        set_points = self._set_points(scene)
+        apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
+        lag = float(np.where(scene.weights > 0.0, apart, 0.0).max()) / LARGEST_LAG_PX
+        begin_s, self._time_s = self._time_s, advance(self.plan, self._time_s, dt_s, lag)
+        planned = planned_joints(self.plan, begin_s, self._time_s, dt_s, joints)
+        return task._replace(
+            set_points=set_points, rates=(self._set_points(scene) - set_points) / dt_s, joint_rates=planned.rates,
+            joint_error=planned.error, joint_weight=planned.weight,
+        )  # fmt: skip
+
+    def _set_points(self, scene: Scene) -> FloatArray:
+        points = transform_points(sample_plan(self.plan, self._time_s).displacement, self._start)
+        pixels, _ = project_points(scene.matrices, points)
+        length_s = float(self.plan.times[-1])
+        share = min(1.0, self._time_s / length_s) if length_s > 0.0 else 1.0
+        # What the goal's pixels differ by from the body's projections comes in along the way.
+        goal, _ = project_points(scene.matrices, self._task.target_points)
+        return np.asarray(pixels + share * (self._task.set_points - goal))
+
+
+def plan_task_path(
+    scene: Scene, task: Task, joints: FloatArray, limits: FloatArray, kinds: tuple[Kind, ...]
+) -> PlannedPath:
+    """Path from ``scene`` to ``task``; ``limits`` (n, 2) and ``kinds`` of the joints. Raises NoPathError."""
+    n, cameras = len(joints), len(scene.matrices)
+    speeds = np.array([SPEED_M if kind == "prismatic" else SPEED_RAD for kind in kinds])
+    request = PlanRequest(
+        operators=scene.operators,
+        composition=scene.composition,
+        joints=joints,
+        matrices=scene.matrices,
+        camera_centres=scene.camera_centres,
+        points=scene.points,
+        targets=task.target_points,
+        kept=np.ones(len(scene.points)),
+        centre=task.centre,
+        centre_target=task.centre_target,
+        faces=FACE[None],
+        limits=PlanLimits(
+            position_min=limits[:, 0] + JOINT_MARGIN,
+            position_max=limits[:, 1] - JOINT_MARGIN,
+            velocity_max=speeds,
+            acceleration_max=speeds / ACCELERATION_S,
+            keep_outs=np.zeros((0, n, 2)),
+            sizes=np.tile(np.array([WIDTH, HEIGHT], dtype=np.float64), (cameras, 1)),
+            lenses=np.tile(pinhole(), (cameras, 1)),
+            view_margin_px=VIEW_MARGIN_PX,
+        ),
+    )
+    planning = plan(request)
+    if planning.plan is None:
+        raise NoPathError("; ".join(describe_failure(failure) for failure in planning.failure))
+    return PlannedPath(planning.plan, scene.points.copy(), task)
+
+
+def describe_failure(failure: ClosestApproach) -> str:
+    """A failure as text."""
+    marker = f" of marker {failure.marker}" if failure.marker >= 0 else ""
+    return (
+        f"{failure.what} {failure.index}{marker} at {failure.share:.0%} of the way: {failure.value:.4g} "
+        f"{failure.unit}, limit {failure.limit:.4g}"
+    )

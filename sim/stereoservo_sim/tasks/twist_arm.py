@@ -20,9 +20,8 @@ from stereoservo_drivers.fake import FakeJointDriver
 from stereoservo_drivers.kit.cartesian import CartesianJointDriver, cartesian_description
 from stereoservo_drivers.kit.virtual_joints import VirtualLimits, positions_of
 from stereoservo_drivers.twist import LIMIT_MARGIN, SINGULAR, SimulatedController, TwistOptions
-from stereoservo_sim.tasks.arms import MID_RANGE, PLATE_ON_FLANGE, RX90_LIMITS, rx90_cell
+from stereoservo_sim.tasks.arms import MID_RANGE, PLATE_ON_FLANGE, RX90_LIMITS, inverse_kinematics, rx90_cell
 from stereoservo_sim.tasks.setting import MARKERS
-from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
 from stereoservo_sim.world.arms.arm_cell import LEVER, body_jacobian
 from stereoservo_sim.world.arms.virtual_arm import TO_NEXT, virtual_links
 from stereoservo_sim.world.history import TrueJointHistory

@@ -9,22 +9,20 @@ its rim, so that it is also off its centre's image as a real one is; what stands
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stereoservo.geometry.distortion import distort
+from stereoservo.geometry.distortion import distort, undistort
 from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo_sim.world.body import MarkerBody, SolidBody
 from stereoservo_sim.world.camera_rig import PinholeCamera, project
 from stereoservo_sim.world.coverage import blend_ellipse, blend_polygon
-from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
+from stereoservo_sim.world.lighting import Lighting
 from stereoservo_sim.world.robots import shape_segments
-from stereoservo_sim.world.scenery.backdrop import Backdrop, PlainBackdrop, RoomBackdrop
-from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 DOT_LEVEL = 225.0
@@ -176,9 +174,7 @@ class Renderer:
 
 def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> Backdrop:
     if background == "pybullet":
-        from stereoservo_sim.world.scenery.backdrop import (
-            PybulletBackdrop,  # the engine only where it is asked for
-        )
+        pass
 
         return PybulletBackdrop(cell, pinhole)
     return RoomBackdrop(cell, pinhole) if background == "arm" else PlainBackdrop(pinhole)
@@ -318,3 +314,214 @@ def _capsule_outline(centres: FloatArray, sizes: FloatArray) -> FloatArray:
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = (centres[:, None] + sizes[:, None, None] * ring).reshape(-1, 2)
     return cv2.convexHull(points.astype(np.float32))[:, 0].astype(np.float64)
+
+
+# -- lenses --------------------------------------------------------------------------------------------------
+# Lens distortion of simulated images: outlines and whole images from ideal to raw pixels.
+
+
+CIRCLE_POINTS = 40
+"""Corners of the polygon that represents a dot: with its area, the centre of its image is right to 1e-4 px."""
+PIECE_PX = 20.0
+"""Length up to which a piece of an outline's edge stays straight."""
+MOST_PIECES = 64
+"""Of one edge, which may reach far out of the picture."""
+
+
+def unit_circle() -> FloatArray:
+    """Corners (CIRCLE_POINTS, 2) of a regular polygon about the origin with the unit circle's area."""
+    angles = np.linspace(0.0, 2.0 * np.pi, CIRCLE_POINTS, endpoint=False)
+    step = 2.0 * np.pi / CIRCLE_POINTS
+    corners: FloatArray = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return corners * float(np.sqrt(step / np.sin(step)))
+
+
+def bend_outline(camera: PinholeCamera, outline: FloatArray) -> FloatArray:
+    """A polygon (k, 2) in ideal pixels, distorted by the lens of ``camera``, its edges finely divided.
+
+    Corners beyond the lens's fold stay at the rim of what it images: outside of the picture, whose corners it reaches.
+    """
+    ways = np.roll(outline, -1, axis=0) - outline
+    pieces = np.clip(np.ceil(np.linalg.norm(ways, axis=1) / PIECE_PX), 1, MOST_PIECES).astype(int)
+    share = np.concatenate([np.arange(n) / n for n in pieces])[:, None]
+    fine = np.repeat(outline, pieces, axis=0) + share * np.repeat(ways, pieces, axis=0)
+    k, centre, r0 = camera.lens[0], camera.lens[1:3], camera.lens[3]
+    offset = fine - centre
+    if k < 0.0:
+        rim = 0.999 * r0 * np.sqrt(-1.0 / (3.0 * k))
+        reach = np.linalg.norm(offset, axis=1, keepdims=True)
+        offset = offset * np.minimum(1.0, rim / np.maximum(reach, 1e-9))
+    return distort(camera.lens, centre + offset)
+
+
+class BentImage:
+    """Distorts the image of ``pinhole``, a larger one without distortion at the same pose, into a camera's image."""
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        """Raises ValueError where the lens's image ends inside the image."""
+        if not camera.sees_whole_image:
+            raise ValueError(f"camera {camera.name!r}: k1 = {camera.k1:g} leaves the image's corners dark")
+        self.camera = camera
+        self.bends = camera.k1 != 0.0
+        self.origin = np.zeros(2)
+        self.pinhole = camera
+        self._source: ImageArray | None = None
+        self._bent: ImageArray | None = None
+        if not self.bends:
+            return
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+        ideal = undistort(camera.lens, np.stack([u, v], axis=-1))
+        self.origin = np.floor(ideal.min(axis=(0, 1)))
+        size = np.ceil((ideal.max(axis=(0, 1)) - self.origin + 2.0) / 2.0).astype(int) * 2
+        K = camera.K.copy()
+        K[:2, 2] -= self.origin
+        self.pinhole = replace(camera, K=K, width=int(size[0]), height=int(size[1]), k1=0.0)
+        self._map = cv2.convertMaps((ideal - self.origin).astype(np.float32), None, cv2.CV_16SC2)
+
+    def image(self, source: ImageArray) -> ImageArray:
+        """Distort the pinhole's image; the last result is cached."""
+        if not self.bends:
+            return source
+        if self._bent is None or source is not self._source:
+            bent = cv2.remap(source, *self._map, interpolation=cv2.INTER_LINEAR)
+            self._source, self._bent = source, np.asarray(bent, dtype=np.uint8)
+        return self._bent
+
+    def outline(self, corners: FloatArray) -> FloatArray:
+        """Distort a polygon (k, 2) of the pinhole's image."""
+        return bend_outline(self.camera, corners + self.origin) if self.bends else corners
+
+
+# -- the backdrop --------------------------------------------------------------------------------------------
+# Background images behind the markers, redrawn rarely: a room, a uniform grey, or the arm by pybullet.
+
+
+REFRESH_FRAMES = 15
+REFRESH_MOVE = 0.05  # [rad] that some joint must have moved
+PLAIN_LEVEL = 90
+
+
+class Backdrop:
+    """Background images that are too slow for every frame: cached until the arm has moved and time has passed."""
+
+    def __init__(self) -> None:
+        self._age = 0
+        self._q: FloatArray | None = None
+        self._image: ImageArray | None = None
+
+    def draw(self, q: FloatArray) -> ImageArray:
+        """The image (height, width) with the arm at ``q`` (n,) [rad]."""
+        raise NotImplementedError
+
+    def image(self, q: FloatArray) -> ImageArray:
+        """Cached image (height, width) for the arm near ``q`` (n,) [rad]."""
+        self._age += 1
+        moved = self._q is None or float(np.abs(q - self._q).max()) > REFRESH_MOVE
+        if self._image is None or (moved and self._age >= REFRESH_FRAMES):
+            self._image, self._q, self._age = self.draw(q), q.copy(), 0
+        return self._image
+
+
+class RoomBackdrop(Backdrop):
+    """A wall and a floor, dimmer than the dots and unevenly lit, as a pinhole ``camera`` of the rig sees them."""
+
+    def __init__(self, cell: SimulatedCell, camera: PinholeCamera) -> None:
+        super().__init__()
+        self._cell = cell
+        self._camera = camera
+
+    def image(self, q: FloatArray) -> ImageArray:
+        """Image of the room; drawn once for a static camera."""
+        if self._image is not None and self._cell.stand is None:
+            return self._image
+        return super().image(q)
+
+    def draw(self, q: FloatArray) -> ImageArray:
+        """Image of the room from the camera's pose with the arm at ``q`` (n,) [rad]."""
+        camera = self._cell.in_world(self._camera, q)
+        v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+        wall = 100 + 18 * np.cos(u / camera.width * 2.2) - 12 * v / camera.height
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
+        rays = rays @ camera.world_to_camera[:3, :3]
+        with np.errstate(divide="ignore"):
+            reach = np.where(rays[..., 2] < -1e-3, -camera.centre[2] / rays[..., 2], np.inf)
+        ground = camera.centre[:2] + np.where(np.isfinite(reach), reach, 0)[..., None] * rays[..., :2]
+        tiles = 82 + 9 * ((np.floor(ground[..., 0] / 0.4) + np.floor(ground[..., 1] / 0.4)) % 2)
+        room = np.where(reach < 6.0, tiles, wall)
+        return np.asarray(cv2.GaussianBlur(room.astype(np.float32), (0, 0), 1.0)).astype(np.uint8)
+
+
+class PlainBackdrop(Backdrop):
+    """Uniform grey background."""
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        super().__init__()
+        self._image = np.full((camera.height, camera.width), PLAIN_LEVEL, dtype=np.uint8)
+
+    def image(self, q: FloatArray) -> ImageArray:
+        """The uniform image, for any ``q``."""
+        assert self._image is not None
+        return self._image
+
+
+SHRINK = 2  # rendered at half size and enlarged: a quarter of the cost, and the lens would blur it anyway
+NEAR, FAR = 0.05, 8.0  # clipping planes [m]
+BRIGHTNESS = 0.6  # of what pybullet's lamp gives
+
+
+class PybulletBackdrop(Backdrop):
+    """Background with the arm by pybullet's renderer, for a pinhole ``camera`` of the cell's rig."""
+
+    def __init__(self, cell: SimulatedCell, camera: PinholeCamera) -> None:
+        from stereoservo_sim.world.physics import PhysicsError, import_pybullet, load_robot
+
+        super().__init__()
+        self._bullet = import_pybullet()
+        self._client = self._bullet.connect(self._bullet.DIRECT)
+        if self._client < 0:
+            raise PhysicsError("pybullet refuses another simulation in this process")
+        self._cell = cell
+        self._loaded = load_robot(self._bullet, self._client, cell.robot)
+        floor = self._bullet.createVisualShape(
+            self._bullet.GEOM_BOX,
+            halfExtents=[3, 3, 0.01],
+            rgbaColor=[0.35, 0.35, 0.38, 1],
+            physicsClientId=self._client,
+        )
+        self._bullet.createMultiBody(
+            baseVisualShapeIndex=floor, basePosition=[0, 0, -0.01], physicsClientId=self._client
+        )
+        self._camera = camera
+        self._projection = projection_matrix(camera).T.ravel().tolist()
+
+    def draw(self, q: FloatArray) -> ImageArray:
+        """Image of the arm at ``q`` (n,) [rad]."""
+        for joint, position in zip(self._loaded.joints, q.tolist(), strict=True):
+            self._bullet.resetJointState(self._loaded.body, joint, position, physicsClientId=self._client)
+        camera = self._cell.in_world(self._camera, q)
+        view = (np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.world_to_camera).T.ravel().tolist()
+        _, _, rgba, _, _ = self._bullet.getCameraImage(
+            camera.width // SHRINK, camera.height // SHRINK, viewMatrix=view, projectionMatrix=self._projection,
+            shadow=0, renderer=self._bullet.ER_TINY_RENDERER, physicsClientId=self._client,
+        )  # fmt: skip
+        grey = (
+            np.reshape(rgba, (camera.height // SHRINK, camera.width // SHRINK, 4))[..., :3].mean(axis=-1)
+            * BRIGHTNESS
+        )
+        enlarged = cv2.resize(
+            grey.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR
+        )
+        return np.asarray(np.clip(enlarged, 0, 255), dtype=np.uint8)
+
+
+def projection_matrix(camera: PinholeCamera) -> FloatArray:
+    """OpenGL projection (4, 4) of a pinhole whose pixels are centred on integers."""
+    (fx, _, cx), (_, fy, cy) = camera.K[0], camera.K[1]
+    return np.array(
+        [
+            [2 * fx / camera.width, 0, 1 - 2 * (cx + 0.5) / camera.width, 0],
+            [0, 2 * fy / camera.height, 2 * (cy + 0.5) / camera.height - 1, 0],
+            [0, 0, -(FAR + NEAR) / (FAR - NEAR), -2 * FAR * NEAR / (FAR - NEAR)],
+            [0, 0, -1, 0],
+        ]
+    )

@@ -9,9 +9,8 @@ import pytest
 import serial
 
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.can import socketcan
-from stereoservo_drivers.can.bus_errors import BusError, bus_error
-from stereoservo_drivers.can.channel import BATCH, Channel, ChannelSettings
+from stereoservo_drivers.can import channel as can_channel
+from stereoservo_drivers.can.channel import BATCH, BusError, Channel, ChannelSettings, bus_error
 from stereoservo_drivers.can.frames import CanFrame
 
 FRAMES = [
@@ -115,7 +114,7 @@ def test_no_permission(monkeypatch):
     def forbidden(*args, **kwargs):
         raise serial.SerialException(errno.EACCES, "could not open port /dev/ttyACM0: Permission denied")
 
-    monkeypatch.setattr("stereoservo_drivers.can.slcan_ports.serial.Serial", forbidden)
+    monkeypatch.setattr("stereoservo_drivers.can.slcan.serial.Serial", forbidden)
     error = refused(ChannelSettings("stereoservo_slcan", "/dev/ttyACM0"))
     assert "dialout" in str(error)
 
@@ -270,10 +269,10 @@ LINK = {
 
 
 def test_socketcan_state_is_read_from_ip():
-    state = socketcan.state_of(LINK)
-    assert state == socketcan.SocketcanState("can", True, "ERROR-ACTIVE", 500_000, 100, 1000)
-    assert socketcan.objection(state, "can0", 500_000) is None
-    assert socketcan.state_of({"flags": [], "linkinfo": {"info_kind": "vcan"}}).restart_ms is None
+    state = can_channel.state_of(LINK)
+    assert state == can_channel.SocketcanState("can", True, "ERROR-ACTIVE", 500_000, 100, 1000)
+    assert can_channel.objection(state, "can0", 500_000) is None
+    assert can_channel.state_of({"flags": [], "linkinfo": {"info_kind": "vcan"}}).restart_ms is None
 
 
 @pytest.mark.parametrize(
@@ -287,15 +286,15 @@ def test_socketcan_state_is_read_from_ip():
 )
 def test_socketcan_objections(change, parts):
     facts = {"kind": "can", "up": True, "state": "ERROR-ACTIVE", "bitrate": 500_000, **change}
-    text = socketcan.objection(socketcan.SocketcanState(**facts), "can0", 500_000)
+    text = can_channel.objection(can_channel.SocketcanState(**facts), "can0", 500_000)
     assert text is not None
     for part in parts:
         assert part in text
 
 
 def test_a_silent_restart_is_noted(monkeypatch):
-    monkeypatch.setattr(socketcan, "read_state", lambda channel: socketcan.state_of(LINK))
-    monkeypatch.setattr(socketcan, "enlarge_receive_buffer", lambda bus: 0)
+    monkeypatch.setattr(can_channel, "read_state", lambda channel: can_channel.state_of(LINK))
+    monkeypatch.setattr(can_channel, "enlarge_receive_buffer", lambda bus: 0)
     monkeypatch.setattr(can, "Bus", lambda **options: FailingBus([]))
     channel = Channel(ChannelSettings("socketcan", "can0", 500_000))
     ((_, error),) = channel.take_errors()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from stereoservo_drivers.can.socketcan import RECEIVE_BUFFER
+from stereoservo_drivers.can.channel import RECEIVE_BUFFER
 
 FILES = Path(__file__).parents[3] / "deploy" / "can"
 UNIT = FILES / "stereoservo-can@.service"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from stereoservo_drivers.can import socketcan
+from stereoservo_drivers.can import channel
 from stereoservo_drivers.can.channel import Channel, ChannelSettings
 from stereoservo_drivers.can.frames import CanFrame
 
@@ -68,7 +68,7 @@ def test_frames_through_the_kernel(pair):
 
 def test_a_burst_fits_the_enlarged_buffer(pair):
     here, there = pair
-    granted = socketcan.enlarge_receive_buffer(there._bus)
+    granted = channel.enlarge_receive_buffer(there._bus)
     # The kernel accounts some 800 bytes a frame; the default of 208 KiB holds fewer than 400.
     burst = min(600, granted // 1024)
     sent = [CanFrame(k, bytes([k % 256])) for k in range(burst)]
@@ -81,8 +81,8 @@ def test_a_burst_fits_the_enlarged_buffer(pair):
 
 
 def test_the_state_is_told(pair):
-    state = socketcan.read_state(NAME)
+    state = channel.read_state(NAME)
     if state is None:
         pytest.skip("no `ip` to ask")
     assert state.kind == "vcan"
-    assert socketcan.objection(state, NAME, 1_000_000) is None
+    assert channel.objection(state, NAME, 1_000_000) is None

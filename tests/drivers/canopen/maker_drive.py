@@ -15,7 +15,7 @@ import numpy as np
 
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Subscriptions
+from stereoservo_drivers.canopen.codec import Subscriptions
 from stereoservo_drivers.canopen.master import Master
 
 STEP_NS = 500_000

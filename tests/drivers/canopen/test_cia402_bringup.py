@@ -20,7 +20,7 @@ from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
 from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
-from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
+from stereoservo_sim.emulators.bus.fault_trials import VirtualHost
 from stereoservo_sim.emulators.nodes.cia402_node import Cia402Node
 from stereoservo_sim.emulators.nodes.dictionary import Abort, SdoError
 

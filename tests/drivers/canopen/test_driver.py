@@ -18,8 +18,7 @@ from stereoservo.ports.devices import Clock, DriverContext, DriverError, Examina
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_drivers.options import decode_options
-from stereoservo_sim.emulators.bus.bus_server import BusServer
-from stereoservo_sim.emulators.bus.endpoints import SlcanTcp
+from stereoservo_sim.emulators.bus.bus_server import BusServer, SlcanTcp
 from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 
 OPTIONS: dict[str, Any] = {

@@ -24,7 +24,7 @@ from stereoservo_drivers.canopen.option_checks import check_options
 from stereoservo_drivers.canopen.options import CanGripper, CanOptions, can_options
 from stereoservo_drivers.lifecycle import LifecycleState
 from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
-from stereoservo_sim.emulators.bus.virtual_host import VirtualHost
+from stereoservo_sim.emulators.bus.fault_trials import VirtualHost
 
 from .maker_drive import MakerBus, MakerDrive
 from .test_makers_dictionaries import MAKERS, eds, joint

@@ -13,12 +13,11 @@ import pytest
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.auxiliary.outputs import DigitalOutputs
-from stereoservo_drivers.canopen.bringup import Subscriptions
 from stereoservo_drivers.canopen.cia402 import Cia402Codec
-from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
+from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup, DigitalOutputs
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
+from stereoservo_drivers.canopen.codec import Subscriptions
 from stereoservo_drivers.canopen.master import Master, MasterSettings, Mode
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CanOutput
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from stereoservo.ports.devices import ExaminationFinding
-from stereoservo_drivers.canopen.options import CanJoint
-from stereoservo_drivers.canopen.unit_checks import (
+from stereoservo_drivers.canopen.examination import (
     JOG,
     JogTrace,
     jog_finding,
@@ -19,6 +18,7 @@ from stereoservo_drivers.canopen.unit_checks import (
     position_finding,
     resolution_finding,
 )
+from stereoservo_drivers.canopen.options import CanJoint
 
 JOINT = CanJoint(
     name="elbow", node_id=3, counts_per_rev=65536, gear_ratio=120.0, max_velocity=1.0, max_acceleration=4.0,

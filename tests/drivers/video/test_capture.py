@@ -17,9 +17,9 @@ import pytest
 
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.video import sources, v4l2
+from stereoservo_drivers.video import sources
+from stereoservo_drivers.video.driver import Reader
 from stereoservo_drivers.video.options import Place, VideoOptions
-from stereoservo_drivers.video.reader import Reader
 from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
 from stereoservo_drivers.video.stream_monitor import Watch
 
@@ -135,35 +135,35 @@ class Kernel:
         self.order = []
 
     def __call__(self, request, structure):
-        if request == v4l2.QUERY_CONTROL:
+        if request == sources.QUERY_CONTROL:
             if structure.id not in self.ranges:
                 raise OSError(errno.EINVAL, "no such control")
             structure.minimum, structure.maximum, structure.step = self.ranges[structure.id]
-        elif request == v4l2.SET_CONTROL:
+        elif request == sources.SET_CONTROL:
             if structure.id == 0x9A0901 and structure.value in (0, 2):
                 raise OSError(errno.EINVAL, "no such entry of the menu")
             least, _, step = self.ranges[structure.id]
             self.values[structure.id] = least + (structure.value - least) // step * step
             self.order.append(structure.id)
-        elif request == v4l2.GET_CONTROL:
+        elif request == sources.GET_CONTROL:
             structure.value = self.values[structure.id]
         else:
             self.enumerate(request, structure)
 
     def enumerate(self, request, structure):
         modes = {"YUYV": {(640, 480): (30, 15)}, "MJPG": {(640, 480): (60,), (1280, 720): (30,)}}
-        if request == v4l2.ENUM_FORMAT:
+        if request == sources.ENUM_FORMAT:
             names = list(modes)
             if structure.index >= len(names):
                 raise OSError(errno.EINVAL, "the end")
             structure.pixelformat = int.from_bytes(names[structure.index].encode(), "little")
             return
         sizes = modes[int(structure.pixel_format).to_bytes(4, "little").decode()]
-        entries = list(sizes) if request == v4l2.ENUM_SIZES else sizes[structure.width, structure.height]
+        entries = list(sizes) if request == sources.ENUM_SIZES else sizes[structure.width, structure.height]
         if structure.index >= len(entries):
             raise OSError(errno.EINVAL, "the end")
         structure.type = 1
-        if request == v4l2.ENUM_SIZES:
+        if request == sources.ENUM_SIZES:
             structure.sizes[0], structure.sizes[1] = entries[structure.index]
         else:
             structure.intervals[0], structure.intervals[1] = 1, entries[structure.index]
@@ -175,7 +175,7 @@ def device(monkeypatch):
     made.kernel = Kernel()
     monkeypatch.setattr(sources.cv2, "VideoCapture", lambda *_: made)
     monkeypatch.setattr(CaptureSource, "_check_device", lambda self: None)
-    monkeypatch.setattr(sources.v4l2, "opened", lambda _path: nullcontext(made.kernel))
+    monkeypatch.setattr(sources, "opened", lambda _path: nullcontext(made.kernel))
     return made
 
 
@@ -189,7 +189,7 @@ def test_what_a_device_is_asked_for_and_what_it_took(camera, device):
     assert settings["width"] == (WIDTH, WIDTH)
     assert settings["rate_hz"] == (60.0, 60.0)
     assert device.order[0] == cv2.CAP_PROP_FOURCC  # the format decides on the sizes that can be had
-    controls = {name: settings[name] for name in settings if name in v4l2.CONTROLS}
+    controls = {name: settings[name] for name in settings if name in sources.CONTROLS}
     assert controls == {
         "auto_exposure": (1.0, 1.0), "exposure": (124.0, 123.0), "gain": (7.0, None), "autofocus": (0.0, 0.0),
         "focus": (30.0, 30.0), "auto_white_balance": (0.0, 0.0), "white_balance": (4000.0, 4000.0),
@@ -201,7 +201,7 @@ def test_what_a_device_is_asked_for_and_what_it_took(camera, device):
         ("autofocus", "focus"),
         ("auto_white_balance", "white_balance"),
     ):
-        assert order.index(v4l2.CONTROLS[lock]) < order.index(v4l2.CONTROLS[value])
+        assert order.index(sources.CONTROLS[lock]) < order.index(sources.CONTROLS[value])
     driver.close()
     assert driver.statistics().settings == settings
 
@@ -250,8 +250,9 @@ def test_a_size_that_a_device_has_not_is_told_with_its_modes(camera, device, mon
 )
 def test_structures_requests_and_controls_are_those_of_the_kernels_header(tmp_path):
     structures = {
-        "v4l2_queryctrl": v4l2.QueryControl, "v4l2_control": v4l2.Control, "v4l2_fmtdesc": v4l2.FormatDescription,
-        "v4l2_frmsizeenum": v4l2.FrameSize, "v4l2_frmivalenum": v4l2.FrameInterval,
+        "v4l2_queryctrl": sources.QueryControl, "v4l2_control": sources.Control,
+        "v4l2_fmtdesc": sources.FormatDescription, "v4l2_frmsizeenum": sources.FrameSize,
+        "v4l2_frmivalenum": sources.FrameInterval,
     }  # fmt: skip
     renamed = {("v4l2_frmsizeenum", "sizes"): "discrete", ("v4l2_frmivalenum", "intervals"): "discrete"}
     expected = {}
@@ -261,16 +262,17 @@ def test_structures_requests_and_controls_are_those_of_the_kernels_header(tmp_pa
             theirs = renamed.get((name, field), field)
             expected[f"offsetof(struct {name}, {theirs})"] = getattr(structure, field).offset
     expected |= {
-        "VIDIOC_QUERYCTRL": v4l2.QUERY_CONTROL, "VIDIOC_G_CTRL": v4l2.GET_CONTROL, "VIDIOC_S_CTRL": v4l2.SET_CONTROL,
-        "VIDIOC_ENUM_FMT": v4l2.ENUM_FORMAT, "VIDIOC_ENUM_FRAMESIZES": v4l2.ENUM_SIZES,
-        "VIDIOC_ENUM_FRAMEINTERVALS": v4l2.ENUM_INTERVALS, "V4L2_CTRL_FLAG_DISABLED": v4l2.DISABLED,
-        "V4L2_BUF_TYPE_VIDEO_CAPTURE": v4l2.CAPTURE, "V4L2_FRMSIZE_TYPE_DISCRETE": v4l2.DISCRETE,
-        "V4L2_FRMIVAL_TYPE_DISCRETE": v4l2.DISCRETE, "V4L2_EXPOSURE_AUTO": v4l2.EXPOSURE_AUTO,
-        "V4L2_EXPOSURE_MANUAL": v4l2.EXPOSURE_MANUAL,
-        "V4L2_EXPOSURE_APERTURE_PRIORITY": v4l2.EXPOSURE_APERTURE_PRIORITY,
-        "V4L2_CID_POWER_LINE_FREQUENCY_DISABLED": v4l2.POWER_LINE[0],
-        "V4L2_CID_POWER_LINE_FREQUENCY_50HZ": v4l2.POWER_LINE[50],
-        "V4L2_CID_POWER_LINE_FREQUENCY_60HZ": v4l2.POWER_LINE[60],
+        "VIDIOC_QUERYCTRL": sources.QUERY_CONTROL, "VIDIOC_G_CTRL": sources.GET_CONTROL,
+        "VIDIOC_S_CTRL": sources.SET_CONTROL, "VIDIOC_ENUM_FMT": sources.ENUM_FORMAT,
+        "VIDIOC_ENUM_FRAMESIZES": sources.ENUM_SIZES,
+        "VIDIOC_ENUM_FRAMEINTERVALS": sources.ENUM_INTERVALS, "V4L2_CTRL_FLAG_DISABLED": sources.DISABLED,
+        "V4L2_BUF_TYPE_VIDEO_CAPTURE": sources.CAPTURE, "V4L2_FRMSIZE_TYPE_DISCRETE": sources.DISCRETE,
+        "V4L2_FRMIVAL_TYPE_DISCRETE": sources.DISCRETE, "V4L2_EXPOSURE_AUTO": sources.EXPOSURE_AUTO,
+        "V4L2_EXPOSURE_MANUAL": sources.EXPOSURE_MANUAL,
+        "V4L2_EXPOSURE_APERTURE_PRIORITY": sources.EXPOSURE_APERTURE_PRIORITY,
+        "V4L2_CID_POWER_LINE_FREQUENCY_DISABLED": sources.POWER_LINE[0],
+        "V4L2_CID_POWER_LINE_FREQUENCY_50HZ": sources.POWER_LINE[50],
+        "V4L2_CID_POWER_LINE_FREQUENCY_60HZ": sources.POWER_LINE[60],
     }  # fmt: skip
     theirs = {
         "auto_exposure": "EXPOSURE_AUTO", "exposure": "EXPOSURE_ABSOLUTE",
@@ -278,7 +280,7 @@ def test_structures_requests_and_controls_are_those_of_the_kernels_header(tmp_pa
         "focus": "FOCUS_ABSOLUTE", "auto_white_balance": "AUTO_WHITE_BALANCE",
         "white_balance": "WHITE_BALANCE_TEMPERATURE", "gain": "GAIN", "power_line": "POWER_LINE_FREQUENCY",
     }  # fmt: skip
-    expected |= {f"V4L2_CID_{theirs[name]}": number for name, number in v4l2.CONTROLS.items()}
+    expected |= {f"V4L2_CID_{theirs[name]}": number for name, number in sources.CONTROLS.items()}
     lines = [f'printf("%lu\\n", (unsigned long)({what}));' for what in expected]
     source = tmp_path / "header.c"
     source.write_text(
@@ -355,7 +357,7 @@ class Hanging:
 
 @pytest.mark.parametrize("hang_in_open", [False, True])
 def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered(hang_in_open, monkeypatch):
-    monkeypatch.setattr("stereoservo_drivers.video.reader.JOIN_S", 0.05)
+    monkeypatch.setattr("stereoservo_drivers.video.driver.JOIN_S", 0.05)
     source, watch = Hanging(hang_in_open), Watch(30.0)
     place = Place("device", "/dev/video0", device=0)
     reader = Reader(source, place, options(open_timeout_s=0.05), "left", watch)

@@ -15,8 +15,8 @@ import pytest
 from stereoservo.ports.devices import CameraDriver, DriverContext, DriverError
 from stereoservo_drivers.contracts import CameraDriverContract
 from stereoservo_drivers.video.driver import VideoCameraDriver
-from stereoservo_drivers.video.genicam import LIBRARY, FrameNumbers
 from stereoservo_drivers.video.options import decode_video_options
+from stereoservo_drivers.video.sources import LIBRARY, FrameNumbers
 
 from .conftest import connected, poll_until
 

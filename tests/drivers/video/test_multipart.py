@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo_drivers.video.chunked import ChunkedDecoder
-from stereoservo_drivers.video.multipart import MultipartError, MultipartParser
+from stereoservo_drivers.video.mjpeg import ChunkedDecoder, MultipartError, MultipartParser
 
 BODIES = st.lists(st.binary(max_size=40).filter(lambda b: b"\n--edge" not in b), min_size=1, max_size=5)
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.inverse.goals import fixed_planes
 from stereoservo.kinematics.inverse.recognition import chain_of, recognise
 from stereoservo.kinematics.inverse.self_motion import null_directions
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
-from stereoservo.kinematics.inverse.solver import inverse_kinematics
+from stereoservo.kinematics.inverse.solver import fixed_planes, inverse_kinematics
 from stereoservo_sim.experiments import inverse_kinematics as families
 from stereoservo_sim.experiments.inverse_kinematics import (
     PUMA_ROWS,

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from stereoservo.geometry.cameras import triangulate
+from stereoservo.kinematics.inverse.postures import refined_on_images
 from stereoservo.kinematics.inverse.recognition import recognise
-from stereoservo.kinematics.inverse.refinement import refined_on_images
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
 from stereoservo.kinematics.joint_reprojection import JointAnglesError, predicted_pixels, seen_chain
 from stereoservo_sim.world import synthetic

@@ -10,8 +10,8 @@ import pytest
 from stereoservo.client import ClientError, FailedError
 from stereoservo.daemon.servo import SILENCE
 from stereoservo.messages.goals import TaughtTarget
-from stereoservo_sim.demonstration import live_demonstrator
-from stereoservo_sim.demonstration.live_demonstrator import BUSY_COMPUTER, LOOKS, MOST_HOLDS, LiveDemonstrator
+from stereoservo_sim.demonstration import runner
+from stereoservo_sim.demonstration.runner import BUSY_COMPUTER, LOOKS, MOST_HOLDS, LiveDemonstrator
 
 
 class HeldCell:
@@ -50,7 +50,7 @@ class HeldCell:
 
 @pytest.fixture(autouse=True)
 def _looks_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_demonstrator, "LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(runner, "LOOK_EVERY_S", 0.0)
 
 
 class LateTold(HeldCell):
@@ -128,7 +128,7 @@ class StoppedCell:
 
 
 def test_what_a_busy_computer_ended_is_begun_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_demonstrator, "load_model", lambda path: path.name)
+    monkeypatch.setattr(runner, "load_model", lambda path: path.name)
     for code in BUSY_COMPUTER:
         told: list[str] = []
         cell: Any = StoppedCell(code, 2)

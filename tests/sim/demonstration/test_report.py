@@ -11,18 +11,16 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from stereoservo_sim.demonstration.report import (
+from stereoservo_sim.demonstration.results import (
     CalibrationPlots,
     GoalPlots,
     ReportData,
-    render_report,
-    write_report,
-)
-from stereoservo_sim.demonstration.report_figures import (
     draw_errors,
     draw_paths,
     draw_residuals,
     draw_velocities,
+    render_report,
+    write_report,
 )
 
 JOINTS = tuple(f"j{i + 1}" for i in range(6))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.shutter_offset import shutter_offsets
-from stereoservo.kinematics.shutter_stamps import ShutterOffset
+from stereoservo.kinematics.model import ShutterOffset
 from stereoservo_sim.experiments.late_drives import run_late_pictures
 from stereoservo_sim.tasks.driven_cell import DrivenCell, Imperfections
 from stereoservo_sim.world.exact_model import exact_model

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.trial_data import TrialData, load_trials
+from stereoservo.cli.calibrate.stored_trials import RecordedTrialCollector
 from stereoservo.cli.main import invoke
 from stereoservo.core.cycle import StepInputs, StepOutputs
-from stereoservo.daemon.jobs.recorded_image_trials import RecordedTrialCollector
 from stereoservo.daemon.jobs.recorded_set_points import SetPointError, set_points_from_images
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.daemon.lockstep import LockstepCell

@@ -13,13 +13,13 @@ from stereoservo_sim.tasks.arms import (
     RX90_LIMITS,
     FreeArm,
     free_cell,
+    inverse_kinematics,
     rx90_cell,
     rx90_reach,
 )
 from stereoservo_sim.tasks.calibrations import calibrate, known_at_start, with_trial_ranges
 from stereoservo_sim.tasks.ground_truth import sight
 from stereoservo_sim.tasks.setting import HOMOGENEOUS_MARKERS, camera_matrices, cartesian_twists
-from stereoservo_sim.tasks.wrist_solutions import inverse_kinematics
 
 
 def test_free_arm_moves_by_the_exponential_of_its_twist(drawn):

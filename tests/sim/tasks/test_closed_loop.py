@@ -14,11 +14,9 @@ from stereoservo_sim.commands.simulate import _show
 from stereoservo_sim.tasks.arms import SerialArm
 from stereoservo_sim.tasks.calibrations import calibrate
 from stereoservo_sim.tasks.campaign import default_jobs, run_campaign, summary
-from stereoservo_sim.tasks.closed_loop import LoopSettings, TaskResult, run_task
-from stereoservo_sim.tasks.core_controller import CoreController
+from stereoservo_sim.tasks.closed_loop import CoreController, LoopSettings, NoPathError, TaskResult, run_task
 from stereoservo_sim.tasks.ground_truth import line_deviations, sight
 from stereoservo_sim.tasks.hard_tasks import shipped_tasks_path
-from stereoservo_sim.tasks.planned_path import NoPathError
 from stereoservo_sim.tasks.setting import SUCCESS_PX
 from stereoservo_sim.tasks.task_file import AlignmentTask, read_tasks, tasks_text
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stereoservo_sim.world.camera_rig import project
+from stereoservo_sim.world.rendering import REFRESH_FRAMES, PybulletBackdrop
 from stereoservo_sim.world.robots import shape_segments
-from stereoservo_sim.world.scenery.backdrop import REFRESH_FRAMES, PybulletBackdrop
 from stereoservo_sim.world.simulated_cell import demo_cell
 
 CELL = demo_cell()

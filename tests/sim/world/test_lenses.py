@@ -13,8 +13,7 @@ from stereoservo.geometry.distortion import distort, undistort
 from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_sim.world.camera_rig import PinholeCamera, project
 from stereoservo_sim.world.coverage import blend_polygon
-from stereoservo_sim.world.lens_distortion import BentImage, bend_outline, unit_circle
-from stereoservo_sim.world.rendering import Renderer, RenderSettings
+from stereoservo_sim.world.rendering import BentImage, Renderer, RenderSettings, bend_outline, unit_circle
 from stereoservo_sim.world.simulated_cell import DEMO_GOALS, demo_cell, hand_cell
 
 from ...drivers.detectors.scenes import as_frame, make_detector

@@ -6,8 +6,8 @@ import pytest
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.pybullet import PybulletCameraDriver
+from stereoservo_sim.world.lighting import Lighting
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
-from stereoservo_sim.world.scenery.lighting import Lighting
 from stereoservo_sim.world.simulated_cell import demo_cell
 
 EVEN = np.full((480, 640), 100.0, np.float32)

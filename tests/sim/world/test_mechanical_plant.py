@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.ports.devices import JointSpec
-from stereoservo_sim.world.mechanical_plant import MechanicalPlant
-from stereoservo_sim.world.mechanics import Mechanics, preset
+from stereoservo_sim.world.mechanics import MechanicalPlant, Mechanics, preset
 from stereoservo_sim.world.robots import RX90
 from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.velocity_drives import DriveBank, IdealPlant

@@ -195,7 +195,7 @@ def calibrate(
     if images is not None:
         if lines is not None:
             raise CommandError("argument", "--lines go with --trials; --images keeps its trial data for that")
-        from stereoservo.cli.calibrate.recorded_images import fit_images, source_of_images  # OpenCV and more
+        from stereoservo.cli.calibrate.stored_trials import fit_images, source_of_images  # OpenCV and more
 
         from_images = fit_images(cell, images, output)
         emit(from_images, f"{_table(from_images)}\n{source_of_images(from_images)}", json)

@@ -6,21 +6,40 @@ from __future__ import annotations
 
 import csv
 import time
+from bisect import bisect_right
 from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.cli.output import CommandError, note
+from stereoservo.core.cycle import Event
+from stereoservo.core.monitor_state import ObservationStatistics
+from stereoservo.core.settings import CoreSettings, TrialSettings, core_settings
+from stereoservo.core.sources.measure_at_pose import (
+    add_observation,
+    averages,
+    measurement_buffers,
+    too_few_seen,
+)
+from stereoservo.daemon.camera_setup import RecordedCamera, recorded_camera, video_of
 from stereoservo.daemon.jobs.fit_job import report_folder
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.gateway.child_jobs import calibration_result
 from stereoservo.gateway.persistence import ModelStore
-from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.cell_file import CellFile, JointLimit, load_cell_file
 from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.locks import holder
+from stereoservo.messages.recording_request import IMAGES_SUFFIX
 from stereoservo.messages.wire import CalibrationResult
+from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import CameraObservation, JointDriverDescription, JointSpec
+from stereoservo.recording.recorded_motion import RecordedMotion, RestInterval, read_motion, rest_intervals
 
 
 class LinesUsed(msgspec.Struct, frozen=True):
@@ -215,3 +234,319 @@ def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], Lin
             ) from error
     names_of = {camera: tuple(of_camera) for camera, of_camera in found.items()}
     return lenses, LinesUsed(str(path), sigma, names_of)
+
+
+# -- recorded images -----------------------------------------------------------------------------------------
+# Calibration from recorded images for ``stereoservo calibrate CELL.toml --images DIR``: extracts the trial data,
+# stores and fits them, and formats the result.
+
+
+TRIALS_FILE = "trials.npz"
+TELL_EVERY = 500
+
+
+class ImagesUsed(msgspec.Struct, frozen=True):
+    """Images used by a calibration. ``left_out``: rests that were not used, by the reason."""
+
+    directory: str
+    stops: int
+    frames: int
+    left_out: dict[str, int]
+    standing: tuple[int, ...]
+
+
+class ImageFit(StoredFit, frozen=True):
+    """A fit of recorded images."""
+
+    from_images: ImagesUsed | None = None
+
+
+def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
+    """Find the trials in recorded images, keep them beside the images, and fit them.
+
+    Raises CommandError, CalibrationError, RecordingError, ImageFileError, DriverError, PluginError, CellFileError.
+    """
+    from stereoservo.calibration.trial_data import save_trials
+
+    pass
+
+    if not cell.endswith(".toml"):
+        raise CommandError(
+            "usage",
+            f"--images needs the cell file, for its cameras' detectors; {cell!r} is a name. Give CELL.toml",
+        )
+    resolve_cell(cell, output)
+
+    def progress(camera: str, frames: int) -> None:
+        if frames % TELL_EVERY == 0:
+            note(f"camera {camera}: {frames} frames")
+
+    found = trials_from_images(Path(cell), images, note, progress)
+    for why, number in found.left_out.items():
+        note(f"{number} rests are not used: {why}")
+    if found.standing:
+        markers = ", ".join(str(marker) for marker in found.standing)
+        note(f"markers {markers} stood still: they are not of the body, and left out")
+    path = images / TRIALS_FILE
+    save_trials(found.trials, path)
+    note(f"{found.stops} stops, {found.frames} frames; the trial data are kept in {path}")
+    used = ImagesUsed(str(images), found.stops, found.frames, found.left_out, found.standing)
+    fit = fit_stored_trials(cell, path, None, 0.3, output)
+    return ImageFit(**{**msgspec.structs.asdict(fit), "from_images": used})
+
+
+def source_of_images(result: ImageFit) -> str:
+    """What the fit was made of, as lines of text."""
+    used = result.from_images
+    what = "" if used is None else f"\n  images {used.directory}: {used.stops} stops, {used.frames} frames"
+    return source_of_stored(result) + what
+
+
+# -- trial data of the pictures ------------------------------------------------------------------------------
+# Trial data from a recording with images: runs the cell's detectors on the frames taken at rest and averages the
+# marker pixels of each stop, for a calibration without the arm.
+
+
+Note = Callable[[str], None]
+Progress = Callable[[str, int], None]
+
+
+@dataclass(frozen=True)
+class RecordedTrials:
+    """Trial data from recorded images; ``left_out``: why rests were not used, with their number; ``frames``
+    averaged; ``standing``: static markers.
+    """
+
+    trials: TrialData
+    stops: int
+    frames: int
+    left_out: dict[str, int]
+    standing: tuple[int, ...]
+
+
+def flight_recording_of(images: Path) -> Path:
+    """Flight recording that a directory of images belongs to: ``NAME.mcap`` beside ``NAME.images``."""
+    return images.absolute().with_suffix(".mcap")
+
+
+def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Progress) -> RecordedTrials:
+    """Run the cell's detectors on the recorded cameras and average as the trial motions do.
+
+    ``progress`` hears the camera and the number of its frame. Raises CalibrationError (``bad_data``,
+    ``too_few_stops``), RecordingError, ImageFileError, PluginError, DriverError, CellFileError.
+    """
+    cell = load_cell_file(cell_path)
+    if not images.is_dir() or images.suffix != IMAGES_SUFFIX:
+        raise CalibrationError(
+            "bad_data",
+            f"{images} is no directory of recorded images; `stereoservo record CELL --images` makes one, "
+            f"NAME{IMAGES_SUFFIX} beside NAME.mcap",
+        )
+    motion = read_motion(flight_recording_of(images))
+    cameras = [
+        recorded_camera(cell, cell_path, section.name, video_of(images, section.name))
+        for section in cell.camera
+    ]
+    settings = _settings(cell, cell_path, motion, cameras)
+    if settings.trials is None:
+        raise CalibrationError(
+            "bad_data",
+            f"{cell_path} has no [calibration] section; base, frames and settle_s of the trial motions are needed",
+        )
+    gathered = RecordedTrialCollector(motion, settings, settings.trials)
+    for camera in cameras:
+        gathered.add(_observations(camera, gathered, note, progress))
+    job = TrialCollector(settings)
+    events = gathered.events()
+    for event in events:
+        job.add(event)
+    trials = job.trials()
+    return RecordedTrials(trials, len(events), trials.images, gathered.left_out, job.standing)
+
+
+def _observations(
+    camera: RecordedCamera, gathered: RecordedTrialCollector, note: Note, progress: Progress
+) -> Iterator[CameraObservation]:
+    name, frames = camera.description.name, 0
+
+    def is_usable(t_shutter_ns: int) -> bool:
+        nonlocal frames
+        frames += 1
+        progress(name, frames)
+        return gathered.wants(name, t_shutter_ns)
+
+    return camera.observations(note, is_usable)
+
+
+def _settings(
+    cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]
+) -> CoreSettings:
+    """The core's settings for the current cell file, the recorded joints, and the detectors on the recorded cameras."""
+    recorded = motion.settings
+    ranges = cell.safety.limit or _recorded_limits(recorded)  # of a simulated arm they may be left out
+    limits = {limit.joint: limit for limit in ranges}
+    if set(limits) != set(recorded.joint_names):
+        raise CalibrationError(
+            "bad_data",
+            f"the flight recording is of joints {', '.join(recorded.joint_names)}; {cell_path} has "
+            f"{', '.join(limits)}: is it of this cell?",
+        )
+    for camera in cameras:
+        was = next((one for one in recorded.cameras if one.name == camera.description.name), None)
+        size = camera.description.width, camera.description.height
+        if was is None or (was.width, was.height) != size:
+            stated = "has no such camera" if was is None else f"has it with {was.width}x{was.height} px"
+            raise CalibrationError(
+                "bad_data",
+                f"{camera.file} holds pictures of {size[0]}x{size[1]} px of camera {camera.description.name!r}; the "
+                f"flight recording {stated}: do they belong together?",
+            )
+    joints = JointDriverDescription(
+        driver=cell.joints.driver,
+        joints=tuple(
+            JointSpec(
+                name, kind, limits[name].min, limits[name].max, limits[name].velocity,
+                limits[name].acceleration, resolution,
+            )
+            for name, kind, resolution in zip(
+                recorded.joint_names, recorded.joint_kinds, recorded.resolution or (0.0,) * len(limits), strict=True
+            )
+        ),
+        rate_hz=recorded.rate_hz, pacing="clock", command_timeout_s=0.1, call_budget_us=0.0,
+        home=() if recorded.trials is None else tuple(recorded.trials.base.tolist()),
+        simulated=not cell.safety.limit,
+    )  # fmt: skip
+    return core_settings(cell, joints, tuple(camera.description for camera in cameras))
+
+
+def _recorded_limits(recorded: CoreSettings) -> tuple[JointLimit, ...]:
+    limits = recorded.limits
+    rows = np.stack([limits.position_min, limits.position_max, limits.velocity_max, limits.acceleration_max])
+    return tuple(
+        JointLimit(name, *row) for name, row in zip(recorded.joint_names, rows.T.tolist(), strict=True)
+    )
+
+
+SAME_POSITION = 4.0
+"""Joints nearer than so many arrival tolerances are in one place: each of two arrivals is within one, and settles."""
+BEFORE_NS = 500_000_000
+
+
+@dataclass
+class _Stop:
+    """A rest whose frames are being collected."""
+
+    rest: RestInterval
+    sums: ObservationStatistics
+    joint_sum: FloatArray
+    frames: int = 0
+
+
+@dataclass
+class RecordedTrialCollector:
+    """Collects the observations of all cameras, in any order of cameras, into the stops of the trial motions.
+
+    ``settings``: of the flight, with the cameras and markers of the detectors that are used now. ``left_out``: why
+    rests were not used, with their number.
+    """
+
+    motion: RecordedMotion
+    settings: CoreSettings
+    trial: TrialSettings
+    left_out: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.motion.settings.joint_names)
+        self._stops = [
+            _Stop(rest, ObservationStatistics(**measurement_buffers(self.settings)), np.zeros(n))
+            for rest in rest_intervals(self.motion, self.trial.settle_s)
+        ]
+        self._settled = [stop.rest.settled_ns for stop in self._stops]
+        self.used = 0
+
+    def wants(self, camera: str, t_ns: int) -> bool:
+        """Whether a frame of this time may be used, or shortly precedes one that is, so that a tracking detector
+        must see it.
+        """
+        column = next(k for k, one in enumerate(self.settings.cameras) if one.name == camera)
+        newest = bisect_right(self._settled, t_ns + BEFORE_NS) - 1
+        return any(
+            t_ns <= stop.rest.end_ns and stop.sums.frames[column] < self.trial.frames
+            for stop in self._stops[max(newest - 1, 0) : newest + 1]
+        )
+
+    def add(self, observations: Iterable[CameraObservation]) -> None:
+        """Add one camera's observations in the order of time; those made in motion are skipped."""
+        for observation in observations:
+            number = bisect_right(self._settled, observation.t_shutter_ns - 1) - 1
+            if number < 0:
+                continue
+            stop = self._stops[number]
+            joints = self.motion.joints_at(observation.t_shutter_ns)
+            if observation.t_shutter_ns > stop.rest.end_ns or joints is None:
+                continue
+            if add_observation(
+                stop.sums, self.settings, observation, self.trial.frames, stop.rest.settled_ns
+            ):
+                stop.joint_sum += joints
+                stop.frames += 1
+                self.used += 1
+
+    def events(self) -> list[Event]:
+        """The stops as events of the core's trial motions. Raises CalibrationError (``too_few_stops``)."""
+        self.left_out = {}
+        seen = [
+            (stop, stop.joint_sum / stop.frames) for stop in self._stops if stop.frames and self._good(stop)
+        ]
+        if not seen:
+            raise CalibrationError(
+                "too_few_stops",
+                f"none of {len(self._stops)} rests of the flight recording has pictures with enough markers "
+                f"({self.used} frames fall into rests): do pictures and flight belong together, and does the cell's "
+                "detector find its markers in them?",
+                rests=len(self._stops), frames=self.used,
+            )  # fmt: skip
+        base = self._base([joints for _, joints in seen])
+        near = SAME_POSITION * self.settings.arrival
+        events: list[Event] = []
+        places: list[FloatArray] = []
+        together = 0
+        for stop, joints in seen:
+            moved = np.flatnonzero(np.abs(joints - base) > near)
+            alone = moved[moved != self.trial.spread_joint]
+            if alone.size > 1 and together == self.trial.together:
+                self._leave_out("more than one joint is away from the base")
+            elif any(bool((np.abs(joints - place) < near).all()) for place in places):
+                self._leave_out("the arm was there before")
+            else:
+                places.append(joints)
+                trial = int(alone[0]) if alone.size else (self.trial.spread_joint if moved.size else -1)
+                if alone.size > 1:
+                    together, trial = together + 1, -1
+                samples = averages(stop.sums, self.settings)
+                event = Event(
+                    len(events) + 1, stop.rest.end_ns, "calibration_sample", id="images", joints=joints
+                )
+                events.append(msgspec.structs.replace(event, samples=samples, trial=trial))
+        return events
+
+    def _good(self, stop: _Stop) -> bool:
+        if too_few_seen(averages(stop.sums, self.settings), self.trial) is None:
+            return True
+        self._leave_out("some camera shows too few markers, or too few frames")
+        return False
+
+    def _leave_out(self, why: str) -> None:
+        self.left_out[why] = self.left_out.get(why, 0) + 1
+
+    def _base(self, places: list[FloatArray]) -> FloatArray:
+        """Positions (n,) of the joints that do not move: the cell file's base, or, where most of ``places`` (n,)
+        differ from that in more than one joint, the configuration from which most others differ in one joint.
+        """
+        candidates = np.array([self.trial.base, *places])
+        away = np.abs(candidates[:, None] - np.array(places)) > SAME_POSITION * self.settings.arrival
+        if self.trial.spread_joint >= 0:
+            away[..., self.trial.spread_joint] = False
+        near = (away.sum(axis=-1) <= 1).sum(axis=1)
+        best: FloatArray = candidates[0 if 2 * near[0] >= len(places) else int(near.argmax())]
+        return best

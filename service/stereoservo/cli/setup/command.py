@@ -7,29 +7,42 @@ the cell, and the note that its joints were commissioned as the file has them.
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
+import time
 import tomllib
-from collections.abc import Generator
-from contextlib import closing
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import typer
 
+from stereoservo.cli import interruption
+from stereoservo.cli.doctor.camera_findings import CameraRecord
+from stereoservo.cli.doctor.cameras import WatchedCamera
 from stereoservo.cli.doctor.command import examine_file, examine_pictures, line_of
+from stereoservo.cli.doctor.joints import examine_joints
+from stereoservo.cli.doctor.plate_motion import judge_turn, turn_between
 from stereoservo.cli.init import toml_options
 from stereoservo.cli.output import CommandError, JsonOption, emit
-from stereoservo.cli.setup.commissioning import commission, in_fault, reset_drives
 from stereoservo.cli.setup.dialogue import Dialogue, answers_text, read_answers
-from stereoservo.cli.setup.first_goal import arm_is_off, calibrated, first_goal, running
 from stereoservo.cli.setup.interview import interview
+from stereoservo.client import Client, ClientError
+from stereoservo.daemon.camera_setup import make_camera
 from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.pacing import ordinary_for_a_while
+from stereoservo.daemon.plant_driver import make_driver
+from stereoservo.daemon.taught_goals import load_taught
 from stereoservo.gateway.persistence import ModelStore
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.messages.directories import CELL_NAME, CellDirectories, cell_directories, create_directories
+from stereoservo.messages.discovery import DaemonError, DaemonProcess, NotRunningError, find_daemon
 from stereoservo.messages.locks import holder
+from stereoservo.messages.wire import EventMessage
 from stereoservo.ports import plugins
+from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError, ExaminationFinding
 from stereoservo.ports.discovery import DriveFinder
 
@@ -242,3 +255,303 @@ def _keep_answers(file: Path, dialogue: Dialogue) -> None:
         path = directories.state / "setup-answers.toml"
         path.write_text(answers_text(dialogue.asked), encoding="utf-8")
         dialogue.say(f"   the answers so far: {path}")
+
+
+# -- commissioning -------------------------------------------------------------------------------------------
+# Commissioning, joint by joint: each is moved by less than a degree, and three witnesses are compared: what its
+# encoder told, what the pictures saw, and what the person says moved.
+
+
+SHARE = 0.45
+"""Of one degree: a gear ratio that is wrong by two moves the joint by less than one."""
+FRAMES = 24
+"""Pictures of a look; their mean is what noise leaves."""
+LOOK_S = 4.0
+POLL_S = 0.002
+EYE = re.compile(r"(?P<joint>\S+?)(?P<sense>[+-]?)")
+
+
+class Cameras:
+    """The cell's cameras, open, to look at the plate before and after a motion. A context manager."""
+
+    def __init__(self, plan: RunPlan) -> None:
+        self._plan = plan
+        self._clock = MonotonicClock()
+        self._stack = ExitStack()
+        self._watched: list[WatchedCamera] = []
+
+    def __enter__(self) -> Cameras:
+        for section, description in zip(self._plan.cell.camera, self._plan.cameras, strict=True):
+            driver, detector = make_camera(section, self._plan.driver_context(self._clock, section))
+            camera = WatchedCamera(CameraRecord(description), driver, detector)
+            self._watched.append(camera)
+            try:
+                driver.configure()
+                driver.activate()
+            except DriverError as error:
+                camera.record.error = str(error)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for camera in self._watched:
+            camera.finish()
+
+    def look(self) -> list[CameraRecord]:
+        """What each camera sees from now on, in ``FRAMES`` pictures taken from now, or as many as come."""
+        begun_ns = self._clock.now_ns()
+        until_ns = begun_ns + round(LOOK_S * 1e9)
+        for camera in self._watched:
+            camera.record.seen.clear()
+        while self._clock.now_ns() < until_ns:
+            for camera in self._watched:
+                camera.poll()
+                seen = camera.record.seen
+                while seen and seen[0].t_shutter_ns < begun_ns:
+                    seen.pop(0)
+            if all(len(camera.record.seen) >= FRAMES or camera.record.error for camera in self._watched):
+                break
+            time.sleep(POLL_S)
+        records = []
+        for camera in self._watched:
+            record = CameraRecord(camera.record.description, list(camera.record.seen))
+            record.error = camera.record.error
+            records.append(record)
+        return records
+
+
+def commission(
+    plan: RunPlan, dialogue: Dialogue, sound: Sequence[bool], names: Sequence[str]
+) -> Generator[ExaminationFinding, None, None]:
+    """Findings on the drives, then on each joint's first motion, which the person permits once, and nobody where
+    something was found wrong before. ``sound``: whether all findings so far are; it grows with those that come.
+
+    ``names``: of the joints, base first.
+    """
+    asked: list[bool] = []
+    before: list[CameraRecord] = []
+
+    def look() -> list[CameraRecord]:
+        with dialogue.doing("looking at the plate"), ordinary_for_a_while():
+            return cameras.look()
+
+    def may_move(_question: str) -> float:
+        if not all(sound):
+            return 0.0
+        if not asked:
+            dialogue.heading("The first motion")
+            dialogue.say(
+                f"Each joint is going to be enabled, moved by {SHARE:g} degrees (a slide: {2 * SHARE:g} mm), slowly, "
+                "looked at, moved back and switched off, base first.\n"
+                "Ctrl-C stops it. Look at the arm: which joint moves, and which way?"
+            )
+            asked.append(
+                dialogue.confirm(
+                    "move", "Is the arm clear all around, and a hand on the emergency stop?", False
+                )
+            )
+        if not asked[0]:
+            return 0.0
+        before[:] = look()
+        return SHARE
+
+    with Cameras(plan) as cameras:
+        for finding in examine_joints(plan, may_move):
+            yield finding
+            if finding.jogged is None:
+                continue
+            seen = seen_by_pictures(plan, finding.jogged, before, look())
+            yield seen
+            if finding.ok is not False and seen.ok is not False:
+                yield asked_of_a_person(dialogue, finding.jogged, names)
+
+
+def in_fault(findings: Sequence[ExaminationFinding]) -> ExaminationFinding | None:
+    """The finding that drives stand in a fault, which only a reset ends; None where they do not."""
+    return next((finding for finding in findings if finding.name == "fault" and finding.ok is False), None)
+
+
+def reset_drives(plan: RunPlan) -> None:
+    """Clear the drives' faults; nothing is enabled. Raises DriverError where one stays."""
+    driver = make_driver(plan, MonotonicClock())
+    try:
+        driver.configure()
+        driver.configure()  # the first call reports what it finds, the next one clears it
+    finally:
+        driver.close()
+
+
+def seen_by_pictures(
+    plan: RunPlan, jogged: tuple[str, float], before: list[CameraRecord], after: list[CameraRecord]
+) -> ExaminationFinding:
+    """Finding on a jog, a joint and its travel [rad or m], by the pictures before and after it."""
+    joint, travel = jogged
+    kind = next(spec.kind for spec in plan.joints.joints if spec.name == joint)
+    if kind == "revolute":
+        return judge_turn(joint, travel, turn_between(before, after))
+    return ExaminationFinding(
+        f"{joint} pictures", None, "a slide turns nothing: its travel is not judged by pictures"
+    )
+
+
+def asked_of_a_person(
+    dialogue: Dialogue, jogged: tuple[str, float], names: Sequence[str]
+) -> ExaminationFinding:
+    """Finding on a jog by what a person saw."""
+    joint, travel = jogged
+    wanted = f"{joint}{'+' if travel > 0 else '-'}"
+    answer = dialogue.ask(
+        f"moved.{joint}",
+        f"Which joint moved, and which way (NAME+ or NAME-, or nothing)? {wanted} was asked for",
+        wanted,
+        lambda text: _eye(text, names),
+    )
+    return eye_finding(joint, travel, answer)
+
+
+def _eye(text: str, names: Sequence[str]) -> tuple[str, str]:
+    """Parse what a person saw move: joint and sense. Raises ValueError."""
+    if text.lower() in ("nothing", "none"):
+        return "", ""
+    match = EYE.fullmatch(text)
+    if match is None or match["joint"] not in names:
+        raise ValueError(f"a joint's name with + or - behind it, of {', '.join(names)}; or nothing")
+    return match["joint"], match["sense"]
+
+
+def eye_finding(joint: str, travel: float, answer: tuple[str, str]) -> ExaminationFinding:
+    """Finding on what a person saw move while ``joint`` was driven by ``travel`` [rad or m]."""
+    name = f"{joint} seen"
+    moved, sense = answer
+    expected = "+" if travel > 0 else "-"
+    if not moved:
+        return ExaminationFinding(
+            name, None, "nobody saw it move; the pictures are the only witness of which joint it was"
+        )
+    if moved != joint:
+        return ExaminationFinding(
+            name, False, f"{joint} was driven, and {moved} moved: they are swapped",
+            f"exchange node_id (and what else is of the drive) of {joint!r} and {moved!r}",
+        )  # fmt: skip
+    if sense and sense != expected:
+        return ExaminationFinding(
+            name, False, f"{joint} was driven to {expected} and turned to {sense}: its sign is inverted",
+            f"direction of {joint!r}: the other sign; then offset_rad anew",
+        )  # fmt: skip
+    return ExaminationFinding(name, True, "it is the joint that moved, and the way it is counted")
+
+
+# -- the first goal ------------------------------------------------------------------------------------------
+# The last steps of `stereoservo setup`: the daemon, a calibration, the first taught goal, and the way back to it.
+
+
+AWAY_SHARE = 0.3
+"""Of a joint's trial motion, how far the arm is sent away from its first goal; and in any case no more than"""
+AWAY_MOST = {"revolute": 0.15, "prismatic": 0.05}
+"""[rad or m]"""
+GOAL_S = 180.0
+
+
+@contextmanager
+def running(file: Path, directories: CellDirectories, dialogue: Dialogue) -> Iterator[Client]:
+    """A client of the cell's daemon, which is started, for the time of it, where none runs.
+
+    Raises CommandError where it does not start; Ctrl-C stops the arm.
+    """
+    daemon: DaemonProcess | None = None
+    try:
+        find_daemon(str(file))
+    except NotRunningError:
+        log = directories.state / "setup-daemon.log"
+        daemon = DaemonProcess(file, log=log)
+        dialogue.say(f"   starting the cell's daemon; its log is {log}")
+    try:
+        if daemon is not None:
+            with dialogue.doing("the daemon starts (the first time, it compiles for half a minute)"):
+                try:
+                    daemon.wait_ready()
+                except DaemonError as error:
+                    raise CommandError("daemon", str(error)) from error
+        with Client(str(file), while_waiting=interruption.check) as client:
+            try:
+                yield client
+            except KeyboardInterrupt:
+                client.stop()
+                raise
+    finally:
+        if daemon is not None:
+            with dialogue.doing("the daemon ends"):
+                daemon.stop()
+
+
+def calibrated(client: Client, dialogue: Dialogue) -> dict[str, Any]:
+    """Calibrate the cell; returns what a report's summary holds. Raises ClientError, CommandError."""
+
+    def progress(event: EventMessage) -> None:
+        if event.kind == "warning":
+            dialogue.say(f"   {event.message}")
+        elif event.kind == "calibrated":
+            dialogue.now("the report is written")
+        elif event.progress is not None and event.kind.startswith("fit"):
+            dialogue.say(f"   fit: {event.progress:4.0%} {event.message}")
+        elif event.progress is not None:
+            dialogue.now(f"trial motions, {event.progress:.0%}")
+
+    with dialogue.doing("trial motions"):
+        result = client.calibrate(progress, report=True)
+    dialogue.say(
+        f"   model epoch {result.epoch}, {result.stratum}: {result.rms_px:.3f} px rms over {result.measurements} "
+        f"measurements. {result.verdict}\n   report: {result.report or 'none could be written'}"
+    )
+    return {
+        "rms_px": result.rms_px, "stratum": result.stratum, "covariance_ok": result.covariance_ok,
+        "model": result.model,
+    }  # fmt: skip
+
+
+def first_goal(client: Client, directories: CellDirectories, dialogue: Dialogue) -> dict[str, Any]:
+    """Teach a goal where the arm stands, send the arm away and back to it by the pictures. Raises ClientError."""
+    known = load_taught(directories.taught)
+    name = dialogue.ask(
+        "goal", "A name for the goal that the cameras see now", next(iter(known), "first"), _goal_name
+    )
+    if name not in known:
+        with dialogue.doing("averaging what the cameras see"):
+            dialogue.say(f"   {client.teach(name).message}")
+    if not dialogue.confirm(
+        "go", "Send the arm a little way off, and back to that goal by its pictures?", True
+    ):
+        return {"name": name, "outcome": "not sent"}
+    with dialogue.doing("the arm moves off by its joints"):
+        client.goal(away(client)).reached(GOAL_S)
+    with dialogue.doing(f"the arm goes to {name!r} by its pictures"):
+        handle = client.goal(name)
+        dialogue.say(f"   accepted: {handle.message}")
+        result = handle.reached(GOAL_S)
+    error = "" if result.error_px is None else f", {result.error_px:.3f} px beside it"
+    dialogue.say(f"   {name!r} is {result.outcome} after {result.seconds:.1f} s{error}")
+    return {"name": name, "outcome": result.outcome, "error_px": result.error_px, "seconds": result.seconds}
+
+
+def _goal_name(text: str) -> str:
+    if not CELL_NAME.fullmatch(text):
+        raise ValueError("letters, digits, '_' and '-', up to 64")
+    return text
+
+
+def away(client: Client) -> dict[str, float]:
+    """Joint positions [rad or m] a little off the present ones, each joint towards the middle of its range."""
+    info, joints = client.info(), client.joints()
+    targets = {}
+    for joint in info.joints:
+        q = joints[joint.name]
+        way = min(AWAY_SHARE * 0.5 * (joint.position_max - joint.position_min), AWAY_MOST[joint.kind])
+        targets[joint.name] = q + (way if q < 0.5 * (joint.position_min + joint.position_max) else -way)
+    return targets
+
+
+def arm_is_off(client: Client) -> bool:
+    """Whether the drives are off and the arm can be enabled. Raises ClientError where the cell is in a fault."""
+    state = client.status()
+    if state.lifecycle == "fault":
+        raise ClientError("the cell is in a fault: " + "; ".join(reason.hint for reason in state.reasons))
+    return state.lifecycle == "inactive"

@@ -53,19 +53,8 @@ from stereoservo.kinematics.kernels import multiply4_into, transform_points, tra
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import Fields, kernel
-from stereoservo.planning.primitives import (
-    HINGE,
-    PLANAR,
-    REACH_RATIO,
-    TRANSLATION,
-)
-from stereoservo.planning.three_point_decomposition import (
-    DONE,
-    MOVES,
-    NO_FACE,
-    NOT_REACHABLE,
-    WAITS,
-)
+from stereoservo.planning.primitives import HINGE, PLANAR, REACH_RATIO, TRANSLATION
+from stereoservo.planning.three_point_decomposition import DONE, MOVES, NO_FACE, NOT_REACHABLE, WAITS
 
 # -- visibility of the face ------------------------------------------------------------------------------------------
 

@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from stereoservo.core.cycle import encode
-from stereoservo.daemon.channels.outbox import Outbox
-from stereoservo.daemon.channels.seqpacket import ChannelError, ChannelServer, PacketChannel
+from stereoservo.daemon.channels.seqpacket import ChannelError, ChannelServer, Outbox, PacketChannel
 from stereoservo.daemon.ipc_messages import Received, Report, received_decoder, report_decoder
 from stereoservo.daemon.process_control import write_log
 from stereoservo.messages.decoding import RecordBoundary

@@ -9,11 +9,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereoservo.kinematics.inverse.recognition import Recognition, recognise
-from stereoservo.kinematics.inverse.refinement import ImageSolutions, refined_on_images
-from stereoservo.kinematics.inverse.solutions import InverseKinematicsError, InverseSolutions, nearest_turns
+from stereoservo.kinematics.inverse.solutions import (
+    InverseKinematicsError,
+    InverseSolutions,
+    distinct,
+    nearest_turns,
+    within_limits,
+)
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo.kinematics.joint_angles import JointAngles
-from stereoservo.kinematics.joint_reprojection import points_seen, seen_chain
+from stereoservo.kinematics.joint_angles import JointAngles, refined_joints
+from stereoservo.kinematics.joint_reprojection import (
+    JointAnglesError,
+    SeenChain,
+    joint_problem,
+    points_seen,
+    seen_chain,
+)
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
@@ -73,3 +84,54 @@ def postures(
         return float(((nearest_turns(seen.chain.kinds, angles.q, zero) - zero) ** 2).sum())
 
     return Postures(structure, found, replace(images, solutions=tuple(sorted(images.solutions, key=far))))
+
+
+# -- refined on the images -----------------------------------------------------------------------------------
+# Joint angles for the images of a goal: each start from inverse kinematics is refined to the least reprojection error,
+# with covariance (thesis 6.8).
+
+
+MERGED = 1e-5
+"""Largest difference of joints [rad or m] of two refinements that ended in one minimum."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSolutions:
+    """Configurations of least image error, one for each start that led to one, least cost first.
+
+    ``refused``: starts (t, n) whose descent explains no image, with the reason of each.
+    """
+
+    solutions: tuple[JointAngles, ...]
+    refused: tuple[tuple[FloatArray, str], ...]
+
+
+def refined_on_images(
+    seen: SeenChain,
+    found: InverseSolutions,
+    points: FloatArray,
+    pixels: FloatArray,
+    sigma: FloatArray | float,
+    *,
+    limits: FloatArray | None = None,
+) -> ImageSolutions:
+    """Solutions ``found``, each refined to the least squares of (6.8), with covariance.
+
+    ``points`` (m, 4) at the chain's zero, raw set-points ``pixels`` (c, m, 2) [px] of standard deviation ``sigma``, NaN
+    where a camera does not see one. Raises JointAnglesError for shapes and limits that do not fit, and for fewer
+    coordinates than joints.
+    """
+    problem = joint_problem(seen, points, pixels, sigma)
+    refined: list[JointAngles] = []
+    refused: list[tuple[FloatArray, str]] = []
+    ends = refined_joints(problem, found.joints, limits=limits)
+    for q, best in zip(found.joints, ends, strict=True):
+        if isinstance(best, JointAnglesError):
+            refused.append((q, str(best)))
+        else:
+            refined.append(replace(best, q=within_limits(seen.chain.kinds, best.q, q, limits)[0]))
+    refined.sort(key=lambda angles: angles.cost)
+    if refined:
+        kept = distinct(seen.chain.kinds, np.array([angles.q for angles in refined]), MERGED)
+        refined = [refined[i] for i in kept]
+    return ImageSolutions(tuple(refined), tuple(refused))

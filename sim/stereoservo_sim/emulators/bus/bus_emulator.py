@@ -2,18 +2,166 @@
 
 from __future__ import annotations
 
+import copy
 import heapq
+import struct
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_sim.emulators.bus.can_wire import MASTER, Disturbances, Wire
-from stereoservo_sim.emulators.bus.fault_commands import LANGUAGE, BusCommand
+from stereoservo_drivers.can.load import frame_bits
 from stereoservo_sim.emulators.bus.plant import AxisPlant
-from stereoservo_sim.emulators.fault_engine import FaultCommandError, FaultEngine
-from stereoservo_sim.emulators.nodes.node import EmulatedNode
+from stereoservo_sim.emulators.fault_engine import (
+    Answer,
+    FaultCommand,
+    FaultCommandError,
+    FaultEngine,
+    FaultLanguage,
+    Verb,
+    Word,
+    at_most,
+    choice_word,
+    time_word,
+)
+from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedNode
+
+# -- the wire ------------------------------------------------------------------------------------------------
+# Discrete-event model of the CAN wire: arbitration, frame times (ISO 11898-1), and injected disturbances.
+
+
+MASTER = 0
+"""The sender that is not a node of the emulated bus; nodes are 1, 2, ... in their order."""
+QUEUE_LIMIT = 2000
+"""Frames that a sender may have waiting; further ones are lost, as from a full transmit buffer."""
+SECOND_NS = 1_000_000_000
+COB_IDS = {
+    "emcy": 0x080, "tpdo1": 0x180, "tpdo2": 0x280, "tpdo3": 0x380, "tpdo4": 0x480, "sdo": 0x580, "heartbeat": 0x700,
+}  # fmt: skip
+"""Frames of a node by name: the base of their id in the predefined connection set (CiA 301, 7.3.5)."""
+SYNC_ID = 0x080
+
+
+def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
+    """Bits of the arbitration field in the order of sending, dominant as 0: the smallest wins.
+
+    A data frame so goes before the remote frame of its id, and a standard one before an extended one that begins alike.
+    """
+    if frame.extended:
+        return frame.id >> 18, 1, 1, frame.id & 0x3FFFF, int(frame.remote)
+    return frame.id, int(frame.remote), 0, 0, 0
+
+
+class Wire:
+    """The wire, one frame at a time. Each sender's frames keep their order; between senders, arbitration decides.
+
+    ``bitrate`` [bit/s]; None: frames take no time. A frame occupies its stuffed bits and the intermission and arrives
+    when those are over. Bit errors, and the collision of two frames with one id, are not modelled: both go out.
+    """
+
+    def __init__(self, bitrate: int | None) -> None:
+        self.bitrate = bitrate
+        self.frames = 0
+        self.lost = 0
+        self.busy_ns = 0
+        self.end_ns = NEVER_NS
+        """When the frame on the wire ends."""
+        self._queues: dict[int, deque[CanFrame]] = {}
+        self._heads: list[tuple[tuple[int, int, int, int, int], int]] = []
+        """Every sender's first waiting frame, by its arbitration field: a heap."""
+        self._sending: tuple[int, CanFrame] | None = None
+
+    def send(self, sender: int, frame: CanFrame) -> None:
+        """Queue a frame of ``sender``."""
+        queue = self._queues.setdefault(sender, deque())
+        if len(queue) >= QUEUE_LIMIT:
+            self.lost += 1
+            return
+        queue.append(frame)
+        if len(queue) == 1:
+            self._compete(sender, frame)
+
+    def _compete(self, sender: int, frame: CanFrame) -> None:
+        heapq.heappush(self._heads, (arbitration_key(frame), sender))
+
+    def waiting(self, sender: int) -> int:
+        """Frames of ``sender`` that are not on the wire yet."""
+        return len(self._queues.get(sender, ()))
+
+    def start(self, t_ns: int) -> None:
+        """If the bus is idle at ``t_ns``, start the frame that wins the arbitration."""
+        if self._sending is not None or not self._heads:
+            return
+        sender = heapq.heappop(self._heads)[1]
+        queue = self._queues[sender]
+        frame = queue.popleft()
+        if queue:
+            self._compete(sender, queue[0])
+        self._sending = sender, frame
+        duration = self.duration_ns(frame)
+        self.busy_ns += duration
+        self.end_ns = t_ns + duration
+
+    def finish(self) -> tuple[int, CanFrame]:
+        """End the frame on the wire; returns its sender and the frame."""
+        assert self._sending is not None  # end_ns is NEVER_NS otherwise
+        ended = self._sending
+        self._sending = None
+        self.end_ns = NEVER_NS
+        self.frames += 1
+        return ended
+
+    def duration_ns(self, frame: CanFrame) -> int:
+        """Duration of ``frame`` on the bus, intermission included."""
+        if self.bitrate is None:
+            return 0
+        return frame_bits(frame) * SECOND_NS // self.bitrate
+
+
+class Disturbances:
+    """Active disturbances by node number, which determine whether each frame is delayed or lost."""
+
+    def __init__(self) -> None:
+        self.master_connected = True
+        self.drop_sync = False
+        self.cut: set[int] = set()
+        self.silent: set[int] = set()
+        self.late_ns: dict[int, int] = {}
+        self.sticky: dict[int, int] = {}
+        self.lose: dict[tuple[int, int], int] = {}
+        """Frames still to be lost by node and id."""
+
+    def fate_ns(self, node_id: int, frame: CanFrame) -> int | None:
+        """Delay of a frame of ``node_id``; None: it is lost."""
+        if node_id in self.silent or node_id in self.cut:
+            return None
+        left = self.lose.get((node_id, frame.id), 0)
+        if left > 0 and not frame.extended:
+            self.lose[node_id, frame.id] = left - 1
+            return None
+        return self.late_ns.get(node_id, 0)
+
+    def master_passes(self, frame: CanFrame) -> bool:
+        """Whether a frame of the master gets onto the bus."""
+        if not self.master_connected:
+            return False
+        return not (self.drop_sync and frame.id == SYNC_ID and not frame.extended)
+
+    def words(self, node_id: int) -> str:
+        """Disturbances of a node, as text."""
+        parts = []
+        if node_id in self.cut or not self.master_connected:
+            parts.append("cable out")
+        if node_id in self.silent:
+            parts.append("silenced")
+        if self.late_ns.get(node_id, 0):
+            parts.append(f"late by {self.late_ns[node_id] * 1e-6:g} ms")
+        if node_id in self.sticky:
+            parts.append(f"fault {self.sticky[node_id]:#x} that stays")
+        return f" [{', '.join(parts)}]" if parts else ""
+
 
 BABBLE = 20_000
 """Sender of a babbling node's babble is this plus its number."""
@@ -323,3 +471,376 @@ class BusEmulator:
             if slot.due_ns <= due
         ]
         return "; ".join(late) or "frames answer frames"
+
+
+# -- fault commands ------------------------------------------------------------------------------------------
+# Fault commands of the emulated bus: the verbs, their arguments, and their effects.
+
+
+NMT = {"start": 1, "stop": 2, "preop": 128, "reset": 129, "reset-communication": 130}
+FLOOD_HZ = 5000.0
+FLOOD_HZ_MAX = 20_000.0
+FOREIGN = 10_000
+"""Sender of frames that neither the master nor an emulated node sends."""
+GENERIC_ERROR = 0x01
+"""Bit 0 of the error register (0x1001)."""
+REMAPPING = ((0x1800, 1, None), (0x1A00, 0, 0), (0x1A00, 1, 0x60410010), (0x1A00, 0, 1), (0x1800, 1, None))
+"""SDO writes that leave the status word alone in TPDO 1: off (None: the PDO's COB-ID), mapping, on."""
+
+
+class BusCommand(FaultCommand, frozen=True):
+    """One fault command. ``node``: 0 is the whole bus. ``number``: an error code, a count, an NMT command, by the
+    verb.
+    """
+
+    node: int = 0
+    number: int = 0
+    duration_ns: int = 0
+    rate_hz: float = 0.0
+    what: str = ""
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+def _node(word: str) -> dict[str, Any]:
+    if not word.isdecimal() or not 1 <= int(word) <= 126:
+        raise FaultCommandError(f"node {word!r}; a number from 1 to 126 is valid")
+    return {"node": int(word)}
+
+
+def _code(word: str) -> dict[str, Any]:
+    try:
+        code = int(word, 0)
+    except ValueError:
+        raise FaultCommandError(f"error code {word!r}; a number such as 0x3210 is valid") from None
+    if not 1 <= code <= 0xFFFFFFFF:
+        raise FaultCommandError(f"error code {word!r}; 1 to 0xFFFFFFFF is valid")
+    return {"number": code}
+
+
+def _code_or_off(word: str) -> dict[str, Any]:
+    return {"what": "off"} if word == "off" else _code(word)
+
+
+def _count(word: str) -> dict[str, Any]:
+    if not word.isdecimal() or not 1 <= int(word) <= 1_000_000:
+        raise FaultCommandError(f"count {word!r}; 1 to 1000000 is valid")
+    return {"number": int(word)}
+
+
+def _frame(word: str) -> dict[str, Any]:
+    if word.lower().startswith("0x"):
+        try:
+            return {"what": f"{int(word, 16):#x}"}
+        except ValueError:
+            raise FaultCommandError(f"id {word!r}; hexadecimal, e.g. 0x182") from None
+    if word not in COB_IDS:
+        raise FaultCommandError(f"{word!r}; valid: {', '.join(COB_IDS)}")
+    return {"what": word}
+
+
+def _rate(word: str) -> dict[str, Any]:
+    try:
+        rate = float(word)
+    except ValueError:
+        rate = -1.0
+    if not 1.0 <= rate <= FLOOD_HZ_MAX:
+        raise FaultCommandError(f"rate {word!r} Hz; 1 to {FLOOD_HZ_MAX:g} is valid")
+    return {"rate_hz": rate}
+
+
+def _without_node(words: list[str]) -> list[str]:
+    return words[1:] if words[:1] == ["node"] else words
+
+
+def _check_emergency(command: BusCommand) -> None:
+    if command.number > 0xFFFF:
+        raise FaultCommandError(f"emergency code {command.number:#x}; at most 0xFFFF is valid")
+
+
+def _cable_words(words: list[str]) -> dict[str, Any]:
+    """Parse arguments whose node may be left out, before the required word."""
+    fields = _node(words[0]) if words and words[0] not in IN_OR_OUT else {}
+    rest = words[len(fields) :]
+    at_most(rest, 1)
+    end = choice_word(IN_OR_OUT)
+    if not rest:
+        raise FaultCommandError(str(end.missing))
+    return fields | end.read(rest[0])
+
+
+def _named(*names: str) -> dict[str, dict[str, Any]]:
+    return {name: {"what": name} for name in names}
+
+
+IN_OR_OUT = _named("in", "out")
+NODE = Word(_node, "the node's number is missing")
+NODE_OR_ALL = Word(_node)
+CODE = Word(_code, "the error code is missing, e.g. 0x3210")
+CODE_OR_OFF = Word(_code_or_off, "the error code is missing, e.g. 0x3210")
+FRAME = Word(_frame, f"one of {', '.join(COB_IDS)} is missing")
+COUNT = Word(_count, default={"number": 1})
+RATE = Word(_rate, default={"rate_hz": FLOOD_HZ})
+DELAY = time_word("duration_ns", "the delay is missing")
+SIDE = choice_word({"+": {"number": 1}, "-": {"number": -1}, "off": {}})
+NMT_WORD = choice_word({name: {"what": name, "number": number} for name, number in NMT.items()})
+
+
+# -- actions ----------------------------------------------------------------------------------------------------------
+
+
+def _fault(emulator: BusEmulator, command: BusCommand) -> str:
+    slot = emulator.slot(command.node)
+    slot.node.trip(command.number, emulator.t_ns)
+    emulator.look(slot)
+    return f"node {command.node}: fault {command.number:#06x}; now {slot.node.state()}"
+
+
+def _sticky(emulator: BusEmulator, command: BusCommand) -> str:
+    causes: set[int] | None = getattr(emulator.slot(command.node).node, "sticky", None)
+    if command.what == "off":
+        emulator.disturbances.sticky.pop(command.node, None)
+        if causes is not None:
+            causes.clear()
+        return f"node {command.node}: the cause is gone"
+    if causes is None:  # a node without persistent causes: the emulator trips it again after each reset
+        emulator.disturbances.sticky[command.node] = command.number
+    else:
+        causes.add(command.number)
+    return f"{_fault(emulator, command)}; the cause stays"
+
+
+def _emcy(emulator: BusEmulator, command: BusCommand) -> str:
+    data = struct.pack("<HB5x", command.number, GENERIC_ERROR)
+    emulator.wire.send(emulator.slot(command.node).sender, CanFrame(COB_IDS["emcy"] + command.node, data))
+    return f"node {command.node}: emergency {command.number:#06x}"
+
+
+def _silence(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.disturbances.silent.add(command.node)
+    return f"node {command.node}: silent", lambda: emulator.disturbances.silent.discard(command.node)
+
+
+def _speak(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.disturbances.silent.discard(command.node)
+    return f"node {command.node}: speaks"
+
+
+def _reboot(emulator: BusEmulator, command: BusCommand) -> str:
+    slot = emulator.slot(command.node)
+    slot.node.power_up(emulator.t_ns)
+    emulator.look(slot)
+    return f"node {command.node}: reboots"
+
+
+def _lose(emulator: BusEmulator, command: BusCommand) -> str:
+    can_id = frame_id(command.node, command.what)
+    emulator.disturbances.lose[command.node, can_id] = command.number
+    return f"node {command.node}: {command.number} of its frames {can_id:#05x} will be lost"
+
+
+def _late(emulator: BusEmulator, command: BusCommand) -> Answer:
+    late_ns = emulator.disturbances.late_ns
+    before = late_ns.get(command.node, 0)
+    late_ns[command.node] = command.duration_ns
+
+    def undo() -> None:
+        late_ns[command.node] = before
+
+    return f"node {command.node}: late by {command.duration_ns * 1e-6:g} ms", undo
+
+
+def _duplicate(emulator: BusEmulator, command: BusCommand) -> str:
+    doubles = [
+        slot for slot in emulator.slots if slot.plant_index is None and slot.node.node_id == command.node
+    ]
+    if command.what == "off":
+        emulator.remove(doubles)
+        return f"node {command.node}: {len(doubles)} doubles removed"
+    # A copy has the state of its original; one that boots forgets it.
+    emulator.add(copy.deepcopy(emulator.slot(command.node).node), boots=command.what == "boots")
+    return f"node {command.node}: a second one {'boots' if command.what == 'boots' else 'runs beside it'}"
+
+
+def _remap(emulator: BusEmulator, command: BusCommand) -> str:
+    slot = emulator.slot(command.node)
+    can_id = COB_IDS["tpdo1"] + command.node
+    for k, (index, subindex, value) in enumerate(REMAPPING):
+        if value is None:
+            value = can_id | (0x80000000 if k == 0 else 0)
+        size = 1 if subindex == 0 else 4
+        head = 0x23 | (4 - size) << 2  # expedited download with its size
+        data = struct.pack("<BHBI", head, index, subindex, value)
+        slot.node.receive(CanFrame(0x600 + command.node, data), emulator.t_ns)
+        answers = emulator.look(slot, keep=COB_IDS["sdo"] + command.node)
+        if not answers:
+            raise FaultCommandError(f"node {command.node} answers no SDO: its protocol has no mapping")
+        if answers[0].data[0] != 0x60:
+            code = int.from_bytes(answers[0].data[4:], "little")
+            raise FaultCommandError(
+                f"node {command.node} refuses {index:#06x}:{subindex} (SDO abort {code:#010x})"
+            )
+    return f"node {command.node}: TPDO 1 carries the status word alone"
+
+
+def _cable(emulator: BusEmulator, command: BusCommand) -> Answer:
+    def connect(there: bool) -> None:
+        if command.node == 0:
+            emulator.disturbances.master_connected = there
+        else:
+            (emulator.disturbances.cut.discard if there else emulator.disturbances.cut.add)(command.node)
+
+    connect(command.what == "in")
+    where = f"node {command.node}: " if command.node else ""
+    return f"{where}bus cable {command.what}", lambda: connect(command.what == "out")
+
+
+def _adapter(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.on_adapter(command.what == "in")
+    return f"adapter {command.what}", lambda: emulator.on_adapter(command.what == "out")
+
+
+def _drop_sync(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.disturbances.drop_sync = True
+
+    def undo() -> None:
+        emulator.disturbances.drop_sync = False
+
+    return "SYNC does not get through", undo
+
+
+def _pass_sync(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.disturbances.drop_sync = False
+    return "SYNC gets through"
+
+
+def _limit(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.slot(command.node).node.axis.limit_switch = command.number
+    _update_inputs(emulator, command)
+    sides = {1: "positive limit switch active", -1: "negative limit switch active", 0: "limit switches free"}
+    return f"node {command.node}: {sides[command.number]}"
+
+
+def _invert(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.slot(command.node).node.axis.inverted_encoder = command.what == "on"
+    _update_inputs(emulator, command)
+    return f"node {command.node}: encoder {'against' if command.what == 'on' else 'with'} the motion"
+
+
+def _update_inputs(emulator: BusEmulator, command: BusCommand) -> None:
+    """Let the drive read its inputs immediately."""
+    slot = emulator.slot(command.node)
+    emulator.plant.observe(emulator.t_ns)
+    slot.node.advance(emulator.t_ns)
+    emulator.look(slot)
+
+
+def _block(emulator: BusEmulator, command: BusCommand) -> Answer:
+    axis = emulator.slot(command.node).node.axis
+    axis.blocked = True
+
+    def undo() -> None:
+        axis.blocked = False
+
+    return f"node {command.node}: blocked", undo
+
+
+def _free(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.slot(command.node).node.axis.blocked = False
+    return f"node {command.node}: free"
+
+
+def _nmt(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.wire.send(FOREIGN, CanFrame(0x000, bytes((command.number, command.node))))
+    return f"foreign NMT command {command.what} to {f'node {command.node}' if command.node else 'all nodes'}"
+
+
+def _flood(emulator: BusEmulator, command: BusCommand) -> Answer:
+    emulator.babble[command.node] = emulator.t_ns, round(1e9 / command.rate_hz)
+
+    def undo() -> None:
+        emulator.babble.pop(command.node, None)
+
+    return f"node {command.node}: babbles at {command.rate_hz:g} Hz", undo
+
+
+def _calm(emulator: BusEmulator, command: BusCommand) -> str:
+    emulator.babble.pop(command.node, None)
+    return f"node {command.node}: calm"
+
+
+def _status(emulator: BusEmulator, command: BusCommand) -> str:
+    return "\n".join(emulator.status())
+
+
+def _help(emulator: BusEmulator, command: BusCommand) -> str:
+    return "\n".join(LANGUAGE.help_lines())
+
+
+def frame_id(node_id: int, what: str) -> int:
+    """CAN id of a node's frame: by its name in the predefined connection set, or itself as ``0x…``."""
+    return int(what, 16) if what.startswith("0x") else COB_IDS[what] + node_id
+
+
+LANGUAGE = FaultLanguage(
+    BusCommand,
+    {
+        "fault": Verb(
+            "fault [node] N CODE", "drive N trips with an error code, e.g. `fault node 3 0x3210`", _fault,
+            (NODE, CODE), prepare=_without_node,
+        ),
+        "sticky": Verb(
+            "sticky N CODE|off", "the same, and the cause stays: it trips again after each reset", _sticky,
+            (NODE, CODE_OR_OFF), prepare=_without_node,
+        ),
+        "emcy": Verb(
+            "emcy N CODE", "an emergency frame of node N without a fault", _emcy,
+            (NODE, CODE), prepare=_without_node, check=_check_emergency,
+        ),
+        "silence": Verb("silence N", "node N hears but sends nothing", _silence, (NODE,), lasting=True),
+        "speak": Verb("speak N", "ends `silence`", _speak, (NODE,)),
+        "reboot": Verb("reboot N", "node N loses its power supply for a moment", _reboot, (NODE,)),
+        "lose": Verb(
+            "lose N FRAME|0xID [COUNT]", f"its next frames are lost; FRAME: {', '.join(COB_IDS)}", _lose,
+            (NODE, FRAME, COUNT),
+        ),
+        "late": Verb(
+            "late N TIME|0", "everything that node N sends comes later by so much, e.g. `late 2 6ms`", _late,
+            (NODE, DELAY), lasting=True,
+        ),
+        "duplicate": Verb(
+            "duplicate N [boots|running|off]", "a second drive numbered N: switched on now, or there already",
+            _duplicate, (NODE, choice_word(_named("boots", "running", "off"), "boots")),
+        ),
+        "remap": Verb("remap N", "somebody changes the mapping of node N's TPDO 1", _remap, (NODE,)),
+        "cable": Verb(
+            "cable [N] out|in", "the bus cable at the master, or at node N", _cable, parse=_cable_words, lasting=True
+        ),
+        "adapter": Verb(
+            "adapter out|in", "the adapter is unplugged: its connection closes", _adapter, (choice_word(IN_OR_OUT),),
+            lasting=True,
+        ),
+        "drop-sync": Verb("drop-sync", "the master's SYNC does not get through", _drop_sync, lasting=True),
+        "pass-sync": Verb("pass-sync", "ends `drop-sync`", _pass_sync),
+        "limit": Verb("limit N +|-|off", "the limit switch of that side", _limit, (NODE, SIDE)),
+        "nmt": Verb(
+            "nmt COMMAND [N]", f"an NMT command of a foreign master, to all or to N: {', '.join(NMT)}", _nmt,
+            (NMT_WORD, NODE_OR_ALL),
+        ),
+        "flood": Verb(
+            "flood N [HZ]", f"node N babbles ({FLOOD_HZ:g} Hz, id 0x17F)", _flood, (NODE, RATE), lasting=True
+        ),
+        "calm": Verb("calm N", "ends `flood`", _calm, (NODE,)),
+        "invert": Verb(
+            "invert N [on|off]", "the encoder of node N counts against the motion", _invert,
+            (NODE, choice_word(_named("on", "off"), "on")),
+        ),
+        "block": Verb("block N", "the joint of node N is in contact: it cannot move", _block, (NODE,), lasting=True),
+        "free": Verb("free N", "ends `block`", _free, (NODE,)),
+        "status": Verb("status", "the state of all drives", _status, logged=False),
+        "help": Verb("help", "this list", _help, logged=False),
+    },
+    example="silence 4",
+)  # fmt: skip
+"""The console language of ``emulate drives``."""

@@ -24,8 +24,7 @@ from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.emulators.nodes.node import EmulatedAxis, EmulatedNode
 from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, place_of
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
-from stereoservo_sim.world.mechanical_plant import MechanicalPlant
-from stereoservo_sim.world.mechanics import MechanicsOption, chosen_mechanics
+from stereoservo_sim.world.mechanics import MechanicalPlant, MechanicsOption, chosen_mechanics
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.velocity_drives import IdealPlant, Plant
 

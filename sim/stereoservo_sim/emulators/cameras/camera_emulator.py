@@ -6,15 +6,28 @@ Sans I/O: the same in virtual and in real time. ``take`` and ``order`` may be ca
 from __future__ import annotations
 
 import heapq
+import re
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import msgspec
 
 from stereoservo_sim.emulators.cameras.emulated_camera import EmulatedCamera, StreamPicture
-from stereoservo_sim.emulators.cameras.fault_commands import ALL, LANGUAGE, CameraCommand
-from stereoservo_sim.emulators.fault_engine import NEVER_NS, FaultCommandError, FaultEngine
+from stereoservo_sim.emulators.fault_engine import (
+    NEVER_NS,
+    Answer,
+    FaultCommand,
+    FaultCommandError,
+    FaultEngine,
+    FaultLanguage,
+    Undo,
+    Verb,
+    Word,
+    choice_word,
+    time_word,
+)
 
 EVENTS_KEPT = 10_000
 RETRY_NS = 1_000_000
@@ -174,3 +187,326 @@ class CameraEmulator:
     def hang_up(self, stream: str, *, within: bool = False) -> None:
         """Close the connections of a stream, at once or ``within`` the next image."""
         self.on_hang_up(stream, within)
+
+
+# -- fault commands ------------------------------------------------------------------------------------------
+# Fault commands of emulated cameras: the verbs, their arguments, and their effects.
+
+
+ALL = "all"
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_LENGTH = re.compile(r"(-?\d+(?:\.\d*)?)(mm|cm|m)")
+_ANGLE = re.compile(r"(-?\d+(?:\.\d*)?)deg")
+_SIZE = re.compile(r"(\d{1,4})x(\d{1,4})")
+LARGEST_SIZE = 4096
+
+
+class CameraCommand(FaultCommand, frozen=True):
+    """One fault command. ``camera``: its name, or ``all``. ``number``: a count, a share, a gain, an angle [deg], by
+    the verb; ``length_m``; ``size`` (width, height); ``what``: a second word.
+    """
+
+    camera: str = ""
+    number: float = 0.0
+    length_m: float = 0.0
+    time_ns: int = 0
+    size: tuple[int, int] = (0, 0)
+    what: str = ""
+
+
+# -- words ------------------------------------------------------------------------------------------------------------
+
+
+def _number_word(what: str, low: float, high: float, default: float | None = None) -> Word:
+    """Argument: a number, or a percentage, from ``low`` to ``high``."""
+
+    def read(text: str) -> dict[str, Any]:
+        try:
+            value = float(text.removesuffix("%")) * (0.01 if text.endswith("%") else 1.0)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise FaultCommandError(f"{what} {text!r}; {low:g} to {high:g} is valid")
+        return {"number": value}
+
+    return (
+        Word(read, f"the {what} is missing") if default is None else Word(read, default={"number": default})
+    )
+
+
+def _size(word: str) -> dict[str, Any]:
+    match = _SIZE.fullmatch(word)
+    if match is None or not all(1 <= int(part) <= LARGEST_SIZE for part in match.groups()):
+        raise FaultCommandError(SIZE_IS)
+    return {"size": (int(match[1]), int(match[2]))}
+
+
+def _check_whole(command: CameraCommand) -> None:
+    if command.number != int(command.number):
+        raise FaultCommandError(f"count '{command.number:g}'; a whole number is valid")
+
+
+def _check_two(command: CameraCommand) -> None:
+    if command.camera == command.what or ALL in (command.camera, command.what):
+        raise FaultCommandError("two different cameras are swapped")
+
+
+def _bump_words(words: list[str]) -> dict[str, Any]:
+    """Arguments: ``CAM back``, or an angle and a length in any order and the axis of the rotation."""
+    if not words:
+        raise FaultCommandError(str(CAMERA.missing))
+    fields = CAMERA.read(words[0])
+    rest = words[1:]
+    if rest == ["back"]:
+        return fields | {"what": "back"}
+    fields["what"] = "y"
+    if len(rest) >= 2 and rest[-2] == "about":
+        if rest[-1] not in ("x", "y", "z"):
+            raise FaultCommandError(f"axis {rest[-1]!r}; x, y or z is valid")
+        fields["what"], rest = rest[-1], rest[:-2]
+    for word in rest:
+        angle, length = _ANGLE.fullmatch(word), _LENGTH.fullmatch(word)
+        if angle is not None and abs(float(angle[1])) <= 180.0:
+            fields["number"] = float(angle[1])
+        elif length is not None and abs(float(length[1])) * _LENGTHS[length[2]] <= 10.0:
+            fields["length_m"] = float(length[1]) * _LENGTHS[length[2]]
+        else:
+            raise FaultCommandError(
+                f"{word!r}; an angle up to 180deg and a length up to 10m are valid, e.g. 5deg 3cm"
+            )
+    if fields.get("number", 0.0) == 0.0 and fields.get("length_m", 0.0) == 0.0:
+        raise FaultCommandError("the angle or the length is missing, e.g. 5deg 3cm")
+    return fields
+
+
+SIZE_IS = f"a size is WIDTHxHEIGHT, 1 to {LARGEST_SIZE} each, e.g. 320x240"
+CAMERA = Word(lambda word: {"camera": word}, "the camera's name is missing")
+SECOND_CAMERA = Word(lambda word: {"what": word}, "the camera's name is missing")
+TIME = time_word("time_ns", "the camera's name or the time is missing")
+COUNT = _number_word("count", 1, 1e6, 1.0)
+ON_OR_OFF = choice_word({"on": {"what": "on"}, "off": {"what": "off"}})
+
+
+# -- actions ----------------------------------------------------------------------------------------------------------
+
+CameraAction = Callable[["CameraEmulator", EmulatedCamera, CameraCommand], Answer]
+
+
+def _each(act: CameraAction) -> Callable[[CameraEmulator, CameraCommand], Answer]:
+    """Action on every camera that the command names, with its undo."""
+
+    def act_on_all(emulator: CameraEmulator, command: CameraCommand) -> Answer:
+        answers, undos = [], []
+        for camera in emulator.named(command.camera):
+            done = act(emulator, camera, command)
+            answer = done if isinstance(done, str) else done[0]
+            answers.append(f"{camera.name}: {answer}")
+            if not isinstance(done, str):
+                undos.append(done[1])
+
+        def undo() -> None:
+            for undo_one in undos:
+                undo_one()
+
+        return "\n".join(answers), undo
+
+    return act_on_all
+
+
+def _set(camera: EmulatedCamera, answer: str, **marks: object) -> tuple[str, Undo]:
+    """Action that sets fields of the camera's condition; the undo restores them."""
+    before = {name: getattr(camera.condition, name) for name in marks}
+
+    def undo() -> None:
+        for name, value in before.items():
+            setattr(camera.condition, name, value)
+
+    for name, value in marks.items():
+        setattr(camera.condition, name, value)
+    return answer, undo
+
+
+def _setter(answer: str, **marks: object) -> Callable[[CameraEmulator, CameraCommand], Answer]:
+    """Factory of actions that set fixed fields of the condition."""
+    return _each(lambda emulator, camera, command: _set(camera, answer, **marks))
+
+
+@_each
+def _stall(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.stalled.add(camera.stream)
+    return "stalls", lambda: emulator.stalled.discard(camera.stream)
+
+
+@_each
+def _disconnect(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.hang_up(camera.stream)
+    return "connections closed"
+
+
+@_each
+def _cut(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.hang_up(camera.stream, within=True)
+    return "connections end in the middle of the next picture"
+
+
+@_each
+def _refuse(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    emulator.refused.add(camera.stream)
+    emulator.hang_up(camera.stream)
+    return "connections refused", lambda: emulator.refused.discard(camera.stream)
+
+
+@_each
+def _latency(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"latency {command.time_ns * 1e-6:g} ms", latency_ns=command.time_ns)
+
+
+@_each
+def _jitter(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"jitter {command.time_ns * 1e-6:g} ms", jitter_ns=command.time_ns)
+
+
+@_each
+def _skew(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    before = camera.view.phase_s
+    camera.view.change(phase_s=command.time_ns * 1e-9)
+    return f"skew {command.time_ns * 1e-6:g} ms", lambda: camera.view.change(phase_s=before)
+
+
+@_each
+def _loss(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    before = camera.view.drop_rate
+    camera.view.change(drop_rate=command.number)
+    return f"loses {command.number:.0%} of its pictures", lambda: camera.view.change(drop_rate=before)
+
+
+@_each
+def _exposure(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"exposure {command.number:g}", gain=command.number)
+
+
+@_each
+def _lamp(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"lamp {command.what}", lamp=command.what == "on")
+
+
+@_each
+def _resize(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"{command.size[0]}x{command.size[1]}", size=command.size)
+
+
+def _swap(emulator: CameraEmulator, command: CameraCommand) -> Answer:
+    first, second = emulator.named(command.camera)[0], emulator.named(command.what)[0]
+    emulator.swap(first, second)
+    return f"{first.name} and {second.name}: swapped", lambda: emulator.swap(first, second)
+
+
+@_each
+def _truncate(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"{command.number:g} JPEGs end in the middle", truncate=int(command.number))
+
+
+@_each
+def _corrupt(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    return _set(camera, f"{command.number:g} JPEGs spoilt", corrupt=int(command.number))
+
+
+@_each
+def _bump(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    if command.what == "back":
+        camera.put_back()
+        return "where it stood at first"
+    try:
+        camera.bump(command.number, command.length_m, "xyz".index(command.what))
+    except ValueError as error:
+        raise FaultCommandError(str(error)) from error
+    return f"turned by {command.number:g} deg about {command.what}, shifted by {command.length_m * 1e3:g} mm"
+
+
+@_each
+def _clear(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
+    camera.clear()
+    for marks in (emulator.stalled, emulator.refused):
+        marks.discard(camera.stream)
+    emulator.unswap(camera)
+    return "as the cell file has it"
+
+
+def _status(emulator: CameraEmulator, command: CameraCommand) -> str:
+    return "\n".join(emulator.status())
+
+
+def _help(emulator: CameraEmulator, command: CameraCommand) -> str:
+    return "\n".join(LANGUAGE.help_lines())
+
+
+LANGUAGE = FaultLanguage(
+    CameraCommand,
+    {
+        "freeze": Verb(
+            "freeze CAM", "the same picture comes again and again, with new numbers and stamps",
+            _setter("frozen", frozen=True), (CAMERA,), lasting=True,
+        ),
+        "drop": Verb(
+            "drop CAM", "its pictures are lost; the connection stands",
+            _setter("its pictures are lost", gone=True), (CAMERA,), lasting=True,
+        ),
+        "stall": Verb(
+            "stall CAM", "the stream stops in the middle of a picture; the connection stands", _stall, (CAMERA,),
+            lasting=True,
+        ),
+        "disconnect": Verb("disconnect CAM", "its connections are closed; they may come again", _disconnect, (CAMERA,)),
+        "cut": Verb("cut CAM", "the same, in the middle of a picture", _cut, (CAMERA,)),
+        "refuse": Verb(
+            "refuse CAM", "its connections are closed and new ones turned away (503)", _refuse, (CAMERA,), lasting=True
+        ),
+        "latency": Verb(
+            "latency CAM TIME", "from shutter to sending, e.g. `latency left 80ms`", _latency, (CAMERA, TIME),
+            lasting=True,
+        ),
+        "jitter": Verb("jitter CAM TIME", "sent up to so much sooner or later", _jitter, (CAMERA, TIME), lasting=True),
+        "skew": Verb(
+            "skew CAM TIME", "its shutters open so much after those of a camera without skew", _skew, (CAMERA, TIME),
+            lasting=True,
+        ),
+        "loss": Verb(
+            "loss CAM SHARE", "chance that a picture is lost, e.g. `loss left 10%`", _loss,
+            (CAMERA, _number_word("share", 0.0, 1.0)), lasting=True,
+        ),
+        "exposure": Verb(
+            "exposure CAM FACTOR", "so many times as long, e.g. `exposure left 0.5`", _exposure,
+            (CAMERA, _number_word("factor", 0.0, 100.0)), lasting=True,
+        ),
+        "lamp": Verb(
+            "lamp on|off", "a lamp beside the upper left corners of all pictures", _lamp, (ON_OR_OFF,),
+            fixed={"camera": ALL}, lasting=True,
+        ),
+        "black": Verb("black CAM", "the lens cap is on", _setter("black", look="black"), (CAMERA,), lasting=True),
+        "white": Verb("white CAM", "dazzled", _setter("white", look="white"), (CAMERA,), lasting=True),
+        "flip": Verb("flip CAM", "mounted upside down", _setter("flip", look="flip"), (CAMERA,), lasting=True),
+        "mirror": Verb("mirror CAM", "left for right", _setter("mirror", look="mirror"), (CAMERA,), lasting=True),
+        "size": Verb(
+            "size CAM WIDTHxHEIGHT", "pictures of another size, e.g. `size left 320x240`", _resize,
+            (CAMERA, Word(_size, SIZE_IS)), lasting=True,
+        ),
+        "swap": Verb(
+            "swap CAM CAM", "their cables are exchanged", _swap, (CAMERA, SECOND_CAMERA), check=_check_two, lasting=True
+        ),
+        "truncate": Verb(
+            "truncate CAM [COUNT]", "its next JPEGs end in the middle", _truncate, (CAMERA, COUNT), check=_check_whole
+        ),
+        "corrupt": Verb(
+            "corrupt CAM [COUNT]", "bytes of its next JPEGs are flipped", _corrupt, (CAMERA, COUNT), check=_check_whole
+        ),
+        "bump": Verb(
+            "bump CAM 5deg 3cm [about x|y|z]", "turned about its own axis (y), shifted along its x; `bump CAM back`",
+            _bump, parse=_bump_words,
+        ),
+        "clear": Verb("clear CAM", "takes back everything but `bump`", _clear, (CAMERA,)),
+        "status": Verb("status", "the state of all cameras", _status, logged=False),
+        "help": Verb("help", "this list", _help, logged=False),
+    },
+    example="freeze left",
+    note="; CAM may be all",
+)  # fmt: skip
+"""The console language of ``emulate cameras``."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,8 @@ from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import ImageArray
 from stereoservo.ports.devices import Clock, DriverContext, Frame
 from stereoservo_drivers.pybullet import PybulletCameraDriver
-from stereoservo_sim.emulators.cameras import effects
 from stereoservo_sim.emulators.cameras.stream_settings import CamerasSettings, StreamSettings
+from stereoservo_sim.emulators.fault_engine import EmulationError
 from stereoservo_sim.world.workpiece import Moved
 
 
@@ -161,20 +162,20 @@ class EmulatedCamera:
 
     def _developed(self, frame: Frame) -> bytes:
         if not (self.condition.frozen and self._last):
-            self._last = effects.jpeg(self._disturbed(frame.image), self.quality)
+            self._last = jpeg(self._disturbed(frame.image), self.quality)
         return self._last
 
     def _disturbed(self, image: ImageArray) -> ImageArray:
         condition = self.condition
         if condition.lamp:
             if self._light is None:
-                self._light = effects.lamp_light(*image.shape)
-            image = effects.lit(image, self._light)
-        image = effects.exposed(image, condition.gain)
+                self._light = lamp_light(*image.shape)
+            image = lit(image, self._light)
+        image = exposed(image, condition.gain)
         if condition.look in ("black", "white"):
-            image = effects.even(image, 0 if condition.look == "black" else 255)
-        image = effects.turned(image, condition.look)
-        return image if condition.size is None else effects.resized(image, condition.size)
+            image = even(image, 0 if condition.look == "black" else 255)
+        image = turned(image, condition.look)
+        return image if condition.size is None else resized(image, condition.size)
 
     def _sending_ns(self, frame: Frame, rng: np.random.Generator) -> int:
         """Sending time, which keeps the images in order whatever the jitter."""
@@ -187,10 +188,10 @@ class EmulatedCamera:
         condition = self.condition
         if condition.truncate > 0:
             condition.truncate -= 1
-            return effects.cut(data)
+            return cut(data)
         if condition.corrupt > 0:
             condition.corrupt -= 1
-            return effects.corrupted(data, rng)
+            return corrupted(data, rng)
         return data
 
     def bump(self, turn_deg: float, shift_m: float, axis: int) -> None:
@@ -212,3 +213,74 @@ class EmulatedCamera:
         """Restore the cell file's settings, except the camera's pose."""
         self.condition = self._fresh(self._stream)
         self.view.change(phase_s=self._stream.skew_ms * 1e-3, drop_rate=self._stream.drop_rate)
+
+
+# -- effects -------------------------------------------------------------------------------------------------
+# Image faults: exposure, light, orientation, size, and damaged JPEG data.
+
+
+LAMP_LEVEL = 110.0
+LAMP_REACH = 0.45
+"""Sigma of the lamp's light, in image widths, about the upper left corner."""
+CUT_SHARE = 0.5
+FLIPPED_BYTES = 40
+HEADER = 700
+"""[bytes] Of a JPEG its tables come first; flipped bytes behind them leave a picture that decodes, wrongly."""
+
+
+def exposed(image: ImageArray, gain: float) -> ImageArray:
+    """``image`` (h, w) with exposure ``gain``, clipped at white."""
+    if gain == 1.0:
+        return image
+    return np.asarray(cv2.convertScaleAbs(image, alpha=gain), dtype=np.uint8)
+
+
+def lamp_light(height: int, width: int, level: float = LAMP_LEVEL) -> npt.NDArray[np.float32]:
+    """Light (h, w) [grey levels] of a lamp beyond the upper left corner."""
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32) / (LAMP_REACH * width)
+    return np.asarray(level * np.exp(-0.5 * (u * u + v * v)), dtype=np.float32)
+
+
+def lit(image: ImageArray, light: npt.NDArray[np.float32]) -> ImageArray:
+    """``image`` (h, w) with ``light`` (h, w) added, clipped at white."""
+    return np.asarray(cv2.add(image, light, dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def turned(image: ImageArray, how: str) -> ImageArray:
+    """``flip``: the image upside down; ``mirror``: left and right exchanged; else unchanged."""
+    if how == "flip":
+        return np.ascontiguousarray(image[::-1, ::-1])
+    if how == "mirror":
+        return np.ascontiguousarray(image[:, ::-1])
+    return image
+
+
+def even(image: ImageArray, level: int) -> ImageArray:
+    """Uniform image of the same size, of grey ``level``."""
+    return np.full_like(image, level)
+
+
+def resized(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    """``image`` resampled to ``size`` (width, height)."""
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def jpeg(image: ImageArray, quality: int) -> bytes:
+    """Encode ``image`` (h, w) as a JPEG. Raises EmulationError."""
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise EmulationError(f"an image of {image.shape} cannot be written as JPEG")
+    return bytes(data)
+
+
+def cut(data: bytes) -> bytes:
+    """First half of a JPEG's data."""
+    return data[: int(len(data) * CUT_SHARE)]
+
+
+def corrupted(data: bytes, rng: np.random.Generator) -> bytes:
+    """A JPEG with some of its bytes inverted, behind its tables."""
+    spoilt = bytearray(data)
+    for at in rng.integers(min(HEADER, len(data) - 1), len(data), FLIPPED_BYTES).tolist():
+        spoilt[at] ^= 0xFF
+    return bytes(spoilt)

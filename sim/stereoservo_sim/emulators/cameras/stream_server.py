@@ -5,16 +5,26 @@ thread.
 from __future__ import annotations
 
 import contextlib
+import gc
+import html
 import os
 import selectors
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
-from stereoservo_sim.emulators.cameras import http_pages
+import cv2
+
+from stereoservo.messages.cell_file import CellFile
+from stereoservo.messages.directories import cell_directories
+from stereoservo.ports.clock import MonotonicClock
 from stereoservo_sim.emulators.cameras.camera_emulator import NEVER_NS, CameraEmulator, CameraEvent
-from stereoservo_sim.emulators.cameras.emulated_camera import StreamPicture
+from stereoservo_sim.emulators.cameras.emulated_camera import EmulatedCamera, StreamPicture
+from stereoservo_sim.emulators.cameras.stream_settings import CamerasSettings, cameras_of_cell, port_of
+from stereoservo_sim.emulators.console import Console, Printer
 from stereoservo_sim.emulators.fault_engine import EmulationError
 
 SEND_BUFFER = 1 << 17
@@ -235,23 +245,23 @@ class CameraServer:
             return True  # what comes after the request is of no interest
         client.asked += data
         try:
-            request = http_pages.parse_request(bytes(client.asked))
+            request = parse_request(bytes(client.asked))
             if request is not None:
                 self._answer(client, request)
-        except http_pages.BadRequestError as error:
+        except BadRequestError as error:
             self._refuse(client, error.status, str(error))
         return True
 
-    def _answer(self, client: _Client, request: http_pages.HttpRequest) -> None:
+    def _answer(self, client: _Client, request: HttpRequest) -> None:
         """Respond to a request. Raises BadRequestError."""
         streams = list(self.streams.values())
-        stream = next((s for s in streams if request.path in (s, http_pages.still_path(s))), None)
+        stream = next((s for s in streams if request.path in (s, still_path(s))), None)
         if stream is None and request.path != "/":
-            raise http_pages.BadRequestError("404 Not Found", f"no {request.path[:80]} here")
+            raise BadRequestError("404 Not Found", f"no {request.path[:80]} here")
         if stream in self.emulator.refused:
-            raise http_pages.BadRequestError("503 Service Unavailable", f"{request.path} is refused by order")
+            raise BadRequestError("503 Service Unavailable", f"{request.path} is refused by order")
         if stream is None or request.head:
-            page = http_pages.index(self._cell, streams)
+            page = index(self._cell, streams)
             self._say(client, page if not request.head else page.partition(b"\r\n\r\n")[0] + b"\r\n\r\n")
             return
         client.stream, client.once = stream, request.path != stream
@@ -259,13 +269,13 @@ class CameraServer:
         if client.once:
             self._newest.pop(stream, None)  # one from now on, not the last that somebody looked at
         else:
-            client.waiting = memoryview(http_pages.stream_head())
+            client.waiting = memoryview(stream_head())
         self._say_event("connected", stream)
         self._wanted()
 
     def _refuse(self, client: _Client, status: str, message: str) -> None:
-        error = http_pages.BadRequestError(status, message)
-        self._say(client, http_pages.failure(error, list(self.streams.values())))
+        error = BadRequestError(status, message)
+        self._say(client, failure(error, list(self.streams.values())))
 
     def _say(self, client: _Client, data: bytes) -> None:
         """Send a response, then close."""
@@ -300,7 +310,7 @@ class CameraServer:
         if picture is None or picture.seq == client.seq:
             return
         client.seq = picture.seq
-        data = http_pages.still(picture) if client.once else http_pages.part(picture)
+        data = still(picture) if client.once else part(picture)
         client.hold = len(data) // 2
         if client.cut:
             data = data[: len(data) // 2]
@@ -334,3 +344,173 @@ class CameraServer:
             if stream not in self.emulator.wanted:
                 del self._newest[stream]
         self._look.set()
+
+
+# -- pages ---------------------------------------------------------------------------------------------------
+# HTTP requests and responses of the server of emulated cameras.
+
+
+BOUNDARY = "picture"
+REQUEST_LIMIT = 8192
+
+
+class BadRequestError(Exception):
+    """An invalid request, or one of an unknown resource."""
+
+    def __init__(self, status: str, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@dataclass(frozen=True)
+class HttpRequest:
+    """A parsed request; ``head``: without the content."""
+
+    path: str
+    head: bool = False
+
+
+def parse_request(data: bytes) -> HttpRequest | None:
+    """The request at the start of ``data``; None while it is incomplete. Raises BadRequestError."""
+    if b"\r\n\r\n" not in data and b"\n\n" not in data:
+        if len(data) > REQUEST_LIMIT:
+            raise BadRequestError("431 Request Header Fields Too Large", f"more than {REQUEST_LIMIT} bytes")
+        return None
+    line = data.splitlines()[0].decode("latin-1") if data.strip() else ""
+    words = line.split()
+    if len(words) != 3 or not words[2].startswith("HTTP/"):
+        raise BadRequestError("400 Bad Request", f"{line[:80]!r} is no request")
+    if words[0] not in ("GET", "HEAD"):
+        raise BadRequestError(
+            "405 Method Not Allowed", f"{words[0][:20]} is not understood; GET and HEAD are"
+        )
+    return HttpRequest(words[1].partition("?")[0], words[0] == "HEAD")
+
+
+def answer(status: str, kind: str, body: bytes, *, head: bool = False) -> bytes:
+    """A complete response."""
+    lines = (
+        f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n"
+        "Cache-Control: no-store\r\nConnection: close\r\n\r\n"
+    )
+    return lines.encode() + (b"" if head else body)
+
+
+def failure(error: BadRequestError, streams: Sequence[str]) -> bytes:
+    """Error response, which lists the streams."""
+    text = f"{error}\nstreams: {', '.join(streams)}\n"
+    return answer(error.status, "text/plain; charset=utf-8", text.encode())
+
+
+def still(picture: StreamPicture) -> bytes:
+    """Response with one image, ``/NAME.jpg``."""
+    return answer("200 OK", "image/jpeg", picture.data)
+
+
+def stream_head() -> bytes:
+    """Head of a stream's response, and its first boundary."""
+    return (
+        "HTTP/1.1 200 OK\r\n"
+        f"Content-Type: multipart/x-mixed-replace; boundary={BOUNDARY}\r\n"
+        "Cache-Control: no-store\r\nConnection: close\r\n\r\n"
+        f"--{BOUNDARY}\r\n"
+    ).encode()
+
+
+def part(picture: StreamPicture) -> bytes:
+    """One image of a stream, which ends with the next boundary, so that nobody waits for it."""
+    head = (
+        f"Content-Type: image/jpeg\r\nContent-Length: {len(picture.data)}\r\nX-Sequence: {picture.seq}\r\n"
+        f"X-Timestamp: {picture.t_shutter_ns // 10**9}.{picture.t_shutter_ns % 10**9:09d}\r\n\r\n"
+    )
+    return head.encode() + picture.data + f"\r\n--{BOUNDARY}\r\n".encode()
+
+
+def index(cell: str, streams: Sequence[str]) -> bytes:
+    """HTML index page of the streams."""
+    title = f"Emulated cameras of {html.escape(cell)}"
+    figures = "".join(
+        f'<figure><img src="{html.escape(s)}" alt="{html.escape(s)}"><figcaption><a href="{html.escape(s)}">'
+        f'{html.escape(s)}</a> <a href="{html.escape(still_path(s))}">one picture</a></figcaption></figure>'
+        for s in streams
+    )
+    style = "body{font-family:sans-serif}figure{display:inline-block;margin:.5em}img{max-width:45vw}"
+    page = (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>{style}</style>"
+        f"<h1>{title}</h1>{figures}"
+    )
+    return answer("200 OK", "text/html; charset=utf-8", page.encode())
+
+
+def still_path(stream: str) -> str:
+    """Path of the single image of a stream."""
+    return f"{stream.removesuffix('.mjpg')}.jpg"
+
+
+# -- served, with a console ----------------------------------------------------------------------------------
+# Lifetime of a cell's emulated cameras, as run by ``stereoservo emulate cameras``.
+
+
+PRIORITY = 3
+"""SCHED_FIFO where it is allowed: real cameras take no processor; below the servo process and emulated drives."""
+
+
+def make_camera_emulator(
+    cell: CellFile, settings: CamerasSettings, runtime_dir: Path, cell_dir: Path = Path()
+) -> CameraEmulator:
+    """The cameras of ``settings``, mounted as those of the cell are, before its arm; ``cell_dir``: of the cell file.
+
+    Raises DriverError.
+    """
+    clock = MonotonicClock()
+    cameras = [
+        EmulatedCamera(
+            stream,
+            settings,
+            clock=clock,
+            mount=cell.camera[0].mount,
+            runtime_dir=runtime_dir,
+            cell_dir=cell_dir,
+            arm=cell.arm_options,
+        )
+        for stream in settings.camera
+    ]
+    return CameraEmulator(cameras, time.monotonic_ns())
+
+
+def serve_cameras(
+    cell: CellFile,
+    cell_dir: Path,
+    *,
+    channel: str | None,
+    orders: Sequence[str],
+    as_json: bool,
+    ended: Callable[[], bool],
+) -> None:
+    """Serve until ``ended``; ``cell_dir``: of the cell file. Raises EmulationError, DriverError, FaultCommandError."""
+    settings = cameras_of_cell(cell)
+    port = settings.port if channel is None else port_of(channel)
+    cv2.setNumThreads(1)  # on small images they only wait for each other
+    emulator = make_camera_emulator(cell, settings, cell_directories(cell.cell.name).runtime, cell_dir)
+    for text in orders:
+        emulator.order(text, emulator.start_ns)
+    server = CameraServer(emulator, cell=cell.cell.name, port=port, connections=settings.connections)
+    emulator.open()
+    printer = Printer(as_json)
+    console = Console(server, printer)
+    console.attach()
+    with contextlib.suppress(OSError):  # not allowed: then without
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    gc.freeze()  # what was imported is not looked through again
+    printer.say(
+        "ready", f"listening on {server.url}: {', '.join(server.streams.values())}", channel=server.url,
+        streams={name: server.url + path for name, path in server.streams.items()}, t_ns=emulator.start_ns,
+        pid=os.getpid(),
+    )  # fmt: skip
+    try:
+        server.run(ended)
+    finally:
+        printer.say(
+            "end", server.words(), pictures=server.pictures, withheld=server.withheld, late_ns=server.late_ns
+        )
+        printer.end()

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import struct
+from collections import deque
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.options import CanJoint
-from stereoservo_sim.emulators.nodes.dictionary import Dictionary
-from stereoservo_sim.emulators.nodes.drive_motion import FOLLOWING_ERROR, DriveMotion
-from stereoservo_sim.emulators.nodes.drive_objects import DriveObjects
-from stereoservo_sim.emulators.nodes.emergency import Emergencies
-from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
-from stereoservo_sim.emulators.nodes.pdo import DEADLINE, ProcessData
-from stereoservo_sim.emulators.nodes.sdo_server import SdoServer
-from stereoservo_sim.emulators.nodes.state_machine import Cia402State, PowerMachine
-from stereoservo_sim.emulators.nodes.supervision import (
-    HeartbeatConsumer,
-    HeartbeatProducer,
-    LifeGuard,
-    SyncWatch,
+from stereoservo_sim.emulators.nodes.communication import DEADLINE, ProcessData, SdoServer
+from stereoservo_sim.emulators.nodes.dictionary import Abort, Dictionary, SdoError, Value
+from stereoservo_sim.emulators.nodes.drive_motion import (
+    CYCLIC_VELOCITY,
+    FOLLOWING_ERROR,
+    PROFILE_POSITION,
+    PROFILE_VELOCITY,
+    Cia402State,
+    DriveMotion,
+    PowerMachine,
 )
+from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 
 COMMUNICATION, HEARTBEAT_LOST, SYNC_LOST, PASSIVE = 0x8100, 0x8130, 0x8700, 0x8120
@@ -373,3 +374,363 @@ class Cia402Node:
         words = [self.nmt.name.lower().replace("_", "-"), str(self.machine.state)]
         words += [f"error 0x{code:04X}" for code in self.emergencies.active]
         return ", ".join(words)
+
+
+# -- objects -------------------------------------------------------------------------------------------------
+# Objects of an emulated CiA 402 drive, bound to its motion: measured values, commands, refusals, stored parameters.
+
+
+MODES = (PROFILE_POSITION, PROFILE_VELOCITY, CYCLIC_VELOCITY)
+SUPPORTED_MODES = sum(1 << mode - 1 for mode in MODES)
+SAVE, LOAD = 0x65766173, 0x64616F6C
+"""Signatures of 0x1010 and 0x1011: "save", "load"."""
+OPTION_CODES = {
+    0x6007: range(4), 0x605A: range(9), 0x605B: range(2), 0x605C: range(2), 0x605D: range(1, 5), 0x605E: range(5),
+}  # fmt: skip
+"""What this drive offers of each."""
+
+
+class DriveObjects:
+    """Binds a dictionary to the drive; keeps what 0x1010 has saved."""
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        machine: PowerMachine,
+        motion: DriveMotion,
+        identity: dict[int, int],
+        settings: NodeSettings,
+    ) -> None:
+        self._dictionary = dictionary
+        self._identity = identity
+        self._settings = settings
+        self._stored: dict[tuple[int, int], Value] = {}
+        for index, value in (
+            (0x6041, motion.status),
+            (0x6064, motion.position),
+            (0x606B, motion.velocity_demand),
+            (0x606C, motion.velocity),
+            (0x6077, motion.torque),
+            (0x6078, motion.torque),
+            (0x60F4, motion.following_error),
+            (0x60FD, motion.digital_inputs),
+        ):
+            dictionary.live(index, 0, value)
+        dictionary.changed(0x6040, lambda sub, value: (machine.control(value), motion.take_set_point()))
+        dictionary.guard(0x6060, self._check_mode)
+        dictionary.changed(0x6060, lambda sub, value: dictionary.set(0x6061, 0, value))
+        for index in OPTION_CODES:
+            dictionary.guard(index, partial(self._check_option, index))
+        dictionary.guard(0x1005, self._check_sync)
+        dictionary.guard(0x1010, lambda sub, value: self._check_signature(sub, value, SAVE))
+        dictionary.changed(0x1010, lambda sub, value: self._save())
+        dictionary.guard(0x1011, lambda sub, value: self._check_signature(sub, value, LOAD))
+        dictionary.changed(0x1011, lambda sub, value: self._forget())
+
+    @staticmethod
+    def _check_mode(sub: int, value: int) -> None:
+        if value not in (0, *MODES):
+            raise SdoError(Abort.INVALID_VALUE)
+
+    @staticmethod
+    def _check_option(index: int, sub: int, value: int) -> None:
+        if value not in OPTION_CODES[index]:
+            raise SdoError(Abort.INVALID_VALUE)
+
+    @staticmethod
+    def _check_sync(sub: int, value: int) -> None:
+        if value >> 11:
+            raise SdoError(Abort.INVALID_VALUE)  # it does not produce SYNC, and knows 11 bits only
+
+    @staticmethod
+    def _check_signature(sub: int, value: int, signature: int) -> None:
+        if not sub or value != signature:
+            raise SdoError(Abort.NOT_STORABLE)
+
+    def _save(self) -> None:
+        self._dictionary.set(0x1010, 1, 1)
+        self._stored = self._dictionary.storable()
+
+    def _forget(self) -> None:
+        self._dictionary.set(0x1011, 1, 1)
+        self._stored = {}
+
+    def power_on(self) -> None:
+        """Set all objects to their values at power on."""
+        self._dictionary.restore(0x0000, 0xFFFF, self._stored)
+        self._dictionary.set(0x6502, 0, SUPPORTED_MODES)
+        self._dictionary.set(0x6061, 0, self._dictionary.get(0x6060))
+        self._fix()
+
+    def reset_communication(self) -> None:
+        """Set the communication profile's objects to their values at power on; errors and their history stay."""
+        keys = [key for key in self._dictionary.entries if key[0] in (0x1001, 0x1003)]
+        errors = {key: self._dictionary.get(*key) for key in keys}
+        self._dictionary.restore(0x1000, 0x1FFF, self._stored)
+        for key, value in errors.items():
+            self._dictionary.set(*key, value)
+        self._fix()
+
+    def _fix(self) -> None:
+        for sub, value in self._identity.items():
+            self._dictionary.set(0x1018, sub, value)
+        if not self._settings.pdos_by_default:
+            for index in (*range(0x1400, 0x1404), *range(0x1800, 0x1804)):
+                self._dictionary.set(index, 1, self._dictionary.get(index, 1) | 1 << 31)
+
+
+# -- emergencies ---------------------------------------------------------------------------------------------
+# Emergency producer of an emulated node: active errors, error register, history (CiA 301, 7.2.7).
+
+
+REGISTER, HISTORY, COB_ID, INHIBIT = 0x1001, 0x1003, 0x1014, 0x1015
+_QUEUED = 32
+
+
+def register_bits(code: int) -> int:
+    """Error register (0x1001) of an error code: generic, and the class given by the code's first digits."""
+    top = code >> 12
+    bits = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0xF: 0x80}.get(top, 0)
+    if top == 0x8:
+        bits = 0x10 if code >> 8 in (0x80, 0x81, 0x82) else 0x20
+    return 0x01 | bits
+
+
+class Emergencies:
+    """Errors of one node. ``active``: codes whose cause is present or that a fault reset has not cleared."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self.active: list[int] = []
+        self._queue: deque[bytes] = deque(maxlen=_QUEUED)
+        self._free_ns = 0
+        self._depth = max((sub for index, sub in dictionary.entries if index == HISTORY), default=0)
+        dictionary.guard(HISTORY, self._check_clearing)
+        dictionary.changed(HISTORY, lambda sub, value: self._forget())
+        dictionary.reading(HISTORY, self._check_reading)
+
+    def power_on(self) -> None:
+        """Clear all errors."""
+        self.active.clear()
+        self._queue.clear()
+        self._free_ns = 0
+
+    def _check_clearing(self, sub: int, value: int) -> None:
+        if value:
+            raise SdoError(Abort.INVALID_VALUE)
+
+    def _check_reading(self, sub: int) -> None:
+        if sub > self._dictionary.get(HISTORY, 0):
+            raise SdoError(Abort.NO_DATA)
+
+    def _forget(self) -> None:
+        for sub in range(1, self._depth + 1):
+            self._dictionary.set(HISTORY, sub, 0)
+
+    def occurred(self, code: int) -> None:
+        """Add an error: register, history, and a frame."""
+        if code not in self.active:
+            self.active.append(code)
+        count = self._dictionary.get(HISTORY, 0)
+        for sub in range(min(count + 1, self._depth), 1, -1):
+            self._dictionary.set(HISTORY, sub, self._dictionary.get(HISTORY, sub - 1))
+        self._dictionary.set(HISTORY, 1, code)
+        self._dictionary.set(HISTORY, 0, min(count + 1, self._depth))
+        self._tell(code)
+
+    def gone(self, codes: list[int]) -> None:
+        """Remove errors: one frame with code 0 and the remaining register."""
+        left = [code for code in self.active if code not in codes]
+        if len(left) != len(self.active):
+            self.active[:] = left
+            self._tell(0)
+
+    def _tell(self, code: int) -> None:
+        register = 0
+        for active in self.active:
+            register |= register_bits(active)
+        self._dictionary.set(REGISTER, 0, register)
+        self._queue.append(struct.pack("<HB5x", code & 0xFFFF, register))
+
+    def frames(self, t_ns: int) -> list[CanFrame]:
+        """Frames to send now; the inhibit time (0x1015) delays the others."""
+        cob_id = self._dictionary.get(COB_ID, 0, 1 << 31)
+        if cob_id & 1 << 31:
+            self._queue.clear()
+            return []
+        inhibit_ns = self._dictionary.get(INHIBIT) * 100_000
+        frames = []
+        while self._queue and t_ns >= self._free_ns:
+            frames.append(CanFrame(id=cob_id & 0x7FF, data=self._queue.popleft()))
+            self._free_ns = t_ns + inhibit_ns
+        return frames
+
+    def due_ns(self) -> int:
+        """Time at which a delayed frame may be sent."""
+        return self._free_ns if self._queue else NEVER_NS
+
+
+# -- supervision ---------------------------------------------------------------------------------------------
+# Monitoring by an emulated node: heartbeats of others and the SYNC period; its own heartbeat (CiA 301).
+
+
+CONSUMER, PRODUCER, SYNC_ID, SYNC_PERIOD = 0x1016, 0x1017, 0x1005, 0x1006
+GUARD_TIME, LIFE_FACTOR = 0x100C, 0x100D
+TOGGLE = 0x80
+
+
+class HeartbeatConsumer:
+    """Monitors the nodes of 0x1016, each from its first heartbeat on, also after a loss (7.2.8.2.2)."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._subs = [sub for index, sub in dictionary.entries if index == CONSUMER and sub]
+        self._deadlines: dict[int, int] = {}
+        dictionary.guard(CONSUMER, self._check)
+        dictionary.changed(CONSUMER, lambda sub, value: self.reset())
+
+    def _check(self, sub: int, value: int) -> None:
+        node, time = value >> 16, value & 0xFFFF
+        if node > 0x7F:
+            raise SdoError(Abort.INVALID_VALUE)
+        if node and time and any(s != sub and self._entry(s)[0] == node for s in self._subs):
+            raise SdoError(Abort.INCOMPATIBLE)
+
+    def _entry(self, sub: int) -> tuple[int, int]:
+        value = self._dictionary.get(CONSUMER, sub)
+        node, time = value >> 16, value & 0xFFFF
+        return (node, time) if node and time else (0, 0)
+
+    def reset(self) -> None:
+        """Wait for first heartbeats again."""
+        self._deadlines.clear()
+
+    def heard(self, node: int, t_ns: int) -> bool:
+        """Process a heartbeat; returns whether its node is monitored."""
+        for sub in self._subs:
+            watched, time = self._entry(sub)
+            if watched == node:
+                self._deadlines[node] = t_ns + time * 1_000_000
+                return True
+        return False
+
+    def lost(self, t_ns: int) -> list[int]:
+        """Nodes whose heartbeat is overdue, each reported once."""
+        nodes = [node for node, deadline in self._deadlines.items() if t_ns >= deadline]
+        for node in nodes:
+            del self._deadlines[node]
+        return nodes
+
+    def due_ns(self) -> int:
+        """Time at which the next heartbeat is overdue."""
+        return min(self._deadlines.values(), default=NEVER_NS)
+
+
+class LifeGuard:
+    """Node guarding (CiA 301, 7.2.8.2.1): answers remote frames, and monitors that they come within 0x100C times 0x100D
+    from the first one on. A node that produces heartbeats does not.
+    """
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._toggle = 0
+        self._deadline_ns = NEVER_NS
+        for index in (GUARD_TIME, LIFE_FACTOR):
+            dictionary.changed(index, lambda sub, value: self.reset())
+
+    def reset(self) -> None:
+        """Wait for a first remote frame again."""
+        self._toggle = 0
+        self._deadline_ns = NEVER_NS
+
+    def asked(self, state: int, t_ns: int) -> bytes | None:
+        """Answer to a remote frame: the NMT state with a toggling bit; None where heartbeats are produced."""
+        if self._dictionary.get(PRODUCER):
+            return None
+        life_ms = self._dictionary.get(GUARD_TIME) * self._dictionary.get(LIFE_FACTOR)
+        self._deadline_ns = t_ns + life_ms * 1_000_000 if life_ms else NEVER_NS
+        answer = bytes([state | self._toggle])
+        self._toggle ^= TOGGLE
+        return answer
+
+    def lost(self, t_ns: int) -> bool:
+        """Whether the next remote frame is overdue; reported once."""
+        if t_ns < self._deadline_ns:
+            return False
+        self._deadline_ns = NEVER_NS
+        return True
+
+    def due_ns(self) -> int:
+        """Time at which the next remote frame is overdue."""
+        return self._deadline_ns
+
+
+class HeartbeatProducer:
+    """Produces heartbeats with the period 0x1017 [ms]; 0: none."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._next_ns = NEVER_NS
+        self.now_ns = 0
+        dictionary.changed(PRODUCER, lambda sub, value: self.restart(self.now_ns))
+
+    def restart(self, t_ns: int) -> None:
+        """Restart; the first heartbeat is due after one period."""
+        period = self._dictionary.get(PRODUCER)
+        self._next_ns = t_ns + period * 1_000_000 if period else NEVER_NS
+
+    def silence(self) -> None:
+        """Stop until ``restart``."""
+        self._next_ns = NEVER_NS
+
+    def tick(self, t_ns: int) -> bool:
+        """Whether a heartbeat is to be sent now; missed ones are not sent later."""
+        if t_ns < self._next_ns:
+            return False
+        period_ns = self._dictionary.get(PRODUCER) * 1_000_000
+        self._next_ns += (1 + (t_ns - self._next_ns) // period_ns) * period_ns
+        return True
+
+    def due_ns(self) -> int:
+        """Time of the next heartbeat."""
+        return self._next_ns
+
+
+class SyncWatch:
+    """Monitors SYNC with the period 0x1006 [us]: a loss is reported once after ``factor`` periods, from the first
+    SYNC on.
+
+    ``can_id``: of SYNC, from 0x1005.
+    """
+
+    def __init__(self, dictionary: Dictionary, factor: float) -> None:
+        self._dictionary = dictionary
+        self._factor = factor
+        self._deadline_ns = NEVER_NS
+        self.reset()
+        dictionary.changed(SYNC_PERIOD, lambda sub, value: self.reset())
+        dictionary.changed(SYNC_ID, lambda sub, value: self._listen())
+
+    def _listen(self) -> None:
+        self.can_id = self._dictionary.get(SYNC_ID, 0, 0x80) & 0x7FF
+
+    def reset(self) -> None:
+        """Wait for a first SYNC again."""
+        self._listen()
+        self._deadline_ns = NEVER_NS
+
+    def heard(self, t_ns: int) -> None:
+        """Process a SYNC."""
+        period_ns = self._dictionary.get(SYNC_PERIOD) * 1000
+        self._deadline_ns = t_ns + round(self._factor * period_ns) if period_ns else NEVER_NS
+
+    def lost(self, t_ns: int) -> bool:
+        """Whether SYNC is overdue."""
+        if t_ns < self._deadline_ns:
+            return False
+        self._deadline_ns = NEVER_NS
+        return True
+
+    def due_ns(self) -> int:
+        """Time at which SYNC is overdue."""
+        return self._deadline_ns

@@ -2,8 +2,8 @@
 
 import pytest
 
-from stereoservo_sim.emulators.bus.fault_commands import LANGUAGE
-from stereoservo_sim.emulators.bus.fault_commands import BusCommand as Command
+from stereoservo_sim.emulators.bus.bus_emulator import LANGUAGE
+from stereoservo_sim.emulators.bus.bus_emulator import BusCommand as Command
 from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
 GOOD = {

@@ -13,8 +13,15 @@ import pytest
 
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
-from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint, served_channel
-from stereoservo_sim.emulators.bus.endpoints import EndpointError, PythonCanEndpoint, SlcanPty, SlcanTcp
+from stereoservo_sim.emulators.bus.bus_server import (
+    BusServer,
+    EndpointError,
+    PythonCanEndpoint,
+    SlcanPty,
+    SlcanTcp,
+    open_endpoint,
+    served_channel,
+)
 from stereoservo_sim.emulators.bus.plant import AxisPlant
 from stereoservo_sim.emulators.fault_engine import FaultCommandError
 from stereoservo_sim.world.velocity_drives import IdealPlant

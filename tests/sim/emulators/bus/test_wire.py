@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_sim.emulators.bus.can_wire import MASTER, QUEUE_LIMIT, Wire, arbitration_key
+from stereoservo_sim.emulators.bus.bus_emulator import MASTER, QUEUE_LIMIT, Wire, arbitration_key
 from stereoservo_sim.emulators.nodes.node import NEVER_NS
 
 standard = st.builds(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from stereoservo_sim.emulators.cameras.fault_commands import LANGUAGE
-from stereoservo_sim.emulators.cameras.fault_commands import CameraCommand as Command
+from stereoservo_sim.emulators.cameras.camera_emulator import LANGUAGE
+from stereoservo_sim.emulators.cameras.camera_emulator import CameraCommand as Command
 from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
 MS = 1_000_000

@@ -18,8 +18,7 @@ import pytest
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo_sim.emulators.cameras.camera_emulator import CameraEmulator
 from stereoservo_sim.emulators.cameras.emulated_camera import EmulatedCamera
-from stereoservo_sim.emulators.cameras.http_pages import REQUEST_LIMIT
-from stereoservo_sim.emulators.cameras.stream_server import CameraServer
+from stereoservo_sim.emulators.cameras.stream_server import REQUEST_LIMIT, CameraServer
 from stereoservo_sim.emulators.cameras.stream_settings import CamerasSettings, StreamSettings
 from stereoservo_sim.emulators.fault_engine import EmulationError
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from stereoservo_sim.emulators.nodes.state_machine import STATUS, Cia402State, PowerMachine
+from stereoservo_sim.emulators.nodes.drive_motion import STATUS, Cia402State, PowerMachine
 
 S = Cia402State
 COMMANDS = {  # control word: mask, value

@@ -16,7 +16,6 @@ import msgspec
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.bringup import Link, until
 from stereoservo_drivers.canopen.cia402 import (
     EMCY_ID,
     HEARTBEAT_ID,
@@ -49,7 +48,7 @@ from stereoservo_drivers.canopen.cia402_words import (
     error_words,
     nmt_words,
 )
-from stereoservo_drivers.canopen.codec import AxisFault
+from stereoservo_drivers.canopen.codec import AxisFault, Link, until
 from stereoservo_drivers.canopen.option_checks import syncs_of_gripper
 from stereoservo_drivers.canopen.options import CanGripper, CanOptions
 from stereoservo_drivers.canopen.units import wrap_int32

@@ -1,0 +1,475 @@
+"""What an emulated node exchanges: process data by four RPDOs and four TPDOs with their parameters (CiA 301, 7.2.2,
+7.5.2.35), service data by its SDO server.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+
+from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_sim.emulators.nodes.dictionary import DUMMY_BITS, LONGEST_STRING, Abort, Dictionary, SdoError
+from stereoservo_sim.emulators.nodes.node import NEVER_NS
+
+TOO_SHORT, TOO_LONG, DEADLINE = 0x8210, 0x8220, 0x8250
+"""Emergency codes: PDO not processed, length exceeded, RPDO time-out (CiA 301, table 26)."""
+
+Report = Callable[[int, bool], None]
+"""(emergency code, whether the error is there or gone)."""
+
+
+@dataclass
+class _Rpdo:
+    can_id: int | None
+    kind: int
+    timeout_ns: int
+    objects: tuple[Mapped, ...]
+    length: int
+    pending: bytes | None = None
+    deadline_ns: int = NEVER_NS
+
+
+@dataclass
+class _Tpdo:
+    can_id: int | None
+    remote: bool
+    kind: int
+    inhibit_ns: int
+    event_ns: int
+    start: int
+    objects: tuple[Mapped, ...]
+    syncs: int = 0
+    sent: bytes | None = None
+    free_ns: int = 0
+    event_due_ns: int = NEVER_NS
+    wanted: bool = False
+
+
+class ProcessData:
+    """PDOs of one node. ``operational`` is set by the node; PDOs are received and sent only then."""
+
+    def __init__(self, dictionary: Dictionary, report: Report) -> None:
+        self._dictionary = dictionary
+        self._report = report
+        self.operational = False
+        self._errors: set[int] = set()
+        for k in range(COUNT):
+            for index in (RPDO_COMMUNICATION + k, TPDO_COMMUNICATION + k):
+                dictionary.guard(index, partial(check_communication, dictionary, index))
+            for index in (RPDO_MAPPING + k, TPDO_MAPPING + k):
+                dictionary.guard(index, partial(check_mapping, dictionary, index))
+            for index in (RPDO_COMMUNICATION + k, RPDO_MAPPING + k):
+                dictionary.changed(index, partial(self._rpdo_changed, k))
+            for index in (TPDO_COMMUNICATION + k, TPDO_MAPPING + k):
+                dictionary.changed(index, partial(self._tpdo_changed, k))
+        self.reload()
+
+    def _rpdo_changed(self, k: int, sub: int, value: int) -> None:
+        self._rpdos[k] = self._rpdo(k)
+        self._index()
+
+    def _tpdo_changed(self, k: int, sub: int, value: int) -> None:
+        self._tpdos[k] = self._tpdo(k)
+        self._index()
+
+    def _index(self) -> None:
+        self._received = {p.can_id for p in self._rpdos if p.can_id is not None}
+        self._requested = {p.can_id for p in self._tpdos if p.can_id is not None and p.remote}
+        self._synchronous = [p for p in self._tpdos if p.can_id is not None and p.kind <= LAST_SYNCHRONOUS]
+        self._event_driven = [p for p in self._tpdos if p.can_id is not None and p.kind in EVENT_TYPES]
+
+    def reload(self) -> None:
+        """Read all parameters from the dictionary; counts and deadlines restart."""
+        self._rpdos = [self._rpdo(k) for k in range(COUNT)]
+        self._tpdos = [self._tpdo(k) for k in range(COUNT)]
+        self._index()
+
+    def _rpdo(self, k: int) -> _Rpdo:
+        index, get = RPDO_COMMUNICATION + k, self._dictionary.get
+        cob_id = get(index, 1, INVALID)
+        objects = mapped(self._dictionary, RPDO_MAPPING + k)
+        used = not cob_id & INVALID and bool(objects)
+        return _Rpdo(
+            can_id=cob_id & 0x7FF if used else None,
+            kind=get(index, 2),
+            timeout_ns=get(index, 5) * 1_000_000,
+            objects=objects,
+            length=sum(o.size for o in objects),
+        )
+
+    def _tpdo(self, k: int) -> _Tpdo:
+        index, get = TPDO_COMMUNICATION + k, self._dictionary.get
+        cob_id = get(index, 1, INVALID)
+        objects = mapped(self._dictionary, TPDO_MAPPING + k)
+        used = not cob_id & INVALID and bool(objects)
+        return _Tpdo(
+            can_id=cob_id & 0x7FF if used else None,
+            remote=not cob_id & NO_REMOTE,
+            kind=get(index, 2),
+            inhibit_ns=get(index, 3) * 100_000,
+            event_ns=get(index, 5) * 1_000_000,
+            start=get(index, 6),
+            objects=objects,
+        )
+
+    def enter_operational(self, operational: bool) -> None:
+        """Enter the NMT state operational: event-driven TPDOs are sent once, deadlines begin with the first RPDO."""
+        if operational == self.operational:
+            return
+        self.operational = operational
+        self.reload()
+        for tpdo in self._tpdos:
+            tpdo.wanted = operational and tpdo.kind in EVENT_TYPES
+        if not operational:
+            for code in tuple(self._errors):
+                self._error(code, there=False)
+
+    def _error(self, code: int, *, there: bool) -> None:
+        if there and code not in self._errors:
+            self._errors.add(code)
+            self._report(code, True)
+        elif not there and code in self._errors:
+            self._errors.remove(code)
+            self._report(code, False)
+
+    def listens(self, frame: CanFrame) -> bool:
+        """Whether the frame is one of these PDOs."""
+        if not self.operational:
+            return False
+        return frame.id in (self._requested if frame.remote else self._received)
+
+    def receive(self, frame: CanFrame, t_ns: int) -> list[CanFrame]:
+        """Process an RPDO, or a remote request of a TPDO; returns the frames to send at once."""
+        if frame.remote:
+            asked = [p for p in self._tpdos if p.can_id == frame.id and p.remote]
+            return [self._transmit(p, t_ns) for p in asked]
+        for rpdo in self._rpdos:
+            if rpdo.can_id == frame.id:
+                self._take(rpdo, frame.data, t_ns)
+        return []
+
+    def _take(self, rpdo: _Rpdo, data: bytes, t_ns: int) -> None:
+        self._error(TOO_SHORT, there=len(data) < rpdo.length)
+        self._error(TOO_LONG, there=len(data) > rpdo.length)
+        if len(data) < rpdo.length:
+            return
+        self._error(DEADLINE, there=False)
+        rpdo.deadline_ns = t_ns + rpdo.timeout_ns if rpdo.timeout_ns else NEVER_NS
+        if rpdo.kind <= LAST_SYNCHRONOUS:
+            rpdo.pending = data
+        else:
+            self._apply(rpdo, data)
+
+    def _apply(self, rpdo: _Rpdo, data: bytes) -> None:
+        at = 0
+        for o in rpdo.objects:
+            if not o.dummy:
+                with suppress(SdoError):  # nobody to tell: the object keeps its value, as in real drives
+                    self._dictionary.store(o.index, o.sub, data[at : at + o.size])
+            at += o.size
+
+    def waits_for_sync(self) -> bool:
+        """Whether a received RPDO takes effect at the next SYNC."""
+        return any(rpdo.pending is not None for rpdo in self._rpdos)
+
+    def sync(self, counter: int | None, t_ns: int) -> list[CanFrame]:
+        """Process SYNC: synchronous TPDOs with current values, then synchronous RPDOs take effect."""
+        if not self.operational:
+            return []
+        frames = [self._transmit(p, t_ns) for p in self._synchronous if self._due_at_sync(p, counter)]
+        for rpdo in self._rpdos:
+            if rpdo.pending is not None:
+                data, rpdo.pending = rpdo.pending, None
+                self._apply(rpdo, data)
+        return frames
+
+    def _due_at_sync(self, tpdo: _Tpdo, counter: int | None) -> bool:
+        if tpdo.kind == 0:
+            return self._content(tpdo) != tpdo.sent
+        if tpdo.start and counter is not None and tpdo.sent is None and tpdo.syncs == 0:
+            if counter != tpdo.start:
+                return False
+            tpdo.syncs = tpdo.kind - 1
+        tpdo.syncs += 1
+        if tpdo.syncs < tpdo.kind:
+            return False
+        tpdo.syncs = 0
+        return True
+
+    def _content(self, tpdo: _Tpdo) -> bytes:
+        return b"".join([self._dictionary.encoded(o.index, o.sub) for o in tpdo.objects])
+
+    def _transmit(self, tpdo: _Tpdo, t_ns: int) -> CanFrame:
+        tpdo.sent = self._content(tpdo)
+        tpdo.wanted = False
+        tpdo.free_ns = t_ns + tpdo.inhibit_ns
+        if tpdo.kind in EVENT_TYPES and tpdo.event_ns:
+            tpdo.event_due_ns = t_ns + tpdo.event_ns
+        assert tpdo.can_id is not None
+        return CanFrame(id=tpdo.can_id, data=tpdo.sent)
+
+    def check_deadlines(self, t_ns: int) -> None:
+        """Report RPDOs that missed their deadline."""
+        if not self.operational:
+            return
+        for rpdo in self._rpdos:
+            if t_ns >= rpdo.deadline_ns:
+                rpdo.deadline_ns = NEVER_NS
+                self._error(DEADLINE, there=True)
+
+    def events(self, t_ns: int) -> list[CanFrame]:
+        """Event-driven TPDOs whose content has changed or whose timer has expired, subject to the inhibit time."""
+        if not self.operational:
+            return []
+        frames = []
+        for tpdo in self._event_driven:
+            if tpdo.wanted or t_ns >= tpdo.event_due_ns or self._content(tpdo) != tpdo.sent:
+                tpdo.wanted = True
+                if t_ns >= tpdo.free_ns:
+                    frames.append(self._transmit(tpdo, t_ns))
+        return frames
+
+    def due_ns(self) -> int:
+        """Time at which ``check_deadlines`` or ``events`` is next needed."""
+        if not self.operational:
+            return NEVER_NS
+        due = min([rpdo.deadline_ns for rpdo in self._rpdos])
+        for tpdo in self._event_driven:
+            due = min(due, tpdo.free_ns if tpdo.wanted else tpdo.event_due_ns)
+        return due
+
+
+# -- rules ---------------------------------------------------------------------------------------------------
+# Rules for changes of PDO parameters by SDO (CiA 301, 7.5.2.35 to 7.5.2.38), and their decoding.
+
+
+INVALID = 1 << 31
+NO_REMOTE = 1 << 30
+EXTENDED = 1 << 29
+COUNT = 4
+"""PDOs of each direction."""
+RPDO_COMMUNICATION, RPDO_MAPPING = 0x1400, 0x1600
+TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
+LONGEST_BITS = 64
+EVENT_TYPES = (254, 255)
+LAST_SYNCHRONOUS = 240
+
+_RESTRICTED = (
+    (0x000, 0x07F), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x6FF), (0x701, 0x7FF),
+)  # fmt: skip
+"""CAN ids that no PDO may have (CiA 301, table 40)."""
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """One object in a PDO; ``dummy``: a gap."""
+
+    index: int
+    sub: int
+    size: int
+    dummy: bool = False
+
+
+def mapped(dictionary: Dictionary, index: int) -> tuple[Mapped, ...]:
+    """Objects listed in the mapping object ``index``."""
+    objects = []
+    for k in range(1, dictionary.get(index, 0) + 1):
+        word = dictionary.get(index, k)
+        which = word >> 16
+        objects.append(Mapped(which, word >> 8 & 0xFF, (word & 0xFF) // 8, which in DUMMY_BITS))
+    return tuple(objects)
+
+
+def check_communication(dictionary: Dictionary, index: int, sub: int, value: int) -> None:
+    """Check a write to 0x1400 or 0x1800 onwards. Raises SdoError."""
+    before = dictionary.get(index, 1)
+    exists = not before & INVALID
+    transmit = index >= TPDO_COMMUNICATION
+    if sub == 1:
+        _check_cob_id(dictionary, index, before, value)
+    elif sub == 2:
+        if LAST_SYNCHRONOUS < value < EVENT_TYPES[0]:
+            raise SdoError(Abort.INVALID_VALUE)  # reserved; remote requests are not offered
+    elif exists and transmit and sub in (3, 6):
+        raise SdoError(Abort.DEVICE_STATE)  # inhibit time and SYNC start value: not while the PDO exists
+
+
+def _check_cob_id(dictionary: Dictionary, index: int, before: int, value: int) -> None:
+    if value & EXTENDED or value & 0x1FFF_F800:
+        raise SdoError(Abort.INVALID_VALUE)
+    if value & INVALID:
+        return
+    can_id = value & 0x7FF
+    if any(low <= can_id <= high for low, high in _RESTRICTED):
+        raise SdoError(Abort.INVALID_VALUE)
+    if not before & INVALID and can_id != before & 0x7FF:
+        raise SdoError(Abort.DEVICE_STATE)
+
+
+def check_mapping(dictionary: Dictionary, index: int, sub: int, value: int) -> None:
+    """Check a write to 0x1600 or 0x1A00 onwards: PDO switched off, count 0, objects, count. Raises SdoError."""
+    transmit = index >= TPDO_MAPPING
+    if not dictionary.get(index - 0x200, 1) & INVALID:
+        raise SdoError(Abort.DEVICE_STATE)
+    if sub:
+        if dictionary.get(index, 0):
+            raise SdoError(Abort.DEVICE_STATE)
+        if value:
+            _check_object(dictionary, value, transmit=transmit)
+        return
+    bits = 0
+    for k in range(1, value + 1):
+        word = dictionary.get(index, k)
+        if not word:
+            raise SdoError(Abort.NOT_MAPPABLE)
+        bits += word & 0xFF
+    if bits > LONGEST_BITS:
+        raise SdoError(Abort.MAPPING_TOO_LONG)
+
+
+def _check_object(dictionary: Dictionary, word: int, *, transmit: bool) -> None:
+    index, sub, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
+    if index in DUMMY_BITS:
+        if transmit or sub or bits != DUMMY_BITS[index]:
+            raise SdoError(Abort.NOT_MAPPABLE)
+        return
+    entry = dictionary.find(index, sub)
+    if not (entry.transmittable if transmit else entry.receivable) or bits != 8 * entry.size:
+        raise SdoError(Abort.NOT_MAPPABLE)
+
+
+# -- the SDO server ------------------------------------------------------------------------------------------
+# SDO server of an emulated node: expedited and segmented transfers (CiA 301, 7.2.4.3). Block transfer is refused.
+
+
+TIMEOUT_NS = 1_000_000_000
+_TOGGLE = 0x10
+
+
+@dataclass
+class _Transfer:
+    """A segmented transfer in progress. ``size`` announced by the client of a download, 0 where it was not."""
+
+    index: int
+    sub: int
+    upload: bool
+    size: int = 0
+    data: bytearray = field(default_factory=bytearray)
+    toggle: int = 0
+    deadline_ns: int = 0
+
+
+class SdoServer:
+    """One server channel: a request's 8 bytes in, a reply's 8 bytes or None out."""
+
+    def __init__(self, dictionary: Dictionary, *, timeout_ns: int = TIMEOUT_NS) -> None:
+        self._dictionary = dictionary
+        self._timeout_ns = timeout_ns
+        self._transfer: _Transfer | None = None
+        self._last = (0, 0)
+
+    def reset(self) -> None:
+        """Abandon a transfer in progress."""
+        self._transfer = None
+
+    def due_ns(self) -> int:
+        """Time at which an incomplete transfer times out."""
+        return NEVER_NS if self._transfer is None else self._transfer.deadline_ns
+
+    def advance(self, t_ns: int) -> bytes | None:
+        """Abort frame of a transfer that has timed out."""
+        if t_ns < self.due_ns():
+            return None
+        return self._abort(Abort.TIMED_OUT)
+
+    def request(self, data: bytes, t_ns: int) -> bytes | None:
+        """Reply to a client's frame; None to an abort and to a frame that is no SDO request."""
+        if len(data) != 8:
+            return None
+        command = data[0] >> 5
+        if command in (1, 2):
+            self._transfer = None
+            self._last = struct.unpack_from("<HB", data, 1)
+        if command == 4:
+            self._transfer = None
+            return None
+        try:
+            if command == 0:
+                return self._download_segment(data, t_ns)
+            if command == 1:
+                return self._download(data, t_ns)
+            if command == 2:
+                return self._upload(t_ns)
+            if command == 3:
+                return self._upload_segment(data, t_ns)
+            if command in (5, 6):
+                self._last = struct.unpack_from("<HB", data, 1)
+            raise SdoError(Abort.COMMAND)
+        except SdoError as refused:
+            return self._abort(refused.code)
+
+    def _abort(self, code: Abort) -> bytes:
+        self._transfer = None
+        return struct.pack("<BHBL", 0x80, *self._last, code)
+
+    def _download(self, data: bytes, t_ns: int) -> bytes:
+        index, sub = self._last
+        entry = self._dictionary.writable(index, sub)
+        if data[0] & 0x02:
+            size = 4 - (data[0] >> 2 & 3) if data[0] & 0x01 else min(entry.size or 4, 4)
+            self._dictionary.download(index, sub, data[4 : 4 + size])
+        else:
+            size = int.from_bytes(data[4:8], "little") if data[0] & 0x01 else 0
+            if size and entry.size and size != entry.size:
+                raise SdoError(Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
+            if size > LONGEST_STRING:
+                raise SdoError(Abort.OUT_OF_MEMORY)
+            self._begin(_Transfer(index, sub, upload=False, size=size), t_ns)
+        return struct.pack("<BHBL", 0x60, index, sub, 0)
+
+    def _upload(self, t_ns: int) -> bytes:
+        index, sub = self._last
+        value = self._dictionary.upload(index, sub)
+        if 1 <= len(value) <= 4:
+            return struct.pack("<BHB4s", 0x43 | (4 - len(value)) << 2, index, sub, value)
+        self._begin(_Transfer(index, sub, upload=True, data=bytearray(value)), t_ns)
+        return struct.pack("<BHBL", 0x41, index, sub, len(value))
+
+    def _begin(self, transfer: _Transfer, t_ns: int) -> None:
+        transfer.deadline_ns = t_ns + self._timeout_ns
+        self._transfer = transfer
+
+    def _going_on(self, data: bytes, t_ns: int, *, upload: bool) -> _Transfer:
+        transfer = self._transfer
+        if transfer is None or transfer.upload != upload:
+            raise SdoError(Abort.COMMAND)
+        if data[0] & _TOGGLE != transfer.toggle:
+            raise SdoError(Abort.TOGGLE)
+        transfer.toggle ^= _TOGGLE
+        transfer.deadline_ns = t_ns + self._timeout_ns
+        return transfer
+
+    def _download_segment(self, data: bytes, t_ns: int) -> bytes:
+        transfer = self._going_on(data, t_ns, upload=False)
+        transfer.data += data[1 : 8 - (data[0] >> 1 & 7)]
+        most = transfer.size or LONGEST_STRING
+        if len(transfer.data) > most:
+            raise SdoError(Abort.TOO_LONG if transfer.size else Abort.OUT_OF_MEMORY)
+        if data[0] & 0x01:
+            if transfer.size and len(transfer.data) < transfer.size:
+                raise SdoError(Abort.TOO_SHORT)
+            self._dictionary.download(transfer.index, transfer.sub, bytes(transfer.data))
+            self._transfer = None
+        return bytes([0x20 | data[0] & _TOGGLE]) + bytes(7)
+
+    def _upload_segment(self, data: bytes, t_ns: int) -> bytes:
+        transfer = self._going_on(data, t_ns, upload=True)
+        segment = bytes(transfer.data[:7])
+        del transfer.data[:7]
+        last = not transfer.data
+        if last:
+            self._transfer = None
+        return bytes([data[0] & _TOGGLE | (7 - len(segment)) << 1 | last]) + segment.ljust(7, b"\0")
