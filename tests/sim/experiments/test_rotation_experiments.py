@@ -233,7 +233,7 @@ def test_the_table_is_shown_beside_the_thesis():
 
     from rich.console import Console
 
-    answer = run_pan_tilt(seeds=1, seed=1, progress=silent)
+    answer = EXPERIMENTS["pan-tilt"].run(1, {"seeds": 1}, silent)
     console = Console(file=io.StringIO(), width=160)
     EXPERIMENTS["pan-tilt"].show(answer, console)
     shown = console.file.getvalue()
