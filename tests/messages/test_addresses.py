@@ -10,7 +10,7 @@ from urllib.parse import quote, unquote
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from stereoservo.messages.addresses import Address, AddressError, without_secrets
@@ -39,6 +39,7 @@ def every_text_of(address: Address) -> list[str]:
 
 
 @given(passwords, st.sampled_from(("http", "https", "rtsp")), st.sampled_from(HOSTS), st.booleans())
+@example("#@", "http", "127.0.0.1:9", False)
 def test_no_password_is_shown_and_none_goes_elsewhere(password, scheme, host, named):
     """A password between two marks, raw, as people write it: the marks are never shown, nor what is between them; read,
     it is the whole password for that host, or it is refused.

@@ -668,3 +668,8 @@ MONITORS: tuple[Monitor, ...] = (
     Monitor("model", _monitor_model, lambda state: state.readiness is ModelReadiness.SUSPECT),
     Monitor("relocalization", _monitor_relocalization, lambda state: state.reanchoring is not None),
 )
+
+
+def monitors_attend(state: CoreState) -> bool:
+    """Whether a monitor is to be called in every step, as the ``state`` is."""
+    return any(entry.attends(state) for entry in MONITORS)

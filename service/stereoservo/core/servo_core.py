@@ -44,7 +44,7 @@ from stereoservo.core.ingest import (
     put_inputs,
 )
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.monitor import MONITORS, NOISE, QUIET, detect, looks_apart, monitor
+from stereoservo.core.monitor import NOISE, QUIET, detect, looks_apart, monitor, monitors_attend
 from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import MOTION_SOURCES, arrange_motion, move, paused
 from stereoservo.core.report import finish_step, priors_of, status_of
@@ -302,7 +302,7 @@ def attends(context: StepContext) -> bool:
     """
     state, source = context.state, context.state.source
     return (
-        any(entry.attends(state) for entry in MONITORS)
+        monitors_attend(state)
         or any(state.mobile)
         or bool(state.queue or state.waiting or state.queued_until_ns)
         or state.planning is not None

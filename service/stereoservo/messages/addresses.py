@@ -144,7 +144,12 @@ def _read(text: str) -> _Reading:
             ":" not in rest.rpartition("@")[0] or _NO_USER.fullmatch(found["host"]) or "." in found["host"]
         )
         return _Reading(scheme, None, rest, "" if certain else _BEHIND)
-    if tail.count("@") > 1 or ("@" in authority and not tail.startswith("#")):
+    within = tail.rpartition("@")[0]
+    if tail.startswith("#"):
+        unclear = "@" in within and any(mark in within for mark in "/?")
+    else:
+        unclear = "@" in within or "@" in authority
+    if unclear:
         return _Reading(scheme, None, rest, _BEHIND)
     before, _, behind = rest.rpartition("@")
     return _Reading(scheme, before, behind, "")
