@@ -174,7 +174,9 @@ def estimate_joint_zeros(
             other = float(apart @ best.information @ apart) > AMBIGUOUS
             if other and one.chi2 - best.chi2 < AMBIGUOUS * noise:
                 return None  # two postures that the pictures do not tell apart
-        found = estimate_changes(problem, named, start=_without_turns(model, best.x))
+        found = best
+    if (np.abs(found.x - _without_turns(model, found.x)) > np.pi).any():
+        found = estimate_changes(problem, named, start=_without_turns(model, found.x))
     kept = _best_subset(found, float(_thresholds(problem, hypotheses).ratios[1]))
     return estimate_changes(problem, tuple(named[k] for k in kept), start=found.x[kept]) if kept else None
 
