@@ -1,5 +1,5 @@
-"""The numbers that the stages remember from one step to the next, as one flat record of fixed size, the same
-for cells of any size: compiled kernels take it as one argument, of one type.
+"""The numbers that the stages remember from one step to the next, as one flat record of fixed size, the same for cells
+of any size: compiled kernels take it as one argument, of one type.
 
 The record is large enough for the largest cell. An array of ``(rows, n)`` values is packed at the start of its field:
 a kernel accesses it as ``record.field[: rows * n].reshape((rows, n))``, and Python as an attribute of `Block`, a view
@@ -154,8 +154,7 @@ def packed_type(
     parts: Mapping[str, type[ctypes.Structure]],
 ) -> np.dtype[Any]:  # fmt: skip
     """The type of a record of ``numbers`` and of the ``arrays`` in the size of the largest cell, of float64 or the
-    types in ``others``,
-    and of the ``parts`` of each camera.
+    types in ``others``, and of the ``parts`` of each camera.
     """
     fields: list[Any] = [(name, np.dtype(kind)) for name, kind, *_ in numbers._fields_]
     fields += [(name, np.dtype(kind), (MAX_CAMERAS,)) for name, kind in parts.items()]
@@ -186,38 +185,32 @@ BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, {part: kind for part, (kind, _
 class Block:
     """The remembered numbers; ``record`` (1,) of type `BLOCK` holds all of it, and is what kernels take.
 
-    Joints: recent samples ``history_positions`` (k, n) at ``history_ns`` (k,), a ring buffer with
-    ``history_count`` entries ever written; ``velocities``, the last ``command`` and the ``correction`` that explains
-    the
-    innovations best (n,). Stamps of the last step and sample, and of the last sample processed by following-error
-    monitoring,
+    Joints: recent samples ``history_positions`` (k, n) at ``history_ns`` (k,), a ring buffer with ``history_count``
+    entries ever written; ``velocities``, the last ``command`` and the ``correction`` that explains the innovations best
+    (n,). Stamps of the last step and sample, and of the last sample processed by following-error monitoring,
     ``last_followed_ns``.
 
     Following: ``missing_travel`` (n,), recent commanded minus measured travel [rad or m], and ``untold_travel``,
     commanded since the last sample; ``last_positions`` (n,), valid if travel is ``followed``. While ``silence_known``:
     readings ``silent_from`` (n,) when each last changed, ``silent_travel`` commanded since, with its sign, less the
-    travel that
-    friction may hold back, and its duration ``silent_s``. ``delay_…``: the arrays of `monitor_state.DriveDelays`,
-    after ``delay_steps`` steps.
+    travel that friction may hold back, and its duration ``silent_s``. ``delay_…``: the arrays of
+    `monitor_state.DriveDelays`, after ``delay_steps`` steps.
 
-    Friction, while a goal is active (see `core.move`): ``friction`` (n,) [rad/s or m/s], the velocity that is
-    added for it; ``friction_from`` (n,): readings from which travel is compared; ``friction_sent`` (n,): commanded
-    since [rad or m], in the time ``friction_s`` (n,). ``run``: progress of the active law.
+    Friction, while a goal is active (see `core.move`): ``friction`` (n,) [rad/s or m/s], the velocity that is added for
+    it; ``friction_from`` (n,): readings from which travel is compared; ``friction_sent`` (n,): commanded since [rad or
+    m], in the time ``friction_s`` (n,). ``run``: progress of the active law.
 
     Loads (see `core.monitors.collision`): ``mean_efforts`` (n,), moving mean; ``effort_excess``, ``following_excess``
-    (samples, n), newest last: excess of the last samples over the expected value; ``contact_low``, ``contact_high``
-    (2, n), of efforts and following errors: the range of loads during a collision, which they may leave again within
-    the next
-    ``leave_s`` of motion. ``efforts``, ``following_errors`` (n,) of the sample at ``loads_ns``, if it contains
+    (samples, n), newest last: excess of the last samples over the expected value; ``contact_low``, ``contact_high`` (2,
+    n), of efforts and following errors: the range of loads during a collision, which they may leave again within the
+    next ``leave_s`` of motion. ``efforts``, ``following_errors`` (n,) of the sample at ``loads_ns``, if it contains
     them.
 
     Cameras: ``round_due``: one camera has delivered two frames since the last round, so the round does not wait for the
-    others. ``estimates``
-    and ``sightings``: one record a camera; a row of each of the arrays ``innovation`` (c, m, 2), ``sigma`` (c, m),
-    ``seen_ns`` (c, m), and
-    ``frame_…`` (c, k, …) of the newest frames belongs to it. Sums over the frames in which the error of
-    the active law was inside its tolerance (see `core.sources.progress`): of their innovations,
-    ``settled_innovation`` (c, m, 2), and variances, ``settled_variance`` (c, m) [px²], their number,
+    others. ``estimates`` and ``sightings``: one record a camera; a row of each of the arrays ``innovation`` (c, m, 2),
+    ``sigma`` (c, m), ``seen_ns`` (c, m), and ``frame_…`` (c, k, …) of the newest frames belongs to it. Sums over the
+    frames in which the error of the active law was inside its tolerance (see `core.sources.progress`): of their
+    innovations, ``settled_innovation`` (c, m, 2), and variances, ``settled_variance`` (c, m) [px²], their number,
     ``settled_count`` (c, m), and the stamp of each camera's last one, ``settled_ns`` (c,).
     """
 
@@ -336,8 +329,7 @@ class Block:
 
 def restored(kept: Mapping[str, Any]) -> Block:
     """The block from the values ``kept`` written by `Block.kept`; values that are missing are initial ones. Raises
-    ValueError or
-    TypeError if ``kept`` is invalid.
+    ValueError or TypeError if ``kept`` is invalid.
     """
     counts = {"rows": 0, **{name: kept.get(name) for name in MOST if name != "rows" or name in kept}}
     if not all(isinstance(count, int) for count in counts.values()):

@@ -1,5 +1,5 @@
-"""State of each camera from step to step: its estimate and its newest frame. Both are numbers and arrays
-in the block (`core.block`), where kernels access them by the number of the camera.
+"""State of each camera from step to step: its estimate and its newest frame. Both are numbers and arrays in the block
+(`core.block`), where kernels access them by the number of the camera.
 """
 
 from __future__ import annotations
@@ -79,8 +79,7 @@ class CameraMonitor(Kept):
     points.
 
     ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2): covariance from detector and timing, ``seen`` (k,) 1 or 0,
-    ``velocity`` (k, 2)
-    [px/s].
+    ``velocity`` (k, 2) [px/s].
     ``q`` (n,): joints.
     ``timing``: timing sums from moving markers.
     ``fresh``: the frame arrived in this step.

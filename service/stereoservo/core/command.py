@@ -1,11 +1,9 @@
 """Stage 6: computes the command from the motion source's velocity, in one kernel: friction compensation, look-ahead for
-late drives, and
-the safety stage, which is the last one.
+late drives, and the safety stage, which is the last one.
 
-The friction of each joint is estimated from small commands and the resulting travel: an integral action for a
-joint that does not move, and none for one that follows. Play and sag cause no wind-up, since the encoder of a motor
-that turns
-through its play does move; for encoders on the output side of the play see `friction_bounds`.
+The friction of each joint is estimated from small commands and the resulting travel: an integral action for a joint
+that does not move, and none for one that follows. Play and sag cause no wind-up, since the encoder of a motor that
+turns through its play does move; for encoders on the output side of the play see `friction_bounds`.
 
 The safety stage limits joint velocities in this order: finite check, stale-input policy (coast on prediction, then
 brake), uniform velocity scale, braking-aware position margins and joint-space keep-outs, uniform acceleration limit. It

@@ -1,11 +1,9 @@
 """Data that the stages of one core step share: the workspace of the kernels, and, for Python, accepted inputs, the
-monitors'
-findings, the velocity output and refused requests.
+monitors' findings, the velocity output and refused requests.
 
 Workspace: the second argument of the kernels beside the block, one flat record of fixed size. It holds the inputs of
-one step, the constants
-of settings and model, the core's Python state as far as this step needs it, and the results. It is not part of the
-memory: it follows from inputs, settings, model and state.
+one step, the constants of settings and model, the core's Python state as far as this step needs it, and the results. It
+is not part of the memory: it follows from inputs, settings, model and state.
 """
 
 from __future__ import annotations
@@ -194,47 +192,40 @@ class Workspace:
     for each its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes),
     ``ids``, ``pixels``, ``covariances``.
 
-    Settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad
-    or m] of a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,);
-    ``lasting_ns``, the time for
-    which an observation has a weight; for the gate of a frame: the squared distance ``gate``, the time ``known_s`` for
-    which an
-    innovation is valid, and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,),
-    ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): those of the model, and those stated in the
-    cell file.
+    Settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad or m] of
+    a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,);
+    ``lasting_ns``, the time for which an observation has a weight; for the gate of a frame: the squared distance
+    ``gate``, the time ``known_s`` for which an innovation is valid, and the time constant ``filter_s`` of its filter;
+    ``camera_rates`` (c,), ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): those of the model, and
+    those stated in the cell file.
     ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.command.SafetyLimits`. Model: the fields of
     `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of joint readings with errors.
 
-    State for this step, written by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's last
-    report and ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python processes the frames;
+    State for this step, written by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's last report
+    and ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python processes the frames;
     ``erring``: joints may deviate from their readings; the arm is ``stopped``, ``paused``; what is monitored;
     ``rounds_apart``: Python examines the rounds of frames, and ``quiet``: none of the last ones needed an explanation;
     ``masked`` (m,); for each camera whether its pose is ``unknown`` and the rule for the offset of its stamps
     (``offset_rule``).
 
     Results of a step: the joints ``q`` (n,), the results of `ingest` for ``joints``, ``frames`` and the ``gap`` of the
-    loop; the
-    fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); the results of the monitors:
+    loop; the fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); the results of the monitors:
     ``contact``, ``following``, the joint ``worst`` with its travel ``missing``; for a round the cameras that were
     examined (``looked_at``) and those that are ``odd``, as bit masks. For the frame processed last: joints ``frame_q``
-    (n,), the fields of
-    `residuals`, and until the prediction of the present is written that of its camera alone, ``of_frame``.
+    (n,), the fields of `residuals`, and until the prediction of the present is written that of its camera alone,
+    ``of_frame``.
 
     Goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that count,
     ``wanted`` (c, m), the target positions of its markers, its centre, the three markers of its ``face`` and the
-    centres
-    ``eyes`` of the ``eye_count`` cameras that must keep it visible; as in `sources.law.GoalError`, ``usable``, and
-    ``body`` and
-    ``centre`` at present, and whether an ``error_px`` was ``measured``; whether its progress was measured in this step
-    (``followed``), how many of
-    its markers were ``seen``, and the result ``run_found`` of `account_run`. Its ``gain`` at present, and the goal's
-    gains,
-    tolerance and limits, as in `state.LawRun`. Results of a law: see `control.law.Law`. ``scene`` and ``task``: those
-    that laws take; ``aim`` and ``faced``: the goal and face that they belong to.
+    centres ``eyes`` of the ``eye_count`` cameras that must keep it visible; as in `sources.law.GoalError`, ``usable``,
+    and ``body`` and ``centre`` at present, and whether an ``error_px`` was ``measured``; whether its progress was
+    measured in this step (``followed``), how many of its markers were ``seen``, and the result ``run_found`` of
+    `account_run`. Its ``gain`` at present, and the goal's gains, tolerance and limits, as in `state.LawRun`. Results of
+    a law: see `control.law.Law`. ``scene`` and ``task``: those that laws take; ``aim`` and ``faced``: the goal and face
+    that they belong to.
 
-    Motion: the source's ``velocity`` (n,), the other fields of `core.context.SourceOutput`, and ``raw``
-    (n,), the velocity with friction compensation. Results of `core.command`: ``finite`` to ``shared_by``, ``acted``
-    (n,),
+    Motion: the source's ``velocity`` (n,), the other fields of `core.context.SourceOutput`, and ``raw`` (n,), the
+    velocity with friction compensation. Results of `core.command`: ``finite`` to ``shared_by``, ``acted`` (n,),
     ``previous`` (n,), the previous command. ``result`` (1 + 3n,): values of a step for recordings, see
     `core.cycle.StepResult`. ``arrays``: all arrays by name.
     """
@@ -442,9 +433,9 @@ NOTHING = Ingested(None, (), 0.0, None, (), None, ())
 
 
 class StepContext:
-    """A step as Python sees it: its inputs, the state, and views of the kernels' results so far. One object serves
-    all steps of a core, so a goal must copy what it keeps of a step. ``ingested``: the accepted inputs, in
-    steps in which Python examines them.
+    """A step as Python sees it: its inputs, the state, and views of the kernels' results so far. One object serves all
+    steps of a core, so a goal must copy what it keeps of a step. ``ingested``: the accepted inputs, in steps in which
+    Python examines them.
 
     `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m,
     2) of the markers; these need a model.

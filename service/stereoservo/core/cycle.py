@@ -43,8 +43,7 @@ class StepInputs(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     ``compiling``: the kernels that need a model are not loaded yet (the first start on a computer); a model waits for
     them.
     ``driver_active``: the state of the driver as the servo process has set it (it owns enable and disable). The core's
-    lifecycle
-    follows ``driver_active`` and requests transitions through ``StepOutputs.driver_request``.
+    lifecycle follows ``driver_active`` and requests transitions through ``StepOutputs.driver_request``.
     ``sent``: velocities (n,) sent to the drives in place of the last step's command; None: that command.
     """
 
@@ -100,8 +99,8 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
     """Markers averaged at rest in one camera: ``ids`` (k,), ``pixels`` (k, 2), ``covariances`` (k, 2, 2) of the mean.
 
     The covariances are the detector's: its noise divided by the number of observations, plus its systematic part.
-    ``sights`` (k,), the number of observations,
-    and ``scatter`` (k,) [px²], the variance of a coordinate over them, allow a test of the stated noise.
+    ``sights`` (k,), the number of observations, and ``scatter`` (k,) [px²], the variance of a coordinate over them,
+    allow a test of the stated noise.
     """
 
     camera: str
@@ -115,8 +114,7 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
 
 class WayFrame(msgspec.Struct, frozen=True, eq=False):
     """A frame taken during motion to a stop: number of its ``camera`` in the cell, stated shutter time, some markers'
-    ``ids`` (k,)
-    and raw ``pixels`` (k, 2).
+    ``ids`` (k,) and raw ``pixels`` (k, 2).
     """
 
     camera: int
@@ -202,9 +200,8 @@ NOT_MEASURED = -1e300
 
 class StepResult(Protocol):
     """The values of a step's outputs that a recording keeps, as in `StepOutputs`. ``values`` (1 + 3n,): the error [px]
-    of the
-    active goal, the velocity before the safety stage, the filtered velocities of the joints, and the command (zero
-    if there is none).
+    of the active goal, the velocity before the safety stage, the filtered velocities of the joints, and the command
+    (zero if there is none).
     """
 
     @property
@@ -233,8 +230,8 @@ def encode_array(value: object) -> object:
 
 
 def decode_array(kind: type, value: object) -> object:
-    """msgspec ``dec_hook``, inverse of :func:`encode_array`. Raises ValueError or TypeError before memory is
-    allocated.
+    """msgspec ``dec_hook``, inverse of :func:`encode_array`. Raises ValueError or TypeError before
+    memory is allocated.
     """
     parts: Any = value
     name, shape, data = parts
@@ -256,8 +253,8 @@ def encode(value: object) -> bytes:
 
 
 def check_observation(observation: CameraObservation) -> None:
-    """Raise ValueError unless an observation's arrays have the required shapes and types; compiled
-    kernels accept no others.
+    """Raise ValueError unless an observation's arrays have the required shapes and types; compiled kernels accept no
+    others.
     """
     ids = observation.ids
     if ids.ndim != 1 or ids.dtype.kind not in "iu":

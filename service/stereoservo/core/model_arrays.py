@@ -62,8 +62,7 @@ class ModelArrays:
     """The largest variances of these errors over all postures (n,) [rad² or m²]; zeros if there are none."""
     ids: IntArray = field(init=False)
     """`marker_ids` as an array (m,), and the standard deviation ``unseen_px`` (m,) [px] of markers before they are
-    seen, if
-    joint readings are exact; read-only.
+    seen, if joint readings are exact; read-only.
     """
     unseen_px: FloatArray = field(init=False)
     no_rates: FloatArray = field(init=False)

@@ -1,5 +1,5 @@
-"""Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or
-ends its goal.
+"""Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or ends
+its goal.
 
 The detection of every step is one kernel, `detect`, which writes its results into the workspace. If it detects
 anything, or the state needs attention (`attends`), each monitor of `MONITORS` is called with the context, in the order
@@ -7,17 +7,14 @@ of the table, and returns its findings. The stage acts on each finding immediate
 add a monitor: a function, and a line in the table.
 
 Requests are answered here, after the stop and before all other monitors, because hold, resume, enable, teach and jog
-change
-what is monitored in the same step. If a goal is accepted in a step with a finding that ends goals, it ends in that step
-with an event of its own.
+change what is monitored in the same step. If a goal is accepted in a step with a finding that ends goals, it ends in
+that step with an event of its own.
 
 This module contains the detection that runs in every step: collision, following error, and whether the unfiltered
 innovations still look like noise. A round is one frame of every camera that delivers. Its chi-square, with the
 covariances of detector, timing and model, is cheap to compute. Only if it is improbable does `monitors.fault_isolation`
-test
-which single change explains it: a displaced camera, all cameras displaced together, a slipped marker, a drifted joint
-zero. A
-diagnosis needs two of the last three rounds.
+test which single change explains it: a displaced camera, all cameras displaced together, a slipped marker, a drifted
+joint zero. A diagnosis needs two of the last three rounds.
 """
 
 from __future__ import annotations

@@ -174,8 +174,7 @@ def paused(state: CoreState) -> bool:
 
 def arrange_motion(context: StepContext) -> None:
     """Write into the workspace what is constant until the active source changes: whether and how it moves the arm, but
-    not
-    its velocity. It does not move while it is paused, nor outside ACTIVE, where `execute_goals` ends it.
+    not its velocity. It does not move while it is paused, nor outside ACTIVE, where `execute_goals` ends it.
     """
     state, derived = context.state, context.derived
     work, source, scale = derived.room.numbers, state.source, context.settings.limits.speed_scale

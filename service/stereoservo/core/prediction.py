@@ -2,8 +2,7 @@
 observations of the cameras (`core.estimate`); joint positions at an earlier time.
 
 Cameras deliver raw pixels. Here they are converted to ideal ones, for which all later computations are linear in
-homogeneous
-coordinates; priors are converted back to raw pixels.
+homogeneous coordinates; priors are converted back to raw pixels.
 """
 
 from __future__ import annotations
@@ -58,9 +57,8 @@ class FrameResiduals(msgspec.Struct, frozen=True, eq=False):
     points.
 
     ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) from detector and timing, ``noise`` (k,) [px²]:
-    variance of a
-    coordinate from the detector alone, whether it was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s] caused by the
-    joints.
+    variance of a coordinate from the detector alone, whether it was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s]
+    caused by the joints.
     """
 
     t_shutter_ns: int
@@ -297,11 +295,9 @@ def present(block: Record, room: Record) -> None:
     """Estimate the current markers.
 
     Written to the workspace ``room``, at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m)
-    1/sigma
-    [1/px] of recently seen markers, 0 for others; ``pixels`` (c, m, 2), the current markers: prediction plus held
-    innovation. Written to the ``block``: the ``correction`` (n,) of the joints that explains the innovations best, so
-    that
-    the corrected points remain those of a rigid body.
+    1/sigma [1/px] of recently seen markers, 0 for others; ``pixels`` (c, m, 2), the current markers: prediction plus
+    held innovation. Written to the ``block``: the ``correction`` (n,) of the joints that explains the innovations best,
+    so that the corrected points remain those of a rigid body.
 
     The correction is one Gauss-Newton step. If it is large (arms with play), further steps follow as long as they
     reduce the residual.

@@ -1,5 +1,5 @@
-"""The complete state of the control core as one versioned, serialisable struct: joint history, camera estimates,
-active motion source, goal queue and plans, monitors. A copy of it with the same inputs gives the same outputs.
+"""The complete state of the control core as one versioned, serialisable struct: joint history, camera estimates, active
+motion source, goal queue and plans, monitors. A copy of it with the same inputs gives the same outputs.
 """
 
 from __future__ import annotations
@@ -163,8 +163,7 @@ class Followed(FollowedTarget, eq=False, kw_only=True):
 
 class FollowedFeatures(FollowedTarget, eq=False, kw_only=True):
     """Incidences at the reference: their ``fixed`` features (k, 3, 4); ``drift`` (4, 4) [1/s], the current twist of the
-    features
-    relative to the body that shall be incident with them.
+    features relative to the body that shall be incident with them.
     """
 
     fixed: FloatArray
@@ -312,14 +311,12 @@ class GoalResolution(msgspec.Struct, eq=False, kw_only=True):
     """Resolution of a target in the model's frame, one part of the computation after the other (`core.goals.resolve`).
 
     Start: the body at ``start`` (m, 4) with its ``faces``, the arm at ``joints`` (n,), corrected, with its
-    ``operators``
-    (n, 4, 4). ``part``: the next part; ``rounds``: least-squares iterations done.
+    ``operators`` (n, 4, 4). ``part``: the next part; ``rounds``: least-squares iterations done.
 
     Results: ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1: the
     whole body at the goal, if
     ``pose_known``, and the ``displacement`` (4, 4) from its start; ``targets`` (m, 4) where ``known`` (m,): the points
-    that
-    determined it; ``face`` (3,): three of these that span a face.
+    that determined it; ``face`` (3,): three of these that span a face.
     """
 
     joints: FloatArray
@@ -346,8 +343,7 @@ class PlanJob(msgspec.Struct, eq=False, kw_only=True):
     """A goal that is being resolved, then planned, and the resulting ``source``.
 
     ``purpose``: to answer ``request``; to queue the goal, which answers ``request``; the next goal of the queue; the
-    goal
-    after the active one, ahead of time; or the active one again. Planned from ``joints`` (n,) with the body at
+    goal after the active one, ahead of time; or the active one again. Planned from ``joints`` (n,) with the body at
     ``points`` (m, 4).
     """
 

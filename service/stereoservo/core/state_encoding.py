@@ -168,8 +168,7 @@ def _with_run(state: dict[str, Any]) -> dict[str, Any]:
 
 def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
     """A state of a former version completed by the missing values; arrays still encoded. Raises StateVersionError for a
-    state
-    recorded during trial motions, because their programme has changed.
+    state recorded during trial motions, because their programme has changed.
     """
     state = _with_round_due(state, version)
     if version >= 12:

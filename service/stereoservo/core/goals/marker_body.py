@@ -3,10 +3,8 @@ and checks that the cameras can see it there, from its front and not mirrored.
 
 Three triangulated points would be enough for (7.21)-(7.24), but every marker of the goal is used. The displacement from
 the current pose to the goal is found by integrating the Cartesian law itself, which converges from anywhere, and
-refined by minimising
-the reprojection error of all set-points. The result is one rigid displacement of the calibrated structure, so it also
-determines
-markers that the goal does not show.
+refined by minimising the reprojection error of all set-points. The result is one rigid displacement of the calibrated
+structure, so it also determines markers that the goal does not show.
 """
 
 from __future__ import annotations
@@ -205,8 +203,7 @@ def displacement_by_law(
     steps: int,
 ) -> tuple[FloatArray, bool]:
     """A displacement (4, 4) as the initial value of least squares, by so many ``steps`` of the law from the
-    ``displacement``
-    of the previous steps; and whether it is close to the solution. Other arguments as in `goal_pose`.
+    ``displacement`` of the previous steps; and whether it is close to the solution. Other arguments as in `goal_pose`.
     """
     basis = displacement_basis(arrays, operators)
     few = np.flatnonzero(known)
@@ -266,8 +263,7 @@ def left_by_components(
     arrays: ModelArrays, operators: FloatArray, points: FloatArray, targets: FloatArray, face: IntArray
 ) -> float:
     """Largest distance [px] from the goal at which a law in components comes to rest with the degrees of freedom
-    ``operators``
-    (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
+    ``operators`` (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
     """
     known = np.ones(len(points), dtype=bool)
     D, _ = _displacement_by_law(operators, points, (targets, known), face, np.eye(4), LAW_STEPS)

@@ -1,5 +1,5 @@
-"""Prepares goals: resolves a target to a motion source, for a large body in parts over several steps; and plans
-the path to a goal in slices over control steps before the arm moves: reports it or refuses the goal.
+"""Prepares goals: resolves a target to a motion source, for a large body in parts over several steps; and plans the
+path to a goal in slices over control steps before the arm moves: reports it or refuses the goal.
 
 The result is reported with the reply. Planned laws follow the plan. Straight laws drive the straight path that was
 planned. Free laws take a path of their own, so only the goal itself can be refused.
@@ -199,8 +199,8 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
 
 
 def _require_components(job: PlanJob, context: StepContext) -> None:
-    """Raises RefusalError if a law in components would come to rest beside the goal, because the arm can make hinge
-    and planar turn of the face only together.
+    """Raises RefusalError if a law in components would come to rest beside the goal, because the arm can make hinge and
+    planar turn of the face only together.
     """
     source, arrays = job.source, context.arrays
     assert source is not None

@@ -1,5 +1,5 @@
-"""Resolves a goal's target in the model's frame into set-points and the body's pose at the goal, for a large
-body in parts, one a step. Refuses invalid targets.
+"""Resolves a goal's target in the model's frame into set-points and the body's pose at the goal, for a large body in
+parts, one a step. Refuses invalid targets.
 """
 
 from __future__ import annotations
@@ -442,8 +442,7 @@ def _find_face(aim: GoalResolution, target: Resolvable, place: BodyState) -> boo
 
 def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
     """Find the pose at a goal of too few markers to determine it alone: the one that an arm of few joints reaches with
-    the least
-    motion. Raises RefusalError if it reaches none.
+    the least motion. Raises RefusalError if it reaches none.
     """
     arrays, cameras = place.arrays, place.settings.cameras
     start = aim.joints if aim.joints.size else arrays.zero
@@ -547,8 +546,7 @@ def _largest_triangle(
     candidates: IntArray, set_points: FloatArray, wanted: FloatArray
 ) -> tuple[IntArray, float]:
     """Three of the ``candidates`` (k,) with the largest area, and twice that [px²]: the smallest over the cameras that
-    see all
-    three.
+    see all three.
     """
     tried = spread_in_images(candidates, set_points, wanted)
     best = tried[:3].copy()

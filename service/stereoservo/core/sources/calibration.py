@@ -3,13 +3,11 @@ first motion, and averages the markers' pixels at every stop.
 
 From the base, joint l moves in steps to one side, then to the other (thesis 5.4.1, fig. 5.13); the steps are uneven
 (`stop_offset`). The range is stated in the cell file, or determined during the motion (`plan_sides`): as far as the
-markers remain in every view. At a stop the pixels are averaged at rest; a spread joint, if there is one, visits
-several positions there (fig. 5.16). A step that loses the markers is reversed and that side is closed. Finally all
-joints are offset from the base at once (`combined_offsets`), if linear extrapolation from the single-joint motions
-predicts that the
-markers remain visible. These poses identify what single joints cannot: sag that depends on several joints, coupled
-joints, and the
-order of the joints.
+markers remain in every view. At a stop the pixels are averaged at rest; a spread joint, if there is one, visits several
+positions there (fig. 5.16). A step that loses the markers is reversed and that side is closed. Finally all joints are
+offset from the base at once (`combined_offsets`), if linear extrapolation from the single-joint motions predicts that
+the markers remain visible. These poses identify what single joints cannot: sag that depends on several joints, coupled
+joints, and the order of the joints.
 """
 
 from __future__ import annotations
@@ -490,13 +488,12 @@ UNEVEN_STEP = 0.5
 """Largest fraction of a step by which the stops of a single joint are moved towards the base."""
 SHARE, UNEVEN = 0.8, 0.5
 """Largest offset of a joint from the middle of its range, as a fraction of half the range in which it was driven; and
-the fraction of this offset by which stops differ, so that
-a gear's ripple does not repeat and errors that grow with the range become visible.
+the fraction of this offset by which stops differ, so that a gear's ripple does not repeat and errors that grow with the
+range become visible.
 """
 ORDER = 16
 """Order of the Hadamard matrix whose signs give the sides to which joints are offset: its columns after the first, of
-ones, are as many as the
-joints of the largest cell.
+ones, are as many as the joints of the largest cell.
 """
 SHRUNK = (1.0, 0.75, 0.5)
 """Factors on the offsets of a stop, tried one after the other until the markers remain in view."""
@@ -518,8 +515,7 @@ def combined_offsets(k: int, low: FloatArray, high: FloatArray) -> FloatArray:
     driven alone.
 
     Signs are those of the columns of a Hadamard matrix: within ``ORDER`` stops every pair of joints is offset equally
-    often
-    to each combination of sides.
+    often to each combination of sides.
     """
     joint = np.arange(len(low))
     signs = np.array([1.0 - 2.0 * (((k % ORDER) & (1 + j)).bit_count() % 2) for j in joint.tolist()])
@@ -627,8 +623,7 @@ def plan_sides(
     (2,), and numbers of stops.
 
     By linear extrapolation through base and probe, the range ends where too few markers would be left in some view. It
-    is never
-    larger than the given ``reach`` (2,).
+    is never larger than the given ``reach`` (2,).
     """
     rates = (probe - base) / offset
     found = np.array(
@@ -674,8 +669,8 @@ def too_little(
     joint: int, stops: int, visited: float, motion: float, sigma_px: float, core: CoreSettings,
     settings: TrialSettings,
 ) -> Reason | None:  # fmt: skip
-    """Why a joint's trial cannot identify it, and the remedy: too few stops, too small a range, or too little motion
-    in the images (``motion`` in sigmas of ``sigma_px``); None if it can.
+    """Why a joint's trial cannot identify it, and the remedy: too few stops, too small a range, or too little motion in
+    the images (``motion`` in sigmas of ``sigma_px``); None if it can.
     """
     name = core.joint_names[joint]
     stated = np.isfinite(settings.range[joint])

@@ -1,9 +1,8 @@
 """Motion source of the model check: a few stops around the base posture at which the markers' pixels are averaged and
-then
-tested against the model in use, without a fit.
+then tested against the model in use, without a fit.
 
-At stop l joint l is above, and the next joint below its base, so that every joint is observed on both sides and
-against the others, with one stop a joint plus the base. `calibration.change.model_check` evaluates the pixels.
+At stop l joint l is above, and the next joint below its base, so that every joint is observed on both sides and against
+the others, with one stop a joint plus the base. `calibration.change.model_check` evaluates the pixels.
 """
 
 from __future__ import annotations

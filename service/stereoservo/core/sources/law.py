@@ -69,8 +69,8 @@ def by_kernel(source: ServoGoal, law: Law) -> bool:
 
 
 def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
-    """One step of a law: error, joint velocity, and whether the goal is reached or out of time; None if the velocity
-    is in the workspace.
+    """One step of a law: error, joint velocity, and whether the goal is reached or out of time; None if the velocity is
+    in the workspace.
     """
     law = context.derived.laws[source.law]
     if by_kernel(source, law) and context.weights is context.derived.room.weights:

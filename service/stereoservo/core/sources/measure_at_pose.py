@@ -272,8 +272,7 @@ def blocked(
     """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty if it may.
 
     The programme does not rely on the safety stage: a keep-out blocks the stop if it intersects the box spanned by the
-    current position
-    and the stop, and by the return position ``back`` (n,) if that is another one.
+    current position and the stop, and by the return position ``back`` (n,) if that is another one.
     """
     limits = context.settings.limits
     margin = limits.position_margin + 2.0 * context.settings.arrival

@@ -1,22 +1,20 @@
 """The progress of a law's run: updates it in each step, finds out why the run is slow or stuck, and tests whether the
-cameras agree with
-each other and with the joints where a goal ends, as far as image noise and the model's accuracy allow.
+cameras agree with each other and with the joints where a goal ends, as far as image noise and the model's accuracy
+allow.
 
 The law makes the arm follow a camera that drifts slowly: when both images show the set-points, the arm is beside the
-goal. Only that camera has a difference between observed and predicted pixels. It is too small for one round of
-frames (`monitors.fault_isolation`), but visible in the mean over the frames in which the goal's error is inside its
-tolerance.
+goal. Only that camera has a difference between observed and predicted pixels. It is too small for one round of frames
+(`monitors.fault_isolation`), but visible in the mean over the frames in which the goal's error is inside its tolerance.
 
 These mean innovations ``d`` are Gaussian with the covariance ``C = Σ/N + S P Sᵀ + J_q S_q J_qᵀ`` of the detector's
 noise over N frames, the model's parameters and the errors of joint readings that the model states. For each camera the
 hypothesis that it was displaced, ``d = E ξ``, reduces the chi-square ``dᵀ C⁻¹ d``; if nothing was displaced, the
 reduction is a chi-square of six degrees of freedom.
-A healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each test,
-all cameras together. Displacements of less than `SHARE` of the goal's tolerance are tolerated. If the joints explain
+A healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each test, all cameras together.
+Displacements of less than `SHARE` of the goal's tolerance are tolerated. If the joints explain
 ``d`` better than any one camera, the cameras agree: the goal is where they show it. If a gain is in `DOUBT`, which
 noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: by the union bound the probability
-of a false alarm
-is then at most so many times `FALSE_ALARMS` for that goal.
+of a false alarm is then at most so many times `FALSE_ALARMS` for that goal.
 """
 
 from __future__ import annotations
@@ -177,8 +175,7 @@ CAUSES = (
 
 class Traits(NamedTuple):
     """Properties of a run: its current ``gain`` and the time ``left_s`` in which its error decays; of its goal the
-    set-points that
-    count (c, m), whether they move, and whether its law may get stuck in a local minimum.
+    set-points that count (c, m), whether they move, and whether its law may get stuck in a local minimum.
     """
 
     gain: float
@@ -418,8 +415,7 @@ def pixel_slopes(
     cameras: tuple[FloatArray, FloatArray], sights_of: tuple[IntArray, IntArray],
 ) -> FloatArray:  # fmt: skip
     """Derivatives (2 k, p) of the innovations of k observations, in ideal pixels, by the ``parameters`` of a model,
-    with the
-    joints at ``q`` (n,).
+    with the joints at ``q`` (n,).
 
     ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first.
     ``cameras``: matrices (c, 3, 4) and lenses.
@@ -527,8 +523,8 @@ def added_covariance(C: FloatArray, slopes: FloatArray, covariance: FloatArray) 
 def explained(
     d: FloatArray, C: FloatArray, columns: FloatArray, first: int, last: int, x: FloatArray
 ) -> float:
-    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A``
-    (r, k) has the ``columns`` in the rows from ``first`` to ``last``; returns the reduction of chi-square.
+    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A`` (r,
+    k) has the ``columns`` in the rows from ``first`` to ``last``; returns the reduction of chi-square.
     """
     rows, count = d.size, columns.shape[1]
     weighted = np.empty((count, rows))
@@ -630,8 +626,7 @@ def decide(
 
 def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None) -> Reason | None:
     """The reason why a goal whose error is inside its tolerance is not reached: a camera that it uses, with set-points
-    ``wanted``
-    (c, m) in it (None: in all), disagrees with the other cameras and the joints; None if they agree.
+    ``wanted`` (c, m) in it (None: in all), disagrees with the other cameras and the joints; None if they agree.
 
     Not tested: models that state no covariance, cameras that may move, and bodies that move independently of the arm.
     """
@@ -685,8 +680,7 @@ def _moment(
     context: StepContext, arrays: ModelArrays, parameters: ModelParameters, sights: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """For the observations ``sights`` (k, 2): mean innovations (2 k,), their covariance (2 k, 2 k), and the derivatives
-    of the pixels by a
-    displacement of the camera (2 k, 6) and by the joints (2 k, n).
+    of the pixels by a displacement of the camera (2 k, 6) and by the joints (2 k, n).
     """
     block, q = context.state.block, context.q
     cameras, markers = np.ascontiguousarray(sights[:, 0]), np.ascontiguousarray(sights[:, 1])

@@ -96,8 +96,7 @@ def _stated(
     goal: Goal, context: StepContext, arrays: ModelArrays
 ) -> tuple[np.ndarray, FloatArray, FloatArray, FloatArray]:
     """Ids (k,) of the target's markers that the goal shows for the held pose, their points (k, 4), ideal pixels (c, k,
-    2)
-    and which are given (c, k) 1 or 0. Raises RefusalError.
+    2) and which are given (c, k) 1 or 0. Raises RefusalError.
     """
     ids = np.array(sorted(goal.follow_markers), dtype=np.int64)
     cameras = len(context.settings.cameras)

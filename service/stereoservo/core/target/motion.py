@@ -1,14 +1,12 @@
 """The motion of a target, a rigid body that is carried neither by the arm nor with the cameras: pose, twist and rate of
-twist with their
-covariance, by a Kalman filter on the pixels of its markers.
+twist with their covariance, by a Kalman filter on the pixels of its markers.
 
 The pose is a displacement ``D`` (4, 4) of its reference points in the model's frame, whatever that frame is. Twists are
 in a ``basis`` (6, 4, 4) of the displacements that is scaled so that a unit moves the markers by one pixel rms. If the
 model is metric, targets are assumed to accelerate equally in all directions, so motion along the rays, which is ten
-times less
-visible, is tracked more slowly. If it is not metric, they are assumed to accelerate equally in the images. The rate of
-the twist is a
-Gauss-Markov process (Singer 1970): it is estimated while images arrive, and decays when they do not.
+times less visible, is tracked more slowly. If it is not metric, they are assumed to accelerate equally in the images.
+The rate of the twist is a Gauss-Markov process (Singer 1970): it is estimated while images arrive, and decays when they
+do not.
 """
 
 from __future__ import annotations
@@ -58,14 +56,11 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
     rate, at ``t_ns``; 0: not found yet.
 
     By camera: ``seen_ns`` (c,), the shutter time of its last frame with enough markers; ``odd_ns`` (c,), of the last
-    one that
-    the motion did not explain, 0 if a later one was explained; ``told`` (c,): whether its estimate was reset since
-    the target was found. ``drift`` (6, 6): covariance of accelerations in the basis. ``odd``: consecutive steps with
-    such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): observations from which the target
-    is found,
-    while it is not found yet; ``stated``: ``points`` are known in advance; ``rest_px``: the residual of the best pose,
-    if none
-    explained these observations.
+    one that the motion did not explain, 0 if a later one was explained; ``told`` (c,): whether its estimate was reset
+    since the target was found. ``drift`` (6, 6): covariance of accelerations in the basis. ``odd``: consecutive steps
+    with such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): observations from which the
+    target is found, while it is not found yet; ``stated``: ``points`` are known in advance; ``rest_px``: the residual
+    of the best pose, if none explained these observations.
 
     ``mark`` (4, 4): its pose at ``mark_ns``; ``farthest_px``: displacement of its markers since; ``still``: they did
     not move in the interval before.
@@ -111,11 +106,10 @@ def begin(
     body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
 ) -> bool:
     """Initialise the target at its stated pose at ``t_ns``, with unknown motion; returns whether its markers determine
-    all six
-    degrees of freedom.
+    all six degrees of freedom.
 
-    ``basis`` (6, 4, 4): displacements; in a ``metric`` frame three translations and three rotations about any
-    point, that move a body of its size equally.
+    ``basis`` (6, 4, 4): displacements; in a ``metric`` frame three translations and three rotations about any point,
+    that move a body of its size equally.
     ``matrices`` (c, 3, 4): the cameras, which see it through ``carrier`` (4, 4).
     """
     here = transform_points(body.displacement, body.points)
@@ -143,8 +137,8 @@ def widen(body: TargetBody, pose_px: float) -> None:
 
 
 def variance_of_carried(body: TargetBody | None) -> float:
-    """Uncertainty of a carried target's markers in the images, due to its motion since it was last seen
-    and tracked: variance [px²] of a coordinate; 0 if the body is not the target.
+    """Uncertainty of a carried target's markers in the images, due to its motion since it was last seen and tracked:
+    variance [px²] of a coordinate; 0 if the body is not the target.
     """
     return (
         float(np.trace(body.covariance[:FREEDOMS, :FREEDOMS])) if body is not None and body.carried else 0.0
@@ -180,8 +174,7 @@ def solve_into(M: FloatArray, X: FloatArray) -> None:
 @kernel
 def turns_about(basis: FloatArray, points: FloatArray, share: float) -> FloatArray:
     """The ``basis`` (6, 4, 4), translations and rotations, with its rotations replaced by ones about the centroid of
-    ``points`` (k, 4) of unit
-    height, scaled by a ``share``.
+    ``points`` (k, 4) of unit height, scaled by a ``share``.
     """
     middle, moved = np.zeros(4), np.zeros((FREEDOMS, 4))
     for i in range(points.shape[0]):
@@ -214,8 +207,7 @@ def scaled_basis(
 ) -> tuple[FloatArray, FloatArray, bool]:
     """The ``basis`` (6, 4, 4) recombined so that each element moves the pixels of ``points`` (k, 4) by 1 px rms,
     independently of the others. Also returns the covariance (6, 6) in the new basis of a motion distributed equally
-    over the old one, at 1 px rms; and
-    whether the basis could be computed.
+    over the old one, at 1 px rms; and whether the basis could be computed.
     """
     J = image_jacobian(seen_through(basis, carrier), matrices, transform_points(carrier, points)).reshape(
         (-1, FREEDOMS)
@@ -308,9 +300,8 @@ Motion = tuple[FloatArray, FloatArray, FloatArray]
 """Motion of a target: its twist and the rate of the twist (6,), and the covariance (18, 18) of pose, twist and rate."""
 View = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """View of a frame: the camera's matrix (1, 3, 4), the transformation between the target's frame and the camera's (4,
-4), ideal pixels (k, 2) of
-the target's markers, and which of them are seen (k,) 1 or 0. Plain tuples, because numba resolves a named one at every
-call.
+4), ideal pixels (k, 2) of the target's markers, and which of them are seen (k,) 1 or 0. Plain tuples, because numba
+resolves a named one at every call.
 """
 
 
@@ -369,8 +360,7 @@ def gate_sights(
     left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, pose: FloatArray, gate: float
 ) -> tuple[FloatArray, int, int]:
     """Which of the markers ``seen`` (k,) are explained within a ``gate`` by the covariance ``pose`` (6, 6), their
-    number,
-    and the number of markers seen.
+    number, and the number of markers seen.
     """
     within, used, count = seen.copy(), 0, 0
     S = np.empty((2, 2))
@@ -554,8 +544,7 @@ def find_shape(
     matrices: FloatArray, sights: FloatArray, seen: FloatArray, plane: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that are seen by two or more cameras, and which
-    these
-    are (k,) 1 or 0.
+    these are (k,) 1 or 0.
     """
     points, ok = triangulate(matrices, sights, seen, 5)
     known = np.zeros(points.shape[0])

@@ -1,12 +1,10 @@
 """Tracking of the target body from frame to frame: detection, tracking, distinction from other motions, and prediction
 through drop-outs.
 
-A frame is compared with the pose predicted by the motion at its shutter time. A deviation in one
-camera, while another one agrees, is attributed to that camera. A deviation in all cameras is attributed to the target,
-if its speed
-makes that possible; otherwise the decision is left to the model monitor: if it names a joint zero or a marker, the
-deviation is not
-tracked as a motion of the target.
+A frame is compared with the pose predicted by the motion at its shutter time. A deviation in one camera, while another
+one agrees, is attributed to that camera. A deviation in all cameras is attributed to the target, if its speed makes
+that possible; otherwise the decision is left to the model monitor: if it names a joint zero or a marker, the deviation
+is not tracked as a motion of the target.
 """
 
 from __future__ import annotations
@@ -162,8 +160,8 @@ def target_sights(
     wanted: IntArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, lens: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The observations of the markers ``wanted`` (k,) in a frame of ``ids`` (s,), raw ``pixels`` (s, 2) with
-    ``covariances``
-    (s, 2, 2): ideal pixels (k, 2), variances of a coordinate (k,) [px²], and which are seen (k,) 1 or 0.
+    ``covariances`` (s, 2, 2): ideal pixels (k, 2), variances of a coordinate (k,) [px²], and which are seen (k,) 1 or
+    0.
     """
     ideal, spread, possible = undistort_sights(lens, pixels, covariances)
     k = wanted.size
@@ -228,9 +226,8 @@ def _at_one_moment(
     body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray
 ) -> tuple[int, FloatArray, FloatArray]:
     """Time at which another camera saw the target last, the pixels (c, k, 2) of all cameras at that time, and which
-    markers they show (c, k)
-    1 or 0. Those of this camera are interpolated between its previous frame and this one, because the target moves
-    between the shutter times.
+    markers they show (c, k) 1 or 0. Those of this camera are interpolated between its previous frame and this one,
+    because the target moves between the shutter times.
     """
     there, shown = body.first.copy(), body.first_seen.copy()
     others = shown.max(axis=1) > 0.0
@@ -258,8 +255,8 @@ def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], p
 
 
 def restart(state: CoreState, arrays: ModelArrays, settings: CoreSettings) -> None:
-    """Adapt to a new model in use: a tracked target is found again with its cameras, and a body
-    declared to move is tracked from the first frame.
+    """Adapt to a new model in use: a tracked target is found again with its cameras, and a body declared to move is
+    tracked from the first frame.
     """
     body = state.target
     if body is None or not state.pending_reanchored:
@@ -374,8 +371,7 @@ def _jumps(
     body: TargetBody, camera: int, t_ns: int, jump: tuple[float, float], since_s: float, state: CoreState
 ) -> bool:
     """Whether a frame that the predicted motion does not explain shows a target that moved differently: ``jump`` holds
-    the
-    displacement and its residual [px]. It may have another cause, or be undecided yet.
+    the displacement and its residual [px]. It may have another cause, or be undecided yet.
     """
     moved_px, rest_px = jump
     body.odd_ns[camera] = t_ns
