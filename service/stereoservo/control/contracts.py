@@ -94,10 +94,10 @@ def error_px(scene: Scene, task: Task) -> float:
 
 
 class LawContract:
-    """Subclass under pytest and set ``law``. What a law must keep: a well-formed and finite velocity, the same for the
+    """Tests of a law: subclass it under pytest and set ``law``.
 
-    same input, independent of the projective frame, within the rates that it is given, and descent to the goal in
-    closed loop, with one camera too where the law declares it.
+    Required: a well-formed and finite velocity, the same for the same input, independent of the projective frame,
+    within the given rates, and descent to the goal in closed loop, with one camera too if the law declares it.
     """
 
     law: Law
@@ -218,7 +218,7 @@ class LawContract:
 
     @staticmethod
     def _rates(scene: Scene, task: Task, velocity: FloatArray) -> tuple[float, float]:
-        """Turn rate [rad/s] of the body and speed of its centre in the frame's coordinates."""
+        """Rotation rate [rad/s] of the body and speed of its centre in the frame's coordinates."""
         twist = np.tensordot(velocity, scene.operators, axes=1)
         return float(np.sqrt(max(0.0, -0.5 * np.trace(twist @ twist)))), float(
             np.linalg.norm(twist @ task.centre)

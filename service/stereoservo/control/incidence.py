@@ -205,7 +205,7 @@ def no_second_task(n: int) -> SecondTask:
 def joint_task(
     positions: FloatArray, targets: FloatArray, wanted: FloatArray, scale: FloatArray, gain: float
 ) -> SecondTask:
-    """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: what of each is as much."""
+    """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: unit of each joint."""
     rates = np.where(wanted > 0.0, gain * (targets - positions), 0.0)
     return SecondTask(np.eye(len(positions)), rates, wanted / scale)
 

@@ -147,8 +147,7 @@ class Law:
 
     ``kernel``: the same step in one compiled call, bit for bit. It takes an array (1,) of a record,
     `core.context.WORKSPACE`, which contains the fields of Scene and Task packed (``weights`` as ``usable``, ``points``
-    as
-    ``body``; ``eyes``: the centres of the cameras that must keep the face visible) and of Options ``gain``, ``dt_s``
+    as ``body``; ``eyes``: the centres of the cameras that must keep the face visible) and of Options ``gain``, ``dt_s``
     and ``jacobian_choice``; the other options have their defaults. It writes ``velocity``, ``components`` (errors, then
     the allowed parts), ``component_status`` and ``conditioning``. None: the step is called.
     For the kernel of a law without components no face is chosen.

@@ -105,7 +105,7 @@ def _without(v: FloatArray, unit: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def _directions(plane_at_infinity: FloatArray) -> FloatArray:
-    """Orthonormal directions (4, 3) of height 0: the complement of the plane, by a reflection."""
+    """Orthonormal directions (4, 3) of height 0: the columns of a reflection that are orthogonal to the plane."""
     v = plane_at_infinity / np.sqrt((plane_at_infinity**2).sum())
     k = int(np.abs(v).argmax())
     v[k] += 1.0 if v[k] > 0.0 else -1.0

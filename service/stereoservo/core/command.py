@@ -94,8 +94,8 @@ def _foresee(block: Record, room: Record) -> None:
 
 
 RISE_S = 0.25
-"""Time constant of the estimate [s]; a joint that does not move receives its source's velocity once more
-in this time.
+"""Time constant of the estimate [s]; the command of a joint that does not move grows by its source's velocity in this
+time.
 """
 LAG_S = 0.06
 """Lag of a healthy drive [s]; travel is compared over longer times."""

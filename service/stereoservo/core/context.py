@@ -439,7 +439,7 @@ class StepContext:
 
     `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m,
     2) of the markers; these need a model.
-    ``goals_read``: ids of the goals that were resolved in this step; at most one, because it takes time.
+    ``goals_read``: ids of the goals whose requests were handled in this step; at most one, to limit the computing time.
     ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few markers.
     ``output``: the output of a motion source in Python; None if a kernel has moved the arm, or nothing did.
     ``moved_arrays``: the model with the target body at its current pose.

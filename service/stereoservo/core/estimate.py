@@ -51,7 +51,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 
 AT_REST = 1e-3
-"""Joint speed below which the arm is at rest [rad/s or m/s]."""
+"""Joint command below which the arm counts as at rest [rad/s or m/s]."""
 
 
 @kernel

@@ -47,7 +47,7 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 
 AT_REST = 1e-3
-"""Joint speed below which the arm is at rest [rad/s or m/s]."""
+"""Joint command below which the arm counts as at rest [rad/s or m/s]."""
 MOVED_SINCE = 0.01
 """Joint motion [rad or m] since planning began, above which a path that is followed is planned again."""
 

@@ -391,8 +391,8 @@ def _judged(room: Record, k: int) -> int:
 
 @kernel
 def first_wrong(room: Record, k: int) -> tuple[int, int]:
-    """The first marker of frame ``k`` that is farther outside the image than the image's own size, and the first one
-    whose covariance is invalid; -1 if there is none.
+    """The first marker of frame ``k`` of the workspace ``room`` that is farther outside the image than the image's own
+    size, and the first one whose covariance is invalid; -1 if there is none.
     """
     work = room[0]
     c, count = work.arrived_camera[k], work.arrived_count[k]

@@ -313,10 +313,9 @@ class GoalResolution(msgspec.Struct, eq=False, kw_only=True):
     Start: the body at ``start`` (m, 4) with its ``faces``, the arm at ``joints`` (n,), corrected, with its
     ``operators`` (n, 4, 4). ``part``: the next part; ``rounds``: least-squares iterations done.
 
-    Results: ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1: the
-    whole body at the goal, if
-    ``pose_known``, and the ``displacement`` (4, 4) from its start; ``targets`` (m, 4) where ``known`` (m,): the points
-    that determined it; ``face`` (3,): three of these that span a face.
+    Results: ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1:
+    the whole body at the goal, if ``pose_known``, and the ``displacement`` (4, 4) from its start; ``targets`` (m, 4)
+    where ``known`` (m,): the points that determined it; ``face`` (3,): three of these that span a face.
     """
 
     joints: FloatArray

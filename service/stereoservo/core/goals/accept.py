@@ -370,7 +370,7 @@ def answer_waiting(context: StepContext) -> None:
 
 
 def _free(context: StepContext) -> bool:
-    """Whether the next request may be handled: no goal is planned before it, and no other goal was resolved in this
+    """Whether the next request may be handled: no goal is planned before it, and no other goal was handled in this
     step.
     """
     return not planning_pending(context) and not context.goals_read

@@ -30,7 +30,9 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
 
 FALSE_ALARMS_PER_HOUR = 1e-3
-"""False alarms of one round, with noise as stated; a diagnosis requires two of three rounds in addition."""
+"""False alarms per hour of single rounds, with noise as stated; a diagnosis requires two of three rounds
+in addition.
+"""
 LEAST_PX = 0.5
 """Rms change of the pixels [px] below which no cause is reported: models have errors of that size
 without any change.

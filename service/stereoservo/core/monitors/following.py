@@ -206,8 +206,8 @@ def account_travel(block: Record, room: Record, command: FloatArray, told: bool,
     """Update the travel by the time since the last step at the velocities ``command`` (n,): without delay in the
     ``block``'s untold and missing travel, with delay in ``delays``.
 
-    ``told``: whether the readings are new. If a joint in steady motion has already moved further than its delay allows,
-    its delay is shorter; the shorter one is added to the samples.
+    ``told``: whether the readings are new. If a joint in steady motion has moved farther than its delay allows, its
+    delay is shorter; the shorter one is added to the samples.
     """
     memory, work = block[0], room[0]
     n, dt_s, step = memory.joints, work.elapsed_s, memory.delay_steps

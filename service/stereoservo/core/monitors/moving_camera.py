@@ -133,7 +133,7 @@ def see(
     if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
         return (
             hidden if mobile.moving else sights
-        )  # joints that a faulty drive tells are no measure of cameras
+        )  # readings of a faulty drive must not be used to judge cameras
     points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
     basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
     assert basis is not None

@@ -45,7 +45,7 @@ MOST_STOPS = 1.5  # factor on calibration.stops, for a joint with a larger range
 
 
 def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSettings) -> CalibrationMotion:
-    """The programme before its first move, to the base."""
+    """The calibration programme before its first move, to the base."""
     trials = trial_settings(settings)
     n = q.size
     # One more than the positions of the spread joint: the last one is that joint at its base.
@@ -647,7 +647,7 @@ def plan_sides(
 
 
 def _way(pixels: FloatArray, rates: FloatArray, width: int, height: int, settings: TrialSettings) -> float:
-    """Distance that markers (m, 2) may move at ``rates`` (m, 2) [px a unit] until too few are left inside."""
+    """Joint offset at which too few markers (m, 2), moving at ``rates`` (m, 2) [px a unit], are left inside."""
     margin = BORDER * width
     low, high = np.full(2, margin), np.array([width, height]) - 1.0 - margin
     ways = []

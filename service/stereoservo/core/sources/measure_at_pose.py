@@ -95,7 +95,7 @@ def averages(sums: ObservationStatistics, settings: CoreSettings) -> tuple[Sampl
         scatter = sums.square_sums[camera, seen] - (sums.deviation_sums[camera, seen] ** 2).sum(axis=-1) / n
         together = float(seen.sum()) / max(
             float(seen.sum()) - 1.0, 1.0
-        )  # one freedom in so many went with the motion
+        )  # the common motion uses one degree of freedom in so many
         samples.append(
             Sample(
                 description.name,

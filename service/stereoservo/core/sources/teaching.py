@@ -14,7 +14,7 @@ from stereoservo.core.state import TeachingState
 from stereoservo.messages.goals import Request, Teach
 
 AT_REST = 1e-3
-"""Joint speed below which the arm is at rest [rad/s or m/s]."""
+"""Joint command below which the arm counts as at rest [rad/s or m/s]."""
 TEACH_TIMEOUT_S = 20.0
 
 

@@ -105,8 +105,8 @@ def target_body(ids: IntArray, points: FloatArray | None, cameras: int, *, carri
 def begin(
     body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
 ) -> bool:
-    """Initialise the target at its stated pose at ``t_ns``, with unknown motion; returns whether its markers determine
-    all six degrees of freedom.
+    """Initialise the target at its ``displacement`` at ``t_ns``, with unknown motion; returns whether its markers
+    determine all six degrees of freedom.
 
     ``basis`` (6, 4, 4): displacements; in a ``metric`` frame three translations and three rotations about any point,
     that move a body of its size equally.

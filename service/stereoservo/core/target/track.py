@@ -226,8 +226,8 @@ def _at_one_moment(
     body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray
 ) -> tuple[int, FloatArray, FloatArray]:
     """Time at which another camera saw the target last, the pixels (c, k, 2) of all cameras at that time, and which
-    markers they show (c, k) 1 or 0. Those of this camera are interpolated between its previous frame and this one,
-    because the target moves between the shutter times.
+    markers they show (c, k) 1 or 0. Those of this camera are interpolated between its previous frame and this one, or
+    extrapolated, because the target moves between the shutter times.
     """
     there, shown = body.first.copy(), body.first_seen.copy()
     others = shown.max(axis=1) > 0.0
