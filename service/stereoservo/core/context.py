@@ -188,9 +188,8 @@ class Workspace:
     ``nominal_s``; whether the ``stop`` was raised; the joint ``sample`` (4, n) (positions, velocities, efforts,
     following errors; ``joints_given``: there is a sample, ``joints_whole``: it is complete for every joint) with
     ``joints_ns`` and ``joints_seq``; the velocity ``sent`` (n,) by the driver in place of the last command, if
-    ``has_sent``; and ``frames`` in arrays ``arrived_…``:
-    for each its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes),
-    ``ids``, ``pixels``, ``covariances``.
+    ``has_sent``; and ``frames`` in arrays ``arrived_…``, for each its ``camera`` (-1: unknown), ``seq``, stamp ``ns``,
+    ``count`` of markers (-1: arrays of other shapes), ``ids``, ``pixels``, ``covariances``.
 
     Settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad or m] of
     a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,);

@@ -22,9 +22,9 @@ JOINT_SHARE = 1e-4
 """Squared weight of a planned joint, relative to the images' in the same joint.
 
 Lower bound: arm and plan disagree on lengths by some fraction ``ε`` of the arm's reach R. If an elbow of depth
-``c δ²``, ``c`` about R/4, is stretched, images and joints have one solution, the plan's side, if this weight, ``share``,
-satisfies ``share·R² > 2 c ε``: 1e-4 is right for ``ε`` up to 2e-4 of the reach, more than remains after calibration.
-Upper bound: the joints bias a well determined direction by 1e-4 of their disagreement, below image noise.
+``c δ²``, ``c`` about R/4, is stretched, images and joints have one solution, the plan's side, if this weight,
+``share``, satisfies ``share·R² > 2 c ε``: 1e-4 is right for ``ε`` up to 2e-4 of the reach, more than remains after
+calibration. Upper bound: the joints bias a well determined direction by 1e-4 of their disagreement, below image noise.
 """
 
 
