@@ -265,14 +265,14 @@ STATE_EVERY_NS = 50_000_000
 SCENE_EVERY_NS = 200_000_000
 JPEG_QUALITY = 80
 BLOCK_STEPS = 100
-"""In a compressed block, as in 0.4 s of a loop of 250 Hz."""
+"""Steps in a compressed block: 0.4 s of a loop of 250 Hz."""
 
 
 @dataclass
 class FlightChannels:
-    """Turns a recording's steps into messages. ``shift_ns``: wall clock less the recording's clock.
+    """Converts a recording's steps into messages. ``shift_ns``: wall clock minus the recording's clock.
 
-    ``models``: by epoch, those that the recording began with.
+    ``models``: by epoch, those at the start of the recording.
     """
 
     settings: CoreSettings
@@ -338,7 +338,7 @@ class FlightChannels:
 
 
 class _File:
-    """The exported file: a channel a topic, made with its first message."""
+    """The exported file: one channel a topic, made with its first message."""
 
     def __init__(self, stream: Any) -> None:
         self._writer = Writer(stream, compression=CompressionType.LZ4, enable_data_crcs=True)
@@ -377,7 +377,7 @@ class _File:
 
 @dataclass(frozen=True)
 class ExportResult:
-    """``messages``: their numbers by topic; ``incomplete``: why the recording breaks off, where it does."""
+    """``messages``: their numbers by topic; ``incomplete``: why the recording ends early, if it does."""
 
     file: Path
     replay: ReplayResult
@@ -386,7 +386,7 @@ class ExportResult:
 
 
 def export_flight(source: Path, target: Path) -> ExportResult:
-    """Write ``target``: the recording ``source`` with Foxglove's channels, and its pictures where it has them.
+    """Write ``target``: the recording ``source`` with Foxglove's channels, and with its pictures if it has them.
 
     Raises RecordingError, ImageFileError, FileExistsError, OSError.
     """
@@ -434,7 +434,7 @@ def _fill(file: _File, source: Path, target: Path) -> ExportResult:
 
 
 def _copy(file: _File, source: Path, t_ns: int, shift_ns: int) -> None:
-    """The recording's own messages, compressed as it has them, at the wall clock's time of the step they belong to."""
+    """The recording's own messages, in their compressed form, at the wall clock's time of the step they belong to."""
     blocks, checkpoints, held, held_ns = StepBlocks(), Checkpoints(), list[bytes](), t_ns
     for topic, data in whole_messages(source):
         if topic == "step":

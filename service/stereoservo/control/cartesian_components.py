@@ -1,9 +1,10 @@
 """Kernels of the components of a Cartesian law: translation of the centre, hinge and planar turn of a face, each as the
-joint screw that makes it and its operator (thesis 7.18 to 7.24; numpy reference: `planning.three_point_decomposition`);
+joint screw that produces it and its operator (thesis 7.18 to 7.24; numpy reference:
+`planning.three_point_decomposition`);
 below them the primitive motions of an arm (translation, two kinds of revolution; reference: `planning.primitives`), and
 the algebra of points and planes that they need.
 
-Names, order and thresholds are those of the references; read these first. No BLAS, no allocation of note.
+Names, order and thresholds are those of the references; read these first. No BLAS, and only small allocations.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from stereoservo.planning.three_point_decomposition import COINCIDENT, DONE, FLA
 
 @kernel
 def _shifted(A: FloatArray, centre: FloatArray) -> FloatArray:
-    """Points moved in parallel so that their middle is the centre."""
+    """Points translated so that their centroid is the centre."""
     out = np.empty((3, 4))
     for k in range(4):
         shift = centre[k] - (A[0, k] + A[1, k] + A[2, k]) / 3.0
@@ -74,8 +75,8 @@ class Components(NamedTuple):
 
 
 class CentredFace(NamedTuple):
-    """A face, moved in parallel so that its middle is the ``centre`` (4,) of its body: ``points`` (3, 4) now and at the
-    goal, ``targets``, their unit planes ``now`` and ``then`` (4,); ``unit_centre`` (4,): the centre at length 1.
+    """A face, translated so that its centroid is the ``centre`` (4,) of its body: current ``points`` (3, 4) and those
+    at the goal, ``targets``, their unit planes ``now`` and ``then`` (4,); ``unit_centre`` (4,): the centre at length 1.
     """
 
     centre: FloatArray
@@ -88,7 +89,7 @@ class CentredFace(NamedTuple):
 
 @kernel
 def decompose(freedoms: Freedoms, task: FaceTask) -> Components:
-    """The components of a motion, of an arm of such freedoms."""
+    """The components of a motion, for an arm with the given freedoms."""
     points, targets, centre = task.points, task.targets, task.centre
     n, rank = freedoms.basis.shape
     found = Components(np.zeros((3, n)), np.zeros((3, 4, 4)), np.zeros(3), np.full(3, DONE))
@@ -120,7 +121,7 @@ def decompose(freedoms: Freedoms, task: FaceTask) -> Components:
 def _translation(
     freedoms: Freedoms, task: FaceTask, unit_centre: FloatArray, system: FloatArray, found: Components
 ) -> None:
-    """The centre's translation into the first of the components; ``system`` (r, 8): scratch."""
+    """Compute the translation of the centre as the first of the components; ``system`` (r, 8): scratch."""
     centre, centre_target = task.centre, task.centre_target
     displacement = np.empty(4)
     for k in range(4):
@@ -154,9 +155,9 @@ def _translation(
 
 @kernel
 def _hinge(freedoms: Freedoms, face: CentredFace, system: FloatArray, found: Components) -> None:
-    """The hinge of the face's plane to that at the goal into the second of the components.
+    """Compute the hinge from the face's plane to that at the goal as the second of the components.
 
-    The face's points at the goal are turned back by it; ``system`` (r, 8): scratch.
+    The face's points at the goal are rotated back by it; ``system`` (r, 8): scratch.
     """
     centre, unit_centre, a, a_t, A_c, A_r = face
     together = dot(a, a_t)
@@ -235,27 +236,29 @@ def _planar_angle(H: FloatArray, A: FloatArray, A_r: FloatArray) -> float:
 
 
 OUT = 0.1
-"""Of the way from a face to a camera: about the size of the face, so that lengths along and across it are alike."""
+"""Fraction of the distance from a face to a camera: about the size of the face, so that lengths along and across it are
+similar.
+"""
 SPANS_NO_SPACE = 1e-26
-"""Share of a coordinate's square that others do not explain, below which points span no space."""
+"""Fraction of a coordinate's square that the others do not explain, below which points span no space."""
 
 
 @kernel
 def dot(x: FloatArray, y: FloatArray) -> float:
-    """Of two 4-vectors."""
+    """Scalar product of two 4-vectors."""
     total: float = x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
     return total
 
 
 @kernel
 def norm(x: FloatArray) -> float:
-    """Of a 4-vector."""
+    """Norm of a 4-vector."""
     return math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] + x[3] * x[3])
 
 
 @kernel
 def unit(x: FloatArray) -> FloatArray:
-    """A 4-vector over its norm."""
+    """A 4-vector divided by its norm."""
     length = norm(x)
     y = np.empty(4)
     for i in range(4):
@@ -302,7 +305,7 @@ def minors(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
 
 @kernel
 def complement(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal pair, orthogonal to two unit vectors that are not one."""
+    """Orthonormal pair, orthogonal to two unit vectors that are not parallel."""
     u = np.empty(4)
     along = dot(x, y)
     for i in range(4):
@@ -322,8 +325,8 @@ def complement(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 class Freedoms(NamedTuple):
-    """What an arm can make now: orthonormal ``motions`` (r, 4, 4), and the joint screws ``basis`` (n, r) that make
-    them.
+    """Motions that an arm can make now: orthonormal ``motions`` (r, 4, 4), and the joint screws ``basis`` (n, r) that
+    produce them.
     """
 
     motions: FloatArray
@@ -332,8 +335,8 @@ class Freedoms(NamedTuple):
 
 @kernel
 def primitive(freedoms: Freedoms, system: FloatArray, screw: FloatArray, H: FloatArray) -> bool:
-    """The motion that an (r, 8) ``system`` leaves, a row a freedom: its joint screw (n,) and operator (4, 4); False:
-    not reachable.
+    """The motion in the null space of an (r, 8) ``system``, one row a freedom: writes its joint screw (n,) and operator
+    (4, 4). Returns False if it is not reachable.
     """
     motions, basis = freedoms
     n, rank = basis.shape
@@ -345,7 +348,7 @@ def primitive(freedoms: Freedoms, system: FloatArray, screw: FloatArray, H: Floa
     if rank > 1:
         smallest, second, largest = left_null_direction(system.copy(), x)
         known = second > DEGENERATE_RATIO * largest and smallest <= threshold * second
-    if not known:  # the bounds do not tell: by the singular values themselves
+    if not known:  # the bounds are not sufficient: use the singular values themselves
         x, smallest, second, largest = null_direction(np.ascontiguousarray(system.T))
         if rank == 1:
             second = 1.0
@@ -363,7 +366,7 @@ def primitive(freedoms: Freedoms, system: FloatArray, screw: FloatArray, H: Floa
 
 @kernel
 def scale_primitive(screw: FloatArray, H: FloatArray, factor: float) -> None:
-    """A screw (n,) and its operator (4, 4) times a factor."""
+    """Multiply a screw (n,) and its operator (4, 4) by a factor."""
     for j in range(screw.shape[0]):
         screw[j] *= factor
     for i in range(4):
@@ -373,7 +376,7 @@ def scale_primitive(screw: FloatArray, H: FloatArray, factor: float) -> None:
 
 @kernel
 def drop_primitive(screw: FloatArray, H: FloatArray) -> None:
-    """No screw (n,), and no operator (4, 4)."""
+    """Set a screw (n,) and its operator (4, 4) to zero."""
     for j in range(screw.shape[0]):
         screw[j] = 0.0
     for i in range(4):
@@ -383,7 +386,7 @@ def drop_primitive(screw: FloatArray, H: FloatArray) -> None:
 
 @kernel
 def as_rotation(screw: FloatArray, H: FloatArray) -> bool:
-    """Scale to eigenvalues ±i; False: no rotation."""
+    """Scale a rotation to eigenvalues ±i; returns False if it is no rotation."""
     trace, size = 0.0, 0.0
     for i in range(4):
         for k in range(4):
@@ -398,7 +401,7 @@ def as_rotation(screw: FloatArray, H: FloatArray) -> bool:
 
 @kernel
 def set_point_columns(motions: FloatArray, A: FloatArray, system: FloatArray, column: int) -> None:
-    """``Ĥ_k A`` of the motions (r, 4, 4) into columns ``column`` to ``column + 3`` of the system (r, 8)."""
+    """Write ``Ĥ_k A`` of the motions (r, 4, 4) to columns ``column`` to ``column + 3`` of the system (r, 8)."""
     for k in range(motions.shape[0]):
         H = motions[k]
         for i in range(4):
@@ -407,7 +410,7 @@ def set_point_columns(motions: FloatArray, A: FloatArray, system: FloatArray, co
 
 @kernel
 def set_plane_columns(motions: FloatArray, a: FloatArray, system: FloatArray, column: int) -> None:
-    """``Ĥ_kᵀ a`` of the motions (r, 4, 4) into columns ``column`` to ``column + 3`` of the system (r, 8)."""
+    """Write ``Ĥ_kᵀ a`` of the motions (r, 4, 4) to columns ``column`` to ``column + 3`` of the system (r, 8)."""
     for k in range(motions.shape[0]):
         H = motions[k]
         for i in range(4):
@@ -429,8 +432,8 @@ def stacked_singular(operators: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @kernel
 def regular_freedoms(operators: FloatArray, least: float) -> tuple[Freedoms, bool]:
-    """The freedoms of an arm of six joints at most, if its stacked operators (n, 4, 4) surely have no singular value
-    below ``least`` times the largest; whether they have none.
+    """The freedoms of an arm of at most six joints, and whether its stacked operators (n, 4, 4) certainly have no
+    singular value below ``least`` times the largest.
     """
     n = operators.shape[0]
     found = Freedoms(np.empty((n, 4, 4)), np.empty((n, n)))
@@ -459,12 +462,13 @@ def singular_freedoms(operators: FloatArray, V: FloatArray, values: FloatArray) 
 
 @kernel
 def normal_frame(points: FloatArray, centres: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Change of frame (4, 4), and its inverse, in which ``points`` (k, 4) and places a little way from their middle to
-    each of ``centres`` (c, 4), all of one height, have the identity as their second moment; the identity where they
-    span no space.
+    """Change of frame (4, 4), and its inverse, which normalises the second moment to the identity. The moment is that
+    of ``points`` (k, 4) and of points at a small distance from their centroid towards each of ``centres`` (c, 4), all
+    of one height. The identity if these span no space.
 
-    Coordinates there are the same up to a rotation of 4-vectors, whatever projective frame the arguments come from: so
-    are norms, angles and singular values of what is conjugated with it. By Gram and Schmidt from the points' rows.
+    Coordinates in the new frame are unique up to a rotation of 4-vectors, whatever projective frame the arguments are
+    in. So norms, angles and singular values of conjugated matrices do not depend on it. By Gram-Schmidt
+    orthogonalisation of the points' rows.
     """
     k, c = points.shape[0], centres.shape[0]
     rows = np.empty((k + c, 4))
@@ -483,7 +487,7 @@ def normal_frame(points: FloatArray, centres: FloatArray) -> tuple[FloatArray, F
         before = 0.0
         for p in range(k + c):
             before += rows[p, i] ** 2
-        for _ in range(2):  # once more: what is left of a column may be small
+        for _ in range(2):  # twice, because the remainder of a column may be small
             for h in range(i):
                 along = 0.0
                 for p in range(k + c):

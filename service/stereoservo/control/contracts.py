@@ -1,7 +1,7 @@
 """Contract of control laws as a pytest suite for any law, third-party ones included: velocities are finite,
 deterministic, independent of the projective frame and within given rates, and converge on a virtual two-camera cell.
 
-Subclass `LawContract` in a module of tests and set ``law``; pytest runs the rest::
+Subclass `LawContract` in a test module and set ``law``; pytest runs the rest::
 
     class TestMine(LawContract):
         law = mine.LAW
@@ -27,10 +27,10 @@ DT_S = 0.04
 
 @dataclass
 class VirtualCell:
-    """A six-joint arm with a plate of four markers before two cameras, hidden by a projective frame.
+    """A six-joint arm with a plate of four markers in front of two cameras, expressed in a projective frame.
 
     ``frame`` (4, 4) maps metric rig coordinates [m] to the frame in which the law works. The arm has three prismatic
-    and three revolute joints, the latter through the plate's middle; ``q`` (6,) are its joints.
+    and three revolute joints, the latter through the plate's centroid; ``q`` (6,) are its joints.
     """
 
     frame: FloatArray
@@ -61,7 +61,9 @@ class VirtualCell:
         return self.home @ self.frame.T @ displacement(self.generators, Composition.BASE_FIRST, q).T
 
     def scene(self, q: FloatArray, cameras: tuple[float, float] = (1.0, 1.0)) -> Scene:
-        """The scene at joints ``q``; ``cameras`` are the weights [1/px] of their markers, 0 for one that is blind."""
+        """The scene at joints ``q``; ``cameras`` are the weights [1/px] of their markers, 0 for a camera that sees
+        nothing.
+        """
         points = self.points(q)
         return Scene(
             moved_operators(self.generators, Composition.BASE_FIRST, q), int(Composition.BASE_FIRST), self.matrices,
@@ -69,7 +71,7 @@ class VirtualCell:
         )  # fmt: skip
 
     def task(self, scene: Scene, q_goal: FloatArray, *, known: bool = True) -> Task:
-        """The goal that the plate has at joints ``q_goal``; its pose not ``known``: by its pixels alone."""
+        """The goal of the plate at joints ``q_goal``; without ``known`` by its pixels alone, its pose unknown."""
         targets = self.points(q_goal)
         shown = targets if known else np.zeros_like(targets)
         return Task(
@@ -92,18 +94,18 @@ def error_px(scene: Scene, task: Task) -> float:
 
 
 class LawContract:
-    """Subclass under pytest and set ``law``. What a law must keep: a well-formed and finite velocity, the same for the
+    """Tests of a law: subclass it under pytest and set ``law``.
 
-    same input, independent of the projective frame, within the rates that it is given, and descent to the goal in
-    closed loop, with one camera too where the law declares it.
+    Required: a well-formed and finite velocity, the same for the same input, independent of the projective frame,
+    within the given rates, and descent to the goal in closed loop, with one camera too if the law declares it.
     """
 
     law: Law
     start_rad = 0.15
-    """Of each joint at the start, at most [rad or m]; a third of it for prismatic ones."""
+    """Largest initial displacement of each joint [rad or m]; a third of it for prismatic ones."""
     converged_px = 0.05
     steps = 400
-    """Of `DT_S` with gain 1/s, in which the error must have come below ``converged_px``."""
+    """Steps of `DT_S` with gain 1/s after which the error must be below ``converged_px``."""
 
     @pytest.fixture(params=[0, 1, 2])
     def cell(self, request: pytest.FixtureRequest) -> VirtualCell:
@@ -163,7 +165,9 @@ class LawContract:
         )
 
     def test_it_reduces_its_own_error(self, cell: VirtualCell) -> None:
-        """Finite differences along the velocity: the error falls, of a law without components that in the images."""
+        """Finite differences along the velocity: the error decreases; for a law without components, the error in the
+        images.
+        """
         scene, task = self.problem(cell)
         step = self.run(scene, task, Options(1.0))
         assert np.abs(step.velocity).max() > 0.0
@@ -214,7 +218,7 @@ class LawContract:
 
     @staticmethod
     def _rates(scene: Scene, task: Task, velocity: FloatArray) -> tuple[float, float]:
-        """Turn rate [rad/s] of the body and speed of its centre in the frame's coordinates."""
+        """Rotation rate [rad/s] of the body and speed of its centre in the frame's coordinates."""
         twist = np.tensordot(velocity, scene.operators, axes=1)
         return float(np.sqrt(max(0.0, -0.5 * np.trace(twist @ twist)))), float(
             np.linalg.norm(twist @ task.centre)

@@ -1,10 +1,11 @@
-"""Faces of a marker body: which of the coplanar groups of its markers are faces, and which side of them is outward,
-from what cameras see; which faces the cameras see along a path; and the choice of the three markers that a control law
-servoes: of one face, seen in most cameras, largest in the images.
+"""Faces of a marker body: which of the coplanar groups of its markers are faces, and which side of them is outward, as
+observed by cameras; which faces the cameras see along a path; and the choice of the three markers that a control law
+uses: of one face, seen in most cameras, largest in the images.
 
-A face has no other marker on one of its sides; that is where the body is, the other one is out, unless the cameras
-that see its markers say otherwise (an inner corner). Planes are signed minors of three markers in outward order: with
-camera centres O of height 1, ``aᵀO > 0`` where the front is seen (7.4.2).
+A face has no other marker on one of its sides; that side is outward, and the body is on the other one, unless the
+cameras that see its markers show the opposite (an inner corner). Planes are signed minors of three markers in outward
+order:
+with camera centres O of height 1, ``aᵀO > 0`` where the front is seen (7.4.2).
 """
 
 from __future__ import annotations
@@ -22,28 +23,33 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import Fields, kernel, plain
 
 LEAST_ALTITUDE = 10.0
-"""Least altitude of a triangle in an image that counts as a face's sight, in deviations of its worst marker."""
+"""Least altitude of a triangle in an image for its face to count as seen, in standard deviations of its
+worst marker.
+"""
 CLEARLY_BETTER = 2.0
-"""Ratio of image areas from which on another triangle takes over."""
+"""Ratio of image areas above which another triangle is chosen instead."""
 MOST_TRIED = 24
-"""Markers of a face of which every three are tried; of more, so many that are spread out in the images."""
+"""Number of markers of a face of which all triples are tried; if there are more, as many that are spread out in the
+images.
+"""
 LEAST_TRIED = 6
 LOOKS = 32_768
-"""Triangles times cameras of one choice, at most: of a body with many large faces fewer markers of each are tried, but
-`LEAST_TRIED`.
+"""Largest number of triangles times cameras in one choice: for a body with many large faces fewer markers of each are
+tried, but at least `LEAST_TRIED`.
 """
 LASTING = 8.0
-"""How many times its area a triangle counts that shows its front at the goal too."""
+"""Factor on the area of a triangle that shows its front at the goal too."""
 SEEN_TO_PX = 0.1
-"""Deviation of markers for which it is asked beforehand on which face a law will work."""
+"""Standard deviation of markers [px] assumed when the face of a law is determined in advance."""
 
 
 class Faces(NamedTuple):
     """f faces of a body of m markers.
 
-    ``triples`` (f, 3): three of the markers, in outward order; ``members`` (f, m) 1 where a marker belongs to it, in
-    some cases to several. ``sided`` (f,) 0 where nothing tells which side is out. ``body`` (m, 4): the markers when the
-    faces were found, which fixes the order.
+    ``triples`` (f, 3): three of the markers, in outward order.
+    ``members`` (f, m): 1 where a marker belongs to the face; some markers belong to several.
+    ``sided`` (f,): 0 where the outward side is unknown.
+    ``body`` (m, 4): the markers when the faces were found, which defines the order.
     """
 
     triples: IntArray
@@ -67,9 +73,11 @@ def find_faces(
 ) -> Faces:
     """The faces of a body of markers ``points`` (m, 4), heights 1, of which the cameras see ``seen`` (c, m) there.
 
-    ``matrices``, ``sigma_px``, ``operators``, ``limit``: see `find_groups`. Likewise ``camera_centres`` (c, 4), with
-    ``seen``: of cameras that saw the body in several poses, ``H_i⁻¹O``; the more, the surer. Raises ValueError for
-    arrays that do not fit and for numbers that are not finite.
+    ``matrices``, ``sigma_px``, ``operators``, ``limit``: see `find_groups`.
+    ``camera_centres`` (c, 4), with ``seen``: may include cameras that saw the body in several poses, ``H_i⁻¹O``; more
+    of them give more reliable faces.
+
+    Raises ValueError for arrays of wrong shapes and for numbers that are not finite.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     seen = np.ascontiguousarray(seen, dtype=np.float64)
@@ -95,8 +103,8 @@ def select_faces(
 
     Regular bodies have coplanar markers that are no face: chamfers, diagonals. Groups of four and more come first,
     those that no camera sees in part before others, those of many markers before few, round before narrow, as long as
-    they bring three new markers; then what is left takes part in planes with no marker on one side. Markers inside the
-    body, on no such plane, belong to no face.
+    they add three new markers; then the remaining markers are assigned to planes with no marker on one side. Markers
+    inside the body, on no such plane, belong to no face.
     """
     counts = np.diff(groups.starts)
     whole = seen_whole(groups.starts, groups.members, seen)
@@ -106,10 +114,11 @@ def select_faces(
 
 
 class Sights(NamedTuple):
-    """What shows along a way of K samples: ``fronts`` (K, f, c) 1 where a camera has a face's front.
+    """Visible faces along a path of K samples: ``fronts`` (K, f, c) 1 where a camera sees a face's front.
 
-    ``lead`` (K,): the face that most cameras have, the former as long as it is as good, -1 where none has any;
-    ``cameras`` (K,): how many have it.
+    ``lead`` (K,): the face seen by most cameras; the previous one is kept as long as it is equally good; -1 where no
+    face is seen.
+    ``cameras`` (K,): the number of cameras that see it.
     """
 
     fronts: FloatArray
@@ -120,9 +129,10 @@ class Sights(NamedTuple):
 def sights_along(
     faces: Faces, points: FloatArray, displacements: FloatArray, camera_centres: FloatArray
 ) -> Sights:
-    """Which faces of the body at ``points`` (m, 4) the cameras have along ``displacements`` (K, 4, 4) of it.
+    """Which faces of the body at ``points`` (m, 4) the cameras see along its ``displacements`` (K, 4, 4).
 
-    Samples without a lead, or with fewer cameras than a law needs, are stretches that only the kinematics carry.
+    Samples without a lead, or with fewer cameras than a law needs, are sections that are controlled by kinematics
+    alone.
     """
     fronts = faces_fronting(
         np.ascontiguousarray(points),
@@ -145,11 +155,13 @@ def sights_along(
 
 
 class FaceChoice(NamedTuple):
-    """On what a law shall work now.
+    """The markers that a law uses now.
 
-    ``face``: its index, -1 where the three markers are of several; ``triple`` (3,): their indices, in outward order.
-    ``cameras``: how many see them, 0: none does, and no law can work. ``kept`` (c,): 1 for the cameras that have the
-    face's front now and at the goal, whose sight of it is kept. ``changed``: other markers than before.
+    ``face``: its index, -1 if the three markers are of several faces.
+    ``triple`` (3,): their indices, in outward order.
+    ``cameras``: number of cameras that see them; 0: none does, and no law can work.
+    ``kept`` (c,): 1 for the cameras that see the face's front now and at the goal, and must keep it visible.
+    ``changed``: other markers than before.
     """
 
     face: int
@@ -160,17 +172,17 @@ class FaceChoice(NamedTuple):
 
 
 NOT_CHOSEN = FaceChoice(-2, np.zeros(3, np.int64), 0, np.zeros(0), False)
-"""What stands in for the choice before the first."""
+"""The value before the first choice."""
 
 
 def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT_CHOSEN) -> FaceChoice:
-    """The three markers on which a law shall work now.
+    """The three markers that a law uses now.
 
-    Of one face, seen in most cameras; among these, of largest image area in units of the noise, which prefers what is
-    spread, near and frontal. A face whose front some camera has at the goal too counts for more. Only markers that have
-    a point now (finite) and at the goal (``target_known``). The former choice stays until a marker of it is hidden,
-    more cameras see another, or another is twice as large. Where no camera sees three markers of one face, any three
-    do.
+    They belong to one face, seen in most cameras. Among such triples the one with the largest image area in units of
+    the noise is chosen, which prefers spread, near and frontal markers. A face whose front some camera sees at the goal
+    too has a larger weight. Only markers with a current point (finite) and one at the goal (``target_known``) are used.
+    The previous choice is kept until one of its markers is hidden, more cameras see another triple, or another is twice
+    as large. If no camera sees three markers of one face, any three are used.
     """
     shown, goal = (scene.points, scene.pixels, scene.weights), (task.target_points, task.target_known)
     face, triple, cameras, kept = _choose_face(
@@ -181,9 +193,9 @@ def choose_face(faces: Faces, scene: Scene, task: Task, before: FaceChoice = NOT
 
 
 def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
-    """The scene for a law that keeps sight of its face: without the cameras that lose it at the goal or have it not.
+    """The scene for a law that keeps its face visible: without the cameras that do not see it now or at the goal.
 
-    Their way cannot be the face's front; what they see of the markers stays.
+    The path cannot depend on these cameras; their observations of the markers are kept.
     """
     if all(choice.kept.tolist()):
         return scene
@@ -195,8 +207,8 @@ def law_scene(scene: Scene, choice: FaceChoice) -> Scene:
 
 
 class ShownBody(NamedTuple):
-    """The markers of a body as they are: ``points`` (m, 4), and in c cameras ``pixels`` (c, m, 2) and ``weights``
-    (c, m), 0 where a marker is not seen.
+    """The current markers of a body: ``points`` (m, 4), and in c cameras ``pixels`` (c, m, 2) and ``weights`` (c, m), 0
+    where a marker is not seen.
     """
 
     points: FloatArray
@@ -205,15 +217,15 @@ class ShownBody(NamedTuple):
 
 
 class BodyGoal(NamedTuple):
-    """Where the markers of a body shall be: ``points`` (m, 4) where ``known`` (m,) is 1."""
+    """The markers of a body at the goal: ``points`` (m, 4) where ``known`` (m,) is 1."""
 
     points: FloatArray
     known: FloatArray
 
 
 class Triangle(NamedTuple):
-    """Three markers, ``triple`` (3,), and the ``face`` that they are of: -1 where they are of several, -2 before the
-    first choice.
+    """Three markers, ``triple`` (3,), and their ``face``: -1 if they are of several, -2 before the first
+    choice.
     """
 
     face: int
@@ -222,7 +234,7 @@ class Triangle(NamedTuple):
 
 @kernel
 def seen_whole(starts: IntArray, members: IntArray, seen: FloatArray) -> IntArray:
-    """1 (g,) where no camera of ``seen`` (c, m) sees only a part of a group, else 0. See `MarkerGroups`."""
+    """(g,) 1 where no camera of ``seen`` (c, m) sees only a part of a group, else 0. See `MarkerGroups`."""
     groups = starts.shape[0] - 1
     whole = np.ones(groups, np.int64)
     for g in range(groups):
@@ -240,10 +252,11 @@ def seen_whole(starts: IntArray, members: IntArray, seen: FloatArray) -> IntArra
 def covering_groups(
     starts: IntArray, members: IntArray, sides: IntArray, rank: IntArray, markers: int
 ) -> IntArray:
-    """Which groups, in the order of their ``rank`` (g,), are faces: they bring markers that none before has.
+    """Which groups, in the order of their ``rank`` (g,), are faces: those that add markers not in a previous one.
 
-    First those of four and more with nothing on one side, then those of four and more at all, three new markers each;
-    then any with nothing on one side, one new marker each.
+    First those of four and more with no marker on one side, then all others of four and more, if they add three new
+    markers each;
+    then any with no marker on one side, if they add one new marker each.
     """
     groups = rank.shape[0]
     left = np.ones(markers, np.int64)
@@ -273,7 +286,7 @@ def outward_faces(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Triples (f, 3) in outward order, members (f, m) and whether the outward side is known (f,) of the `Faces`.
 
-    What cameras see outweighs where the rest of the body is.
+    Observations of cameras take precedence over the position of the rest of the body.
     """
     triples, starts, members, sides, _ = groups
     chosen = covering_groups(starts, members, sides, rank, points.shape[0])
@@ -310,10 +323,11 @@ def faces_fronting(
     displacements: FloatArray,
     camera_centres: FloatArray,
 ) -> FloatArray:
-    """1 (K, f, c) where a face of the body, moved by ``displacements`` (K, 4, 4), shows its front; else 0.
+    """(K, f, c) 1 where a face of the body, moved by ``displacements`` (K, 4, 4), shows its front; else 0.
 
-    ``points`` (m, 4) now, of height 1 like ``camera_centres`` (c, 4); ``triples`` (f, 3) in outward order; a face whose
-    outward side is not known, ``sided`` (f,) 0, counts as seen from both.
+    ``points`` (m, 4): current ones, of height 1 like ``camera_centres`` (c, 4).
+    ``triples`` (f, 3): in outward order.
+    ``sided`` (f,): 0 for a face with unknown outward side, which counts as seen from both.
     """
     samples, faces, cameras = displacements.shape[0], triples.shape[0], camera_centres.shape[0]
     out = np.ones((samples, faces, cameras))
@@ -336,12 +350,14 @@ def faces_fronting(
 def kept_faces(
     faces: Faces, points: FloatArray, targets: FloatArray, matrices: FloatArray, camera_centres: FloatArray
 ) -> IntArray:
-    """Outward triples (k, 3) of the faces that some camera has both now and at the goal: those that a plan must keep.
+    """Outward triples (k, 3) of the faces that some camera sees both now and at the goal: a plan must keep these
+    visible.
 
-    That on which a law will work leads, for the way is turned by it: which of two alike faces the model names first is
-    a matter of noise. Empty where the body turns so far that no face lasts: the way has to hand over
-    (`sights_along`). Faces whose side is not known ask for nothing. Contiguous ``points``,
-    ``targets`` (m, 4), ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4).
+    The face that a law will use comes first, because it determines the path; the order of two equivalent faces in the
+    model is arbitrary. Empty if the body rotates so far that no face remains visible: then the path has to change faces
+    (`sights_along`). Faces with unknown side impose no constraint.
+
+    ``points``, ``targets`` (m, 4), ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4): contiguous arrays.
     """
     triples, sided = faces.triples, faces.sided
     eye = np.eye(4).reshape((1, 4, 4))
@@ -384,7 +400,9 @@ def _kept_rows(rows: FloatArray, kept: FloatArray) -> FloatArray:
 
 @kernel
 def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
-    """Cameras that see a triangle well, and its areas there, in squared deviations of its worst marker, summed."""
+    """Number of cameras that see a triangle well, and the sum of its areas there, in squared standard deviations of its
+    worst marker.
+    """
     count, area = 0, 0.0
     for c in range(weights.shape[0]):
         weight = min(weights[c, i], weights[c, j], weights[c, k])
@@ -407,7 +425,7 @@ def spread_in_images(
 ) -> IntArray:
     """At most ``count`` of the ``candidates`` (k,), ascending, each the farthest in the images from those before it.
 
-    ``pixels`` (c, m, 2); two markers are apart in the cameras that see both, ``weights`` (c, m) above 0.
+    ``pixels`` (c, m, 2): distances are taken in the cameras that see both markers, ``weights`` (c, m) above 0.
     """
     k = candidates.shape[0]
     if k <= count:
@@ -415,7 +433,7 @@ def spread_in_images(
     chosen = np.zeros(k, np.bool_)
     nearest = np.empty(k)
     latest = 0
-    for nth in range(count + 1):  # the first one only tells which is the farthest from it
+    for nth in range(count + 1):  # the first one only serves to find the farthest from it
         far = -1
         for a in range(k):
             i, j = candidates[latest], candidates[a]
@@ -435,7 +453,8 @@ def spread_in_images(
 
 @kernel
 def markers_tried(members: FloatArray, usable: FloatArray, cameras: int) -> int:
-    """Of how many ``usable`` (m,) markers of each face every three are tried: `MOST_TRIED`, or as `LOOKS` allows.
+    """Number of ``usable`` (m,) markers of each face of which all triples are tried: `MOST_TRIED`, or fewer according
+    to `LOOKS`.
 
     ``members`` (f, m).
     """
@@ -465,7 +484,7 @@ def choose_triangle(
     weights: FloatArray,
     before: Triangle,
 ) -> tuple[int, IntArray, int]:
-    """Face (-1: across faces), its three markers and the cameras that see them (0: there are none).
+    """Face (-1: across faces), its three markers and the number of cameras that see them (0: there are none).
 
     See `choose_face`; the order of the markers is not yet outward. ``lasting`` (f,), ``usable`` (m,).
     """
@@ -475,7 +494,7 @@ def choose_triangle(
     best_face, best_count, best_area = -1, 0, 0.0
     candidates = np.empty(markers, np.int64)
     most = markers_tried(members, usable, weights.shape[0])
-    # faces first; across faces only where none is seen
+    # faces first; across faces only if none is seen
     for f in range(faces + 1):
         if f == faces and best_count > 0:
             break
@@ -538,7 +557,7 @@ def choose_face_step(
     if face >= 0 and sided[face] > 0.0:
         outward = minors(body[triples[face, 0]], body[triples[face, 1]], body[triples[face, 2]])
         side = dot(outward, minors(body[i], body[j], body[k]))
-    else:  # the side that most cameras see
+    else:  # the side seen by most cameras
         plane = minors(points[i], points[j], points[k])
         for c in range(cameras):
             if weights[c, i] > 0.0 and weights[c, j] > 0.0 and weights[c, k] > 0.0:

@@ -1,16 +1,17 @@
 """Constant-velocity Kalman filter of each marker's pixels in each camera (thesis 9.3), for set-points streamed at any
 rate; and the offset between a client's clock and the daemon's.
 
-A pixel moves as ``ẍ = white noise`` of spectral density ``q`` [px²/s³] and is measured with a deviation ``sigma``
-[px], both axes alike and independent: with ``F = [1 T; 0 1]`` and ``Q = q [T³/3 T²/2; T²/2 T]`` over a step T, which
-adds up over any division of time, so that irregular stamps need nothing special. At a regular T the gains settle at
-``(α, β/T)`` with
+A pixel moves as ``ẍ = white noise`` of spectral density ``q`` [px²/s³] and is measured with a standard deviation
+``sigma`` [px], both axes equally and independently: with ``F = [1 T; 0 1]`` and ``Q = q [T³/3 T²/2; T²/2 T]`` over a
+step T.
+These are additive over any division of time, so irregular stamps need no special treatment. At a regular T the gains
+converge to ``(α, β/T)`` with
 
     β² / (1 − α) = q T³ / sigma²,        α² = (2 − α) β − β² / 6,
 
-the fixed point of the covariance recursion written by its entries (Kalata 1984 has the same for noise that is
-constant over a step; Bar-Shalom, Li, Kirubarajan 2001, ch. 6.5). For set-points that a client streams
-it gives their rates; for measured features the velocity that damping needs (`control.pd`).
+the fixed point of the covariance recursion written by its entries (Kalata 1984 has the same for noise that is constant
+over a step; Bar-Shalom, Li, Kirubarajan 2001, ch. 6.5). For set-points that a client streams it gives their rates; for
+measured features the velocity that damping needs (`control.pd`).
 
 State is plain arrays, functions are pure.
 """
@@ -30,8 +31,10 @@ class TrackSettings(msgspec.Struct, frozen=True):
     """``sigma_px`` of one observation; ``density_px2_s3``: q, of the target's acceleration.
 
     A target whose acceleration is about A [px/s²] for about D [s] at a time has q = A² D; the default is of 400 px/s²
-    for 0.25 s. ``rate_px_s``: deviation of a velocity of which nothing is known. ``jump_sigmas``: an innovation beyond
-    so many of its deviations is a new target. ``gap_s``: after such a silence a marker is no longer tracked.
+    for 0.25 s.
+    ``rate_px_s``: standard deviation of an unknown velocity.
+    ``jump_sigmas``: an innovation beyond so many of its standard deviations is a new target.
+    ``gap_s``: after such a silence a marker is no longer tracked.
     """
 
     sigma_px: float = 0.2
@@ -50,9 +53,10 @@ class TrackSettings(msgspec.Struct, frozen=True):
 class TargetTrack(msgspec.Struct, frozen=True, eq=False):
     """Filtered pixels of c cameras and m markers.
 
-    ``positions`` (c, m, 2) [px] and ``rates`` (c, m, 2) [px/s] at ``stamps_s`` (c, m), where ``tracked`` (c, m) is 1;
-    ``covariance`` (c, m, 3) of an axis: position, position with rate, rate. ``stamp_s``: of the newest observation,
-    -inf before the first. ``ignored``: observations that were duplicates or came too late; ``jumps``: new targets.
+    ``positions`` (c, m, 2) [px] and ``rates`` (c, m, 2) [px/s] at ``stamps_s`` (c, m), where ``tracked`` (c, m) is 1.
+    ``covariance`` (c, m, 3): of an axis: position, position with rate, rate.
+    ``stamp_s``: of the newest observation, -inf before the first.
+    ``ignored``: number of observations that were duplicates or came too late; ``jumps``: number of new targets.
     """
 
     settings: TrackSettings
@@ -67,7 +71,7 @@ class TargetTrack(msgspec.Struct, frozen=True, eq=False):
 
 
 def empty_track(cameras: int, markers: int, settings: TrackSettings | None = None) -> TargetTrack:
-    """A track that has seen nothing."""
+    """A track without observations."""
     shape = (cameras, markers)
     return TargetTrack(
         settings=settings or TrackSettings(),
@@ -82,9 +86,10 @@ def empty_track(cameras: int, markers: int, settings: TrackSettings | None = Non
 def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: FloatArray) -> TargetTrack:
     """The track after one more observation: ``pixels`` (c, m, 2) where ``wanted`` (c, m) is not 0 and they are finite.
 
-    One that is not newer than the newest is ignored. A marker that the observation leaves out goes on at its rate
-    until ``gap_s`` after its own last one. Where any marker jumps, all of the observation start anew, at rest: one
-    body has gone elsewhere. Raises ValueError for a stamp that is not finite, and for other shapes than the track's.
+    An observation that is not newer than the newest is ignored. A marker missing in the observation continues at its
+    rate until ``gap_s`` after its own last one. If any marker jumps, all markers of the observation restart at rest,
+    because they are on one body. Raises ValueError for a stamp that is not finite, and for other shapes than the
+    track's.
     """
     if not math.isfinite(stamp_s):
         raise ValueError(f"stamp_s is {stamp_s}; a finite time is needed")
@@ -111,8 +116,8 @@ def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: Floa
 def predict(track: TargetTrack, t_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels (c, m, 2), rates (c, m, 2) [px/s] and tracked (c, m) at ``t_s``, in the time of the stamps.
 
-    Beyond ``gap_s`` after its last observation a marker stands where it was at that time, with rate 0: a client that
-    has fallen silent moves nothing any more.
+    Later than ``gap_s`` after its last observation a marker stays at its position at that time, with rate 0: a silent
+    client moves nothing.
     """
     return predict_track(
         track.positions, track.rates, track.stamps_s, track.tracked, t_s, track.settings.gap_s
@@ -123,7 +128,7 @@ def predict(track: TargetTrack, t_s: float) -> tuple[FloatArray, FloatArray, Flo
 def update_track(
     track: Fields, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: Fields
 ) -> bool:
-    """One observation into a track's arrays; whether a marker jumped. See `observe`.
+    """Add one observation to a track's arrays; returns whether a marker jumped. See `observe`.
 
     ``track``: the fields of `TargetTrack` from ``positions`` to ``tracked``; ``constants``: those of `TrackSettings`.
     """
@@ -216,9 +221,10 @@ def predict_track(
 
 
 class ClientClock(msgspec.Struct, frozen=True):
-    """How a client's stamps lie to the times at which they arrive: ``offset_s`` = arrival less stamp, of the fastest.
+    """Offset between a client's stamps and their times of arrival: ``offset_s`` = arrival minus stamp, of the fastest
+    message.
 
-    ``drift`` [s/s]: how fast a later, slower message may pull it up, so that clocks may run apart.
+    ``drift`` [s/s]: rate at which later, slower messages may increase it, so that drifting clocks are followed.
     """
 
     offset_s: float | None = None
@@ -227,9 +233,9 @@ class ClientClock(msgspec.Struct, frozen=True):
 
 
 def arrived(clock: ClientClock, stamp_s: float, arrival_s: float) -> ClientClock:
-    """The clock after a message: ``predict(track, now_s − offset_s)`` then asks in the client's time.
+    """The clock after a message: ``predict(track, now_s − offset_s)`` is then evaluated in the client's time.
 
-    The least delay of the way stays in the offset: it cannot be told from one side.
+    The smallest transmission delay remains in the offset: it cannot be measured from one side.
     """
     offset = arrival_s - stamp_s
     if clock.offset_s is not None:

@@ -1,9 +1,9 @@
-"""Control law of incidences: the joint velocity that brings points, lines and planes of the body onto points, lines
-and planes of the scene (thesis 2.5.3), with a second task in the null space. Also why it cannot go further.
+"""Control law of incidences: the joint velocity that moves points, lines and planes of the body onto points, lines and
+planes of the scene (thesis 2.5.3), with a second task in the null space. Also the reasons why it cannot continue.
 
-What a task leaves free stays as it is, or serves a second task in the null space. Lines and planes have no
-orientation: either way round is reached, whichever is nearer. The step runs
-`incidence_kernel.incidence_kernel`, whose module states how residuals are measured.
+Degrees of freedom that a task leaves free are not moved, or serve a second task in the null space. Lines and planes
+have no orientation: the nearer of the two orientations is reached. The step runs `incidence_kernel.incidence_kernel`,
+whose module defines the residuals.
 """
 
 from __future__ import annotations
@@ -49,36 +49,41 @@ KINDS = (
     "line-on-plane",
     "plane-on-plane",
 )
-"""By their codes 0 to 5; the words of the wire."""
+"""Names by their codes 0 to 5, as in messages."""
 
 FEATURES = ("point", "line", "plane")
 FINITE = 1e-6
-"""Height of a point at unit norm, relative to the plane's, below which it lies at infinity."""
+"""Height of a point at unit norm, relative to the plane's, below which it is at infinity."""
 FLAT = 1e-6
 """Sine below which points of a fixed feature coincide or are collinear."""
 
 
 class IncidenceStatus(IntEnum):
-    """What becomes of an incidence. Codes up to 2 are those of `planning.three_point_decomposition.ComponentStatus`."""
+    """Status of an incidence. Codes up to 2 are those of `planning.three_point_decomposition.ComponentStatus`."""
 
     MOVES = 0
     DONE = 1
     """Within the tolerance."""
     NOT_DRIVABLE = 2
-    """The arm, as it stands, has no motion that brings it nearer: a freedom is missing, or it is out of reach."""
+    """In its current posture the arm has no motion that reduces the error: a degree of freedom is missing, or the
+    target is out of reach.
+    """
     CONTRADICTS = 3
-    """Alone it could be brought nearer, but not without taking others farther off."""
+    """Its error could be reduced alone, but not without increasing those of others."""
     NOT_FINITE = 4
-    """A point is not known, or lies in a camera's focal plane; the velocity is zero."""
+    """A point is unknown, or in a camera's focal plane; the velocity is zero."""
 
 
 class IncidenceTask(NamedTuple):
     """k incidences as arrays.
 
-    ``kinds`` (k,) codes of `KINDS`. ``markers`` (k, 3): indices into ``Scene.points`` of the points that span the
-    moving feature, -1 where there are fewer. ``fixed`` (k, 3, 4): a point of height 1, then one direction of height
-    0 for a line, two for a plane, zero rows where there are fewer. ``tolerance_px`` [px]. ``drift`` (4, 4) [1/s]: twist
-    of the fixed features relative to the moving points, where either move by themselves; fed forward.
+    ``kinds`` (k,): codes of `KINDS`.
+    ``markers`` (k, 3): indices into ``Scene.points`` of the points that span the moving feature, -1 if there are fewer.
+    ``fixed`` (k, 3, 4): a point of height 1, then one direction of height 0 for a line, two for a plane, zero rows if
+    there are fewer.
+    ``tolerance_px`` [px].
+    ``drift`` (4, 4) [1/s]: twist of the fixed features relative to the moving points, if either move on their own; fed
+    forward.
     """
 
     kinds: IntArray
@@ -89,10 +94,15 @@ class IncidenceTask(NamedTuple):
 
 
 class IncidenceStep(NamedTuple):
-    """``velocity`` (n,) [rad/s or m/s]. ``error_px`` (k,): of each incidence, the largest distance over its points and
-    all cameras between a point's image and that of the nearest point of the feature [px]. ``status`` (k,):
-    `IncidenceStatus`. ``rank``: freedoms that the task takes. ``conditioning``: the smallest singular value that counts
-    over the largest, squared. ``share`` in [0, 1]: of the residual, what joints can still take away to first order.
+    """Result of a step.
+
+    ``velocity`` (n,) [rad/s or m/s].
+    ``error_px`` (k,): of each incidence, the largest distance over its points and all cameras between a point's image
+    and that of the nearest point of the feature [px].
+    ``status`` (k,): `IncidenceStatus`.
+    ``rank``: number of degrees of freedom that the task uses.
+    ``conditioning``: the smallest singular value that counts over the largest, squared.
+    ``share`` in [0, 1]: fraction of the residual that joints can still reduce to first order.
     """
 
     velocity: FloatArray
@@ -110,12 +120,15 @@ def incidence_task(
     plane_at_infinity: FloatArray,
     tolerance_px: float,
 ) -> IncidenceTask:
-    """An `IncidenceTask` of words and points.
+    """An `IncidenceTask` from names and points.
 
-    ``kinds`` of `KINDS`; ``markers``: indices into the scene's points, as many as span the moving feature; ``fixed``:
-    (1, 4), (2, 4) or (3, 4) points that span the fixed one, of any height, at infinity or not (a line given by a point
-    and a direction). Raises GeometryError for another number of points, points that span less than the feature, and
-    features wholly at infinity.
+    ``kinds``: of `KINDS`.
+    ``markers``: indices into the scene's points, as many as span the moving feature.
+    ``fixed``: (1, 4), (2, 4) or (3, 4) points that span the fixed one, of any height, at infinity or not (a line given
+    by a point and a direction).
+
+    Raises GeometryError for another number of points, points that span less than the feature, and features wholly at
+    infinity.
     """
     k = len(kinds)
     codes = np.zeros(k, dtype=np.int64)
@@ -140,9 +153,10 @@ def incidence_task(
 def feature_form(
     points: FloatArray, dimension: int, plane_at_infinity: FloatArray, name: str = "incidence"
 ) -> FloatArray:
-    """A fixed feature (3, 4) as `IncidenceTask` has it: a finite point of ``points`` and directions, zero rows below.
+    """A fixed feature (3, 4) in the form of `IncidenceTask`: a finite point of ``points`` and directions, zero rows
+    below.
 
-    ``points`` (dimension + 1, 4), of any height, some at infinity. No LAPACK, no BLAS: the core takes goals. Raises
+    ``points`` (dimension + 1, 4): of any height, some at infinity. No LAPACK, no BLAS: the core calls it. Raises
     GeometryError, naming ``name``, for another number of points, points that span less, features wholly at infinity.
     """
     what = FEATURES[dimension]
@@ -184,20 +198,22 @@ def feature_form(
 
 
 def no_second_task(n: int) -> SecondTask:
-    """The freedoms that are left stay as they are."""
+    """No second task: the remaining degrees of freedom are not moved."""
     return SecondTask(np.zeros((0, n)), np.zeros(0), np.zeros(0))
 
 
 def joint_task(
     positions: FloatArray, targets: FloatArray, wanted: FloatArray, scale: FloatArray, gain: float
 ) -> SecondTask:
-    """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: what of each is as much."""
+    """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: unit of each joint."""
     rates = np.where(wanted > 0.0, gain * (targets - positions), 0.0)
     return SecondTask(np.eye(len(positions)), rates, wanted / scale)
 
 
 def limits_task(positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float) -> SecondTask:
-    """Joints from their limits towards the middle of their ranges, the farther the stronger (`limit_pull`)."""
+    """Joints away from their limits towards the middle of their ranges, with a velocity that rises with the distance
+    from the middle (`limit_pull`).
+    """
     pull, half = limit_pull(positions, lower, upper)
     return SecondTask(np.eye(len(positions)), rate * half * pull, 1.0 / half)
 
@@ -210,7 +226,7 @@ def image_task(
     weights: FloatArray,
     gain: float,
 ) -> SecondTask:
-    """Points (m, 4), as predicted, towards set-points (c, m, 2) [px]; ``weights`` (c, m) = 1/sigma, 0: no set-point."""
+    """Predicted points (m, 4) towards set-points (c, m, 2) [px]; ``weights`` (c, m) = 1/sigma, 0: no set-point."""
     n = operators.shape[0]
     J = image_jacobian(operators, matrices, points)
     image = points[None, :, None, :] * matrices[:, None, :, :]
@@ -228,12 +244,14 @@ def incidence_step(
     second: SecondTask | None = None,
     metric: FloatArray | None = None,
 ) -> IncidenceStep:
-    """``q̇ = J⁺ (drift - gain e)`` by damped least squares and the least motion; the second task in the null space.
+    """``q̇ = J⁺ (drift - gain e)`` by damped least squares with the least motion; the second task in the null space.
 
-    Of the scene: ``operators``, ``composition``, ``matrices`` (two or more), ``points``. ``metric`` (n,) > 0: what a
-    unit of each joint's motion costs; None: the pixels by which it moves the points (`joint_metric`).
-    Damping rises where the residual, seen a step ``gain * dt_s`` ahead (at least a tenth), would not fall as the linear
-    model says.
+    Uses of the scene: ``operators``, ``composition``, ``matrices`` (two or more), ``points``.
+    ``metric`` (n,) > 0: cost of a unit of each joint's motion; None: the pixels by which it moves the points
+    (`joint_metric`).
+
+    The damping is increased if the residual, predicted a step ``gain * dt_s`` ahead (at least a tenth), would not
+    decrease as in the linear model.
     """
     n = scene.operators.shape[0]
     if metric is None:
@@ -251,7 +269,9 @@ def incidence_step(
 
 
 def incidence_reasons(step: IncidenceStep, task: IncidenceTask, names: Sequence[str]) -> tuple[Reason, ...]:
-    """Why the task goes no further: one reason a cause, its subject the ``names`` (k,) of the incidences concerned."""
+    """Why the task cannot continue: one reason for each cause, its subject the ``names`` (k,) of the incidences
+    concerned.
+    """
     reasons = []
     for status, code, hint in (
         (
@@ -281,7 +301,7 @@ def incidence_reasons(step: IncidenceStep, task: IncidenceTask, names: Sequence[
 
 
 DEAR = 10.0
-"""Cost of a motion that no joint makes, relative to one that joints make, so that these are used first."""
+"""Cost of a motion that no joint makes, relative to one that joints make, so that the latter are used first."""
 
 
 def incidence_freedoms(
@@ -293,12 +313,17 @@ def incidence_freedoms(
     tolerance: float = REACH,
     anywhere: bool = False,
 ) -> tuple[Freedom | None, ...]:
-    """For each incidence by itself the freedom that it lacks here, None where the arm brings it nearer in all respects.
+    """For each incidence alone, the degree of freedom that it lacks in this posture; None if the arm can reduce its
+    whole error.
 
-    To first order, as the arm stands: a freedom that is lost at a singularity counts as missing. ``anywhere``: only
-    one that the arm lacks wherever it stands (a SCARA's tilts, the turns of slides). What the body would have to do
-    besides all that the arm can is named; ``tolerance``: part of the residual that may be left, besides the task's
-    own. Raises GeometryError as `mobility.mobility` does.
+    To first order at the current posture: a degree of freedom lost at a singularity counts as missing. The result is
+    the motion that the body would need in addition to all motions of the arm.
+
+    ``anywhere``: only a degree of freedom that the arm lacks in every posture (a SCARA's tilts, the rotations of linear
+    axes).
+    ``tolerance``: fraction of the residual that may remain, in addition to the task's own tolerance.
+
+    Raises GeometryError as `mobility.mobility` does.
     """
     E = body_frame(
         scene.operators, scene.matrices, scene.points, plane_at_infinity, H_projective_to_euclidean
@@ -322,7 +347,7 @@ def incidence_freedoms(
         )
         step = incidence_step(scene, alone, options)
         body = incidence_step(free, alone, options, metric=cost)
-        # On a ridge, or at its goal, nothing tells the motion that is needed.
+        # At a maximum of the error, or at its goal, the required motion is undetermined.
         needed = step.error_px[0] > task.tolerance_px and body.share > 1.0 - tolerance
         unmade = math.sqrt(1.0 - step.share**2)
         if not needed or unmade <= tolerance or unmade * step.error_px[0] <= task.tolerance_px:

@@ -2,9 +2,9 @@
 planes, damped least-squares joint velocity, second task in the null space.
 
 A moving point X of the body and a fixed point, line or plane, ``base + Σ s_k d_k`` with ``base`` of height 1 and
-directions of height 0, are compared in the images: ``A`` (2c, 4), the gradient of X's pixels in all cameras, turns
-differences of points of height 1 into pixels. The residual is what of ``A (X - base)`` the feature's own directions
-``A d_k`` do not take up: three, two or one conditions on X, whatever the number of cameras.
+directions of height 0, are compared in the images: ``A`` (2c, 4), the gradient of X's pixels in all cameras, converts
+differences of points of height 1 into pixels. The residual is the part of ``A (X - base)`` outside the span of ``A
+d_k``: three, two or one conditions on X, whatever the number of cameras.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from stereoservo.numerics.linear import damped_least_squares, right_singular
 
 
 class Seen(NamedTuple):
-    """The arm (``operators`` (n, 4, 4), ``composition``) and what of b moving points counts, images as they are now.
+    """The arm (``operators`` (n, 4, 4), ``composition``) and the images of its b moving points, linearised at present.
 
-    ``points`` (m, 4), of which ``at`` (b,) are compared to ``bases`` (b, 4) by ``gradients`` (b, 2c, 4), less what the
-    orthonormal ``tangents`` (b, 2, 2c) take up.
+    ``points`` (m, 4), of which ``at`` (b,) are compared with ``bases`` (b, 4) by ``gradients`` (b, 2c, 4), without the
+    part in the span of the orthonormal ``tangents`` (b, 2, 2c).
     """
 
     operators: FloatArray
@@ -39,27 +39,29 @@ class Seen(NamedTuple):
 
 
 RANK = 2e-4
-"""Singular value of the scaled task Jacobian, relative to the largest, below which a direction is left alone."""
+"""Singular value of the scaled task Jacobian, relative to the largest, below which a direction is not used."""
 
 STATIONARY = 0.02
-"""Share of the residual that joints can still take away to first order, below which the task stands still."""
+"""Fraction of the residual that joints can still reduce to first order, below which the task is at rest."""
 
 MOSTLY = 0.25
-"""The same share where what can be taken away is less than the tolerance: noise keeps it from vanishing."""
+"""The same fraction if the reducible part is less than the tolerance: noise keeps it from vanishing."""
 
 WORTH = 1e-3
-"""Relative decrease of the squared residual, beyond the linear model's, from which on a way out of a rest counts."""
+"""Least relative decrease of the squared residual, in addition to the linear model's, for a motion that leaves a rest
+position.
+"""
 
 PROBE = 0.25
-"""Motion of such a probe, in parts of the residual."""
+"""Size of such a probing motion, relative to the residual."""
 
 ATTEMPTS = 10
 GROWTH = 8.0
 SUFFICIENT = 0.25
-"""Damping is raised until the residual, seen ahead, falls by this part of what the linear model says."""
+"""The damping is increased until the predicted residual decreases by this fraction of the linear model's decrease."""
 
 AHEAD = 0.1
-"""Least part of a whole step at which the residual is seen ahead."""
+"""Least fraction of a whole step at which the residual is predicted."""
 
 MOVES, DONE, NOT_DRIVABLE, CONTRADICTS, NOT_FINITE = 0, 1, 2, 3, 4
 """As `incidence.IncidenceStatus`."""
@@ -67,7 +69,7 @@ MOVES, DONE, NOT_DRIVABLE, CONTRADICTS, NOT_FINITE = 0, 1, 2, 3, 4
 
 @kernel
 def _squared(seen: Seen, motion: FloatArray) -> float:
-    """Squared residual [px²] after a ``motion`` (n,) of the joints, the images' gradients as they were."""
+    """Squared residual [px²] after a ``motion`` (n,) of the joints, with constant gradients of the images."""
     points = transform_points(displace(seen.operators, seen.composition, motion), seen.points)
     total = 0.0
     rows = seen.gradients.shape[1]
@@ -84,7 +86,7 @@ def _squared(seen: Seen, motion: FloatArray) -> float:
 
 @kernel
 def _reducible(J: FloatArray, e: FloatArray) -> float:
-    """Squared part of ``e`` (r,) that lies in the range of ``J`` (r, n), small singular values left out."""
+    """Squared part of ``e`` (r,) in the range of ``J`` (r, n), without small singular values."""
     rows, n = J.shape
     V, values = right_singular(J)
     part = 0.0
@@ -111,8 +113,8 @@ class Constraints(NamedTuple):
 
 
 class Regulation(NamedTuple):
-    """How a task is regulated: ``tolerance_px`` within which an incidence is done; ``gain`` [1/s], ``dt_s`` [s] and
-    ``damping`` as in `control.law.Options`; ``metric`` (n,) > 0: what a unit of each joint's motion costs.
+    """Parameters of the control: ``tolerance_px`` within which an incidence is done; ``gain`` [1/s], ``dt_s`` [s] and
+    ``damping`` as in `control.law.Options`; ``metric`` (n,) > 0: cost of a unit of each joint's motion.
     """
 
     tolerance_px: float
@@ -123,9 +125,9 @@ class Regulation(NamedTuple):
 
 
 class SecondTask(NamedTuple):
-    """What to do with the freedoms that are left: ``rows`` (r, n) times the velocity shall be ``rates`` (r,).
+    """A task for the remaining degrees of freedom: ``rows`` (r, n) times the velocity shall equal ``rates`` (r,).
 
-    ``weights`` (r,): 1/sigma of the rates, 0 where a row is not to be read. Build it by `no_second_task`, `joint_task`,
+    ``weights`` (r,): 1/sigma of the rates, 0 for a row that is not used. Build it by `no_second_task`, `joint_task`,
     `limits_task`, `image_task`.
     """
 
@@ -135,9 +137,13 @@ class SecondTask(NamedTuple):
 
 
 class Linearization(NamedTuple):
-    """The incidences to first order: ``J`` (b·2c, n) and ``e`` (b·2c,) [px] by the ``metric``, rows of a constraint's
-    moving points, ``rates`` (b·2c,) [px/s] at which the features leave these points by themselves, ``owner`` (b,) of
-    the blocks, the constraints' ``error`` (k,) [px], and whether all is ``finite``.
+    """The incidences to first order.
+
+    ``J`` (b·2c, n), ``e`` (b·2c,) [px]: by the ``metric``, rows of a constraint's moving points.
+    ``rates`` (b·2c,) [px/s]: rates at which the features leave these points on their own.
+    ``owner`` (b,): constraint of each block.
+    ``error`` (k,) [px]: of the constraints.
+    ``finite``: whether all values are finite.
     """
 
     J: FloatArray
@@ -150,7 +156,7 @@ class Linearization(NamedTuple):
 
 class Decomposition(NamedTuple):
     """Right singular vectors ``V`` and ``values`` of a Jacobian; ``along`` (n,): the error's components, 0 beyond
-    ``rank``; squares of the error in ``total`` and its drivable ``part``; ``conditioning``; drivable ``share``.
+    ``rank``; squares of the error in ``total`` and its reducible ``part``; ``conditioning``; reducible ``share``.
     """
 
     V: FloatArray
@@ -256,7 +262,7 @@ def incidence_kernel(
     regulation: Fields,
     second: Fields,
 ) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
-    """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, drivable share; see `incidence.IncidenceStep`.
+    """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, reducible share; see `incidence.IncidenceStep`.
 
     ``points`` (m, 4) in cameras ``matrices`` (c, 3, 4); the fields of a `PresentArm`, of `Constraints`, a `Regulation`
     and a `SecondTask`.
@@ -301,7 +307,7 @@ def incidence_kernel(
 def _feed_forward(
     velocity: FloatArray, linear: Linearization, found: Decomposition, metric: FloatArray, damping: float
 ) -> None:
-    """Add to ``velocity`` (n,) the least motion that keeps the moving points on features which move by themselves."""
+    """Add to ``velocity`` (n,) the least motion that keeps the moving points on features which move on their own."""
     n = velocity.shape[0]
     V, values = found.V, found.values
     for i in range(found.rank):
@@ -320,7 +326,7 @@ def _feed_forward(
 def _damped_step(
     seen: Seen, found: Decomposition, metric: FloatArray, damping: float, ahead: float, step: FloatArray
 ) -> None:
-    """A step (n,) of damped least squares whose residual, seen ahead, falls as the linear model says."""
+    """Compute a step (n,) of damped least squares whose predicted residual decreases as in the linear model."""
     n = step.shape[0]
     V, values, along, total = found.V, found.values, found.along, found.total
     largest = values[0] * values[0]
@@ -337,7 +343,7 @@ def _damped_step(
                 s -= V[j, i] * along[i] / (values[i] * values[i] + damp)
             step[j] = s / metric[j]
             look[j] = ahead * step[j]
-        # The rounding of the residual itself would decide below it.
+        # Below it the rounding of the residual itself would decide.
         if predicted <= 1e-12 * total:
             break
         left = _squared(seen, look)
@@ -355,9 +361,10 @@ def _way_out(
     part: float,
     step: FloatArray,
 ) -> bool:
-    """At rest far from the goal: the motion along a singular direction, either sense, that lowers the residual most.
+    """At rest far from the goal: the motion along a singular direction, of either sign, that reduces the residual most;
+    returns whether there is one.
 
-    Finds the way off a ridge (a line exactly across its target, half a turn), where the gradient vanishes.
+    It leaves a maximum of the error (a line exactly across its target, half a turn), where the gradient vanishes.
     """
     n = step.shape[0]
     size = PROBE * math.sqrt(total / seen.at.shape[0])
@@ -380,7 +387,9 @@ def _way_out(
 
 @kernel
 def _blame(J: FloatArray, e: FloatArray, owner: IntArray, rows: int, status: IntArray) -> None:
-    """Mark what stands in the way: alone movable, it contradicts others; else the arm cannot move it here."""
+    """Set the status of incidences that cannot be reached: if one could be moved alone, it contradicts others; else the
+    arm cannot move it here.
+    """
     for k in range(status.shape[0]):
         if status[k] == DONE:
             continue
@@ -404,14 +413,14 @@ def _blame(J: FloatArray, e: FloatArray, owner: IntArray, rows: int, status: Int
 def _second_task(
     velocity: FloatArray, found: Decomposition, second: SecondTask, metric: FloatArray, damping: float
 ) -> None:
-    """Add to ``velocity`` (n,) what serves the second task in the first one's null space: ``(S N)⁺ (ṡ - S q̇₁)``."""
+    """Add to ``velocity`` (n,) the second task in the first one's null space: ``(S N)⁺ (ṡ - S q̇₁)``."""
     V, rank = found.V, found.rank
     rows, rates, weights = second
     n = velocity.shape[0]
     count = rates.shape[0]
     if rank == n or count == 0:
         return
-    # In joint coordinates, by the projector: damping would depend on the choice of a basis of the null space.
+    # In joint coordinates, by the projector: otherwise damping would depend on the choice of a basis of the null space.
     projector = np.zeros((n, n))
     for i in range(n):
         for j in range(n):
@@ -433,15 +442,15 @@ def _second_task(
 
 
 METRIC_FLOOR = 0.01
-"""Least metric of a joint, relative to the largest: a joint that moves nothing in the images is not free of charge."""
+"""Least metric of a joint, relative to the largest: a joint that moves nothing in the images still has a cost."""
 
 DROPPED = 1e-9
-"""Length [px, relative to the direction's share before it] below which a direction is no further one."""
+"""Length [px, relative to that of the direction before it] below which a direction is not independent."""
 
 
 @kernel
 def moving_count(kind: int) -> int:
-    """How many points span the moving feature."""
+    """Number of points that span the moving feature."""
     return 3 if kind == 5 else (2 if kind >= 3 else 1)
 
 
@@ -487,7 +496,7 @@ def product(A: FloatArray, x: FloatArray, r: int) -> float:
 
 @kernel
 def feature_tangents(A: FloatArray, fixed: FloatArray, dimension: int) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal ``T`` (2, 2c) and directions ``D`` (2, 4) with ``A D_k = T_k``; zero rows where there are fewer."""
+    """Orthonormal ``T`` (2, 2c) and directions ``D`` (2, 4) with ``A D_k = T_k``; zero rows if there are fewer."""
     rows = A.shape[0]
     T = np.zeros((2, rows))
     D = np.zeros((2, 4))
@@ -520,7 +529,7 @@ def feature_tangents(A: FloatArray, fixed: FloatArray, dimension: int) -> tuple[
 
 @kernel
 def project_out(T: FloatArray, x: FloatArray) -> None:
-    """Remove from ``x`` (2c,) what the orthonormal rows of ``T`` (2, 2c) take up."""
+    """Remove from ``x`` (2c,) its components along the orthonormal rows of ``T`` (2, 2c)."""
     for k in range(2):
         s = 0.0
         for r in range(x.shape[0]):
@@ -535,7 +544,7 @@ def image_distance(
 ) -> float:
     """Largest distance [px] over the cameras between the images of ``X`` (4,) and of its nearest point of the feature.
 
-    To first order where that point does not lie before a camera as X does.
+    To first order if that point is not in front of a camera as X is.
     """
     rows = A.shape[0]
     Y = base.copy()

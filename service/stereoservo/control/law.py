@@ -19,24 +19,25 @@ from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 
 
 class JacobianChoice(IntEnum):
-    """Around what an image Jacobian is developed (8.1.1)."""
+    """Points at which an image Jacobian is evaluated (8.1.1)."""
 
     CURRENT = 0
-    """The present points."""
+    """The current points."""
     DESIRED = 1
-    """The points at the goal, with the operators at present."""
+    """The points at the goal, with the current operators."""
     MEAN = 2
-    """The mean of both: converges from farthest."""
+    """The mean of both: converges from the largest distance."""
     FIXED_DEPTH = 3
-    """The present pixels at the depths of the goal."""
+    """The current pixels at the depths of the goal."""
 
 
 class Scene(NamedTuple):
-    """The present: an arm of n joints, c cameras, m markers of the moving body.
+    """The current state: an arm of n joints, c cameras, m markers of the moving body.
 
-    ``operators`` (n, 4, 4) at the current configuration (5.21), ``composition`` a `kinematics.composition.Composition`.
-    ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4); ``points`` (m, 4), all of height ``a∞ᵀM = 1``. ``pixels``
-    (c, m, 2) ideal, ``weights`` (c, m) = 1/sigma [1/px], 0 where a marker is not seen.
+    ``operators`` (n, 4, 4): at the current configuration (5.21); ``composition``: a
+    `kinematics.composition.Composition`.
+    ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4); ``points`` (m, 4), all of height ``a∞ᵀM = 1``.
+    ``pixels`` (c, m, 2): ideal; ``weights`` (c, m) = 1/sigma [1/px], 0 where a marker is not seen.
     """
 
     operators: FloatArray
@@ -52,15 +53,16 @@ NO_JOINTS = np.zeros(0)
 
 
 class Task(NamedTuple):
-    """Where to go.
+    """The goal.
 
-    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0, and their velocities ``rates`` (c, m, 2)
-    [px/s], zero for a goal that stands. ``target_points`` (m, 4) of height 1 where ``target_known`` (m,) is 1.
-    ``centre`` now and ``centre_target``, (4,) of height 1: one point of the body. ``face`` (3,): markers that span
-    the face whose sight is kept.
+    ``set_points`` (c, m, 2): ideal pixels with ``wanted`` (c, m) 1 or 0, and their velocities ``rates`` (c, m, 2)
+    [px/s], zero for a static goal.
+    ``target_points`` (m, 4): of height 1 where ``target_known`` (m,) is 1.
+    ``centre``, ``centre_target`` (4,): a point of the body, of height 1, now and at the goal.
+    ``face`` (3,): markers that span the face that must stay visible.
 
-    Of a plan, for planned laws; empty where there is none: ``joint_rates`` (n,) [rad/s or m/s],
-    ``joint_error`` (n,) planned joints less the arm's, ``joint_weight`` [0, 1] what share of their weight they have.
+    Of a plan, for planned laws; empty without one: ``joint_rates`` (n,) [rad/s or m/s], ``joint_error`` (n,) planned
+    joints minus the arm's, ``joint_weight`` [0, 1] the fraction of their weight.
     """
 
     set_points: FloatArray
@@ -80,11 +82,13 @@ DAMPING = 1e-6
 
 
 class Options(NamedTuple):
-    """How to go there.
+    """Parameters of a step.
 
-    ``gain`` [1/s]. ``dt_s`` [s]: how long the velocity will be held; 0: the instantaneous law, to first order.
-    ``rotation_rate`` [rad/s], ``translation_rate`` [lengths of the frame's coordinates a second]: the largest that a
-    component may be driven at. ``damping`` relative to the largest diagonal of the normal matrix.
+    ``gain`` [1/s].
+    ``dt_s`` [s]: time for which the velocity will be held; 0: the instantaneous law, to first order.
+    ``rotation_rate`` [rad/s], ``translation_rate`` [lengths of the frame's coordinates a second]: the largest rates of
+    a component.
+    ``damping``: relative to the largest diagonal element of the normal matrix.
     """
 
     gain: float
@@ -96,9 +100,9 @@ class Options(NamedTuple):
 
 
 class LawStep(NamedTuple):
-    """``velocity`` (n,) [rad/s or m/s]. ``error`` (k,), ``allowed`` (k,), ``status`` (k,): of the law's components, see
-    `ComponentStatus` of the planning; k = 0 for laws in the images. ``conditioning``: of the normal matrix, 0
-    singular; 1 where there is none.
+    """Result of a step: ``velocity`` (n,) [rad/s or m/s]. ``error`` (k,), ``allowed`` (k,), ``status`` (k,): of the
+    law's components, see `ComponentStatus` of the planning; k = 0 for laws in the images. ``conditioning``: of the
+    normal matrix, 0 singular; 1 if there is none.
     """
 
     velocity: FloatArray
@@ -109,14 +113,16 @@ class LawStep(NamedTuple):
 
 
 Path = Literal["free", "straight", "planned"]
-"""Where a law leads the body: where its errors take it, on the straight line that is checked before, along a plan."""
+"""The path of the body under a law: free (determined by the errors), the straight line that is checked in advance, or a
+planned path.
+"""
 OneCamera = Literal["suffices", "continues", "refused"]
-"""What a law does with one camera: made for it, goes on by prediction once it has begun, or is refused."""
+"""Behaviour of a law with one camera: designed for it, continues by prediction once it has started, or is refused."""
 
 
 @dataclass(frozen=True)
 class LawProperties:
-    """What a user weighs when choosing a law: the row of a law in the table of docs/goals-and-laws.md, in Markdown."""
+    """Properties for choosing a law: its row in the table of docs/goals-and-laws.md, in Markdown."""
 
     centre: str
     face: str
@@ -128,24 +134,25 @@ class LawProperties:
 
 @dataclass(frozen=True)
 class Law:
-    """A control law as a plug-in: its step, what the daemon must know of it, and its words.
+    """A control law as a plug-in: its step, the properties that the daemon needs, and its texts.
 
-    ``step`` maps (Scene, Task, Options) to a LawStep. It is pure, allocates little and returns within a fraction of
-    the cycle. ``reasons`` of a step: what holds it up, empty where nothing does. ``components``, ``units``: of
-    ``LawStep.error``, which has as many elements.
-
-    ``needs_pose``: the step reads ``target_points``; ``path`` and ``one_camera``: see `Path` and `OneCamera`;
-    ``follows_streams``: the target may move while the law runs. ``options``: fields of a goal that belong to this
-    law, of ``centre``, ``jacobian`` and ``profile``.
+    ``step``: maps (Scene, Task, Options) to a LawStep. It is pure, allocates little and returns within a fraction of
+    the cycle.
+    ``reasons``: of a step: why it is held up, empty if it is not.
+    ``components``, ``units``: of ``LawStep.error``, which has as many elements.
+    ``needs_pose``: the step reads ``target_points``.
+    ``path``, ``one_camera``: see `Path` and `OneCamera`.
+    ``follows_streams``: the target may move while the law runs.
+    ``options``: fields of a goal that belong to this law, of ``centre``, ``jacobian`` and ``profile``.
 
     ``kernel``: the same step in one compiled call, bit for bit. It takes an array (1,) of a record,
-    `core.context.WORKSPACE`, which has the fields of Scene and Task packed (``weights`` as ``usable``, ``points`` as
-    ``body``; of the cameras that keep sight of the face the centres as ``eyes``) and of Options ``gain``, ``dt_s`` and
-    ``jacobian_choice``, whose rest is as by default; it fills in ``velocity``, ``components`` (errors, then what
-    is allowed), ``component_status`` and ``conditioning``. None: the step is called.
+    `core.context.WORKSPACE`, which contains the fields of Scene and Task packed (``weights`` as ``usable``, ``points``
+    as ``body``; ``eyes``: the centres of the cameras that must keep the face visible) and of Options ``gain``, ``dt_s``
+    and ``jacobian_choice``; the other options have their defaults. It writes ``velocity``, ``components`` (errors, then
+    the allowed parts), ``component_status`` and ``conditioning``. None: the step is called.
     For the kernel of a law without components no face is chosen.
 
-    ``summary``: one line for lists. ``colour``: in figures. ``rank``: where the law stands in lists.
+    ``summary``: one line for lists. ``colour``: in figures. ``rank``: position of the law in lists.
     """
 
     step: Callable[[Scene, Task, Options], LawStep]

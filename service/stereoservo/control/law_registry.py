@@ -22,7 +22,7 @@ OPTIONS = ("centre", "jacobian", "profile")
 
 
 class UnknownLawError(KeyError):
-    """No usable law has this name; the message lists those that there are, and a broken one's error."""
+    """No usable law has this name; the message lists the usable ones, and the error of a broken one."""
 
     def __init__(self, name: str, known: tuple[str, ...], error: str = "") -> None:
         super().__init__(name)
@@ -56,20 +56,20 @@ class LawRegistry(Mapping[str, Law]):
 
     @property
     def errors(self) -> Mapping[str, str]:
-        """Of the laws that are installed and cannot be used, by name."""
+        """Errors of installed laws that cannot be used, by name."""
         self._loaded()
         return self._errors
 
     def unknown(self, name: str) -> UnknownLawError:
-        """What is wrong with a name that no usable law has."""
+        """The error for a name that no usable law has."""
         return UnknownLawError(name, tuple(self._loaded()), self._errors.get(name, ""))
 
     def usable(self) -> dict[str, Law]:
-        """The laws themselves: what a loop looks its law up in. A law that is disabled leaves it."""
+        """The usable laws as a dict, for lookups in the loop. A disabled law is removed from it."""
         return self._loaded()
 
     def disable(self, name: str, error: str) -> None:
-        """Take a law out of use in this process, for the reason ``error``."""
+        """Disable a law in this process, for the reason ``error``."""
         if self._loaded().pop(name, None) is not None:
             self._errors[name] = error
 
@@ -78,17 +78,17 @@ class LawRegistry(Mapping[str, Law]):
         return tuple(name for name, law in self.items() if option in law.options)
 
     def on_path(self, path: Path) -> tuple[str, ...]:
-        """Names of the laws that lead the body on such a path."""
+        """Names of the laws that move the body on such a path."""
         return tuple(name for name, law in self.items() if law.path == path)
 
     def surest_first(self) -> tuple[str, ...]:
-        """All names, by how surely a law arrives: on a straight line, by the goal's pose, by its pixels."""
+        """All names, ordered by how reliably a law arrives: on a straight line, by the goal's pose, by its pixels."""
         return tuple(
             sorted(self, key=lambda name: (self[name].path != "straight", not self[name].needs_pose))
         )
 
     def sources(self) -> dict[str, str]:
-        """Of every law: the distribution that it comes from with its version, and a hash of its source file."""
+        """Source of every law: its distribution with its version, and a hash of its source file."""
         found = {}
         for plugin in plugins.list_plugins(self._group):
             if plugin.name in self:
@@ -115,7 +115,7 @@ def source_hash(law: Law) -> str:
 
 
 def _checked(law: Any) -> Law:
-    """The law itself. Raises TypeError or ValueError for what cannot be one."""
+    """The law, after validation. Raises TypeError or ValueError if it is not a valid one."""
     if not isinstance(law, Law):
         raise TypeError(f"is a {type(law).__name__}; an instance of stereoservo.control.law.Law is needed")
     unknown = [option for option in law.options if option not in OPTIONS]

@@ -1,14 +1,14 @@
-"""Coplanar groups of a body's markers, from projective points and the views that fix them: the candidates for its
+"""Coplanar groups of a body's markers, from projective points and the views that determine them: the candidates for its
 faces.
 
-Nothing here is metric, and nothing depends on what is seen at a moment: the groups belong to a model. A marker is in
-the plane of three others when the determinant of the four is within a few of its own standard deviations, those that
-pixels of a deviation ``sigma_px`` leave. Where the plates themselves are less flat than the cameras are sharp, state a
+Nothing here is metric, and nothing depends on the current visibility: the groups belong to a model. A marker is in the
+plane of three others if the determinant of the four is within a few of its own standard deviations, for pixels with a
+standard deviation ``sigma_px``. If the plates themselves are less flat than the cameras are accurate, state a
 ``sigma_px`` that covers it.
 
-Every three of up to `EXHAUSTIVE` markers are tried. Of more, only those that lie near one another, each moved on to the
-three that span its plane best: of the order of m², not m⁴. This is work for where a model is made, not for a control
-step.
+All triples of up to `EXHAUSTIVE` markers are tried. If there are more, only triples of neighbouring markers are tried,
+each replaced by the triple that spans its plane best: of the order of m², not m⁴. This is computed when a model is
+made, not in a control step.
 """
 
 from __future__ import annotations
@@ -30,37 +30,42 @@ from stereoservo.planning.motion_frame import average_over_turns
 FLAT_PX = 0.05
 """A good ``sigma_px`` for the markers of a calibrated model on plates flat to some tenths of a millimetre.
 
-Larger ones take in markers of the next face that stand near the common edge.
+Larger values include markers of the next face that are near the common edge.
 """
 IN_PLANE = 4.0
 """Standard deviations up to which a marker is in a plane."""
 SPANS = 10.0
-"""Altitude of a triangle, in standard deviations, from which on it tells a plane."""
+"""Least altitude of a triangle, in standard deviations, that determines a plane."""
 AVERAGING_ROUNDS = 3
-"""How often an arm's turns are averaged over, one joint after another."""
+"""Number of averages over an arm's rotations, one joint after another."""
 EXHAUSTIVE = 32
-"""Markers of which every three are tried."""
+"""Number of markers of which all triples are tried."""
 NEAR = 8
-"""Nearest markers of each that make planes with it, where there are more."""
+"""Number of nearest markers of each that form planes with it, if there are more."""
 LOCAL = 24
-"""Nearest markers among which the plane of three near ones is widened first."""
+"""Number of nearest markers among which the plane of three neighbours is widened first."""
 WIDEST = 16
-"""Markers of a plane among which its widest triple is sought; of more, so many that are spread out."""
+"""Number of markers of a plane among which its widest triple is searched; if there are more, as many that are spread
+out.
+"""
 MOST_GROUPS = 1024
-"""Groups that are kept where not all markers' triples are tried: those of most markers, the roundest of these."""
+"""Number of groups that are kept if not all triples are tried: those of most markers, the roundest of these."""
 
 TRIAL_TURN = 0.3
-"""How far [rad], and a third of it [m], joints are moved to and fro for the views that calibration had."""
+"""Motion of joints to and fro [rad], and a third of it [m], for views like those of calibration."""
 NEAREST, FARTHEST = 0.5, 2.0
-"""Depths, relative to those now, that a marker may have in such a view."""
+"""Range of the depth of a marker in such a view, relative to its current depth."""
 
 
 class MarkerGroups(NamedTuple):
     """g groups of coplanar markers that may be faces: of four and more, or with no marker on one side.
 
-    ``triples`` (g, 3): three that tell the plane best; ``starts`` (g + 1,): where the members of each group begin in
-    ``members`` (k,), ascending; ``sides`` (g, 2): other markers above and below; ``roundness`` (g,): altitude of the
-    triple over the group's extent. In the order in which they were found: planes that are told best first.
+    ``triples`` (g, 3): three that determine the plane best.
+    ``starts`` (g + 1,): start of each group's members in ``members`` (k,), ascending.
+    ``sides`` (g, 2): numbers of other markers above and below.
+    ``roundness`` (g,): altitude of the triple over the group's extent.
+
+    In the order in which they were found: the most accurate planes first.
     """
 
     triples: IntArray
@@ -71,7 +76,7 @@ class MarkerGroups(NamedTuple):
 
 
 def no_groups() -> MarkerGroups:
-    """Of markers that span no plane."""
+    """No groups: the markers span no plane."""
     none = np.zeros((0, 3), np.int64), np.zeros(1, np.int64), np.zeros(0, np.int64)
     return MarkerGroups(*none, np.zeros((0, 2), np.int64), np.zeros(0))
 
@@ -86,15 +91,19 @@ def find_groups(
 ) -> MarkerGroups:
     """Coplanar groups of ``points`` (m, 4) of height 1.
 
-    ``matrices`` (k, 3, 4): the views that fix the markers; cameras that saw the body in several poses are views
-    ``P H_i``. ``sigma_px`` [px], ``limit`` deviations from a plane. ``operators`` (n, 4, 4) of an arm that moves the
-    body, as it stands: the markers count as known from views a small motion of each joint away too, as calibration had
-    them, and lengths become comparable that one view foreshortens.
+    ``matrices`` (k, 3, 4): the views that determine the markers; cameras that saw the body in several poses are views
+    ``P H_i``.
+    ``sigma_px`` [px]: standard deviation of pixels.
+    ``limit``: largest distance from a plane in standard deviations.
+    ``operators`` (n, 4, 4): of the arm that moves the body, at its current posture. The markers are assumed to be known
+    also from views after a small motion of each joint, as in calibration;
+    this makes lengths comparable that one view foreshortens.
 
-    Fewer than three markers, or all on one line, have none, nor have markers of which the views do not fix one.
+    There are no groups for fewer than three markers, for collinear markers, and for markers that the views do not
+    determine.
     """
     views = trial_views(points, matrices, operators)
-    # further views stand for other directions, not for more sights: what is systematic does not average out
+    # further views add directions, not observations: systematic errors do not average out
     sigma = sigma_px * float(np.sqrt(len(views) / max(1, len(matrices))))
     information = marker_information(points, views, sigma)
     covariances = marker_covariances(points, information)
@@ -156,7 +165,7 @@ def with_groups(model: CellModel) -> CellModel:
 
 
 def groups_of(model: CellModel) -> MarkerGroups | None:
-    """The coplanar groups of a model's markers as arrays; None where it comes without."""
+    """The coplanar groups of a model's markers as arrays; None if it states none."""
     given = model.marker_groups
     if not given:
         return None if given is None else no_groups()
@@ -187,7 +196,9 @@ def _turns(operator: FloatArray) -> bool:
 
 @kernel
 def trial_views(points: FloatArray, matrices: FloatArray, operators: FloatArray) -> FloatArray:
-    """``P exp(±s Ĥ_j)`` (k, 3, 4) besides the cameras ``P`` themselves, where all markers stay well before them."""
+    """``P exp(±s Ĥ_j)`` (k, 3, 4) in addition to the cameras ``P`` themselves, if all markers stay well in front of
+    them.
+    """
     cameras, n = matrices.shape[0], operators.shape[0]
     views = np.empty((cameras * (2 * n + 1), 3, 4))
     count = 0
@@ -238,10 +249,10 @@ def marker_information(points: FloatArray, matrices: FloatArray, sigma_px: float
 
 @kernel
 def marker_covariances(points: FloatArray, information: FloatArray) -> FloatArray:
-    """Covariances (m, 4, 4) for planes through the points; NaN where the views do not fix one.
+    """Covariances (m, 4, 4) for planes through the points; NaN where the views do not determine one.
 
-    The information is blind along the point itself, its scale: so much of it is added there, which no plane sees that
-    passes through the point.
+    The information has no component along the point itself, its scale. It is regularised in that direction, which has
+    no effect on planes that pass through the point.
     """
     covariances = np.empty(information.shape)
     filled = np.empty((4, 4))
@@ -265,10 +276,10 @@ def marker_covariances(points: FloatArray, information: FloatArray) -> FloatArra
 
 @kernel
 def turned_average(information: FloatArray, operators: FloatArray) -> FloatArray:
-    """The markers' mean information, averaged over the turns that an arm's revolute ``operators`` (n, 4, 4) make.
+    """The markers' mean information (4, 4), averaged over the rotations of an arm's revolute ``operators`` (n, 4, 4).
 
-    As a form on differences of points (height 0), which displacements only turn: with two axes or more that are not
-    parallel it becomes the same in all directions, as no single view is. (4, 4).
+    It is used as a form on differences of points (height 0), which displacements only rotate: with two or more axes
+    that are not parallel it becomes isotropic, unlike that of a single view.
     """
     mean = np.zeros((4, 4))
     for p in range(information.shape[0]):
@@ -293,7 +304,7 @@ def _form(a: FloatArray, S: FloatArray, b: FloatArray) -> float:
 
 @kernel
 def off_plane(points: FloatArray, covariances: FloatArray, i: int, j: int, k: int) -> FloatArray:
-    """``det[M_i M_j M_k M_l]`` in deviations of itself (m,), for every marker l; 0 for the three themselves."""
+    """``det[M_i M_j M_k M_l]`` in its own standard deviations (m,), for every marker l; 0 for the three themselves."""
     markers = points.shape[0]
     out = np.zeros(markers)
     four = np.empty(4, np.int64)
@@ -323,7 +334,7 @@ def off_plane(points: FloatArray, covariances: FloatArray, i: int, j: int, k: in
 
 @kernel
 def all_triples(markers: int) -> IntArray:
-    """Every three of so many markers (t, 3), ascending."""
+    """All triples of so many markers (t, 3), ascending."""
     out = np.empty((markers * (markers - 1) * (markers - 2) // 6, 3), np.int64)
     t = 0
     for i in range(markers):
@@ -384,10 +395,12 @@ def coplanar_groups(
     distances: FloatArray,
     limit: float,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Groups of markers in one plane, from the triples that tell their planes best on.
+    """Groups of markers in one plane, starting with the triples that determine their planes best.
 
-    Triples (t, 3) with ``altitudes`` (t,), the largest first; those inside a group of four that was found are passed
-    over. Members (g, m) 1 or 0; facts (g, 6): the triple, markers in it, others above and below; roundness (g,):
+    ``triples`` (t, 3), ``altitudes`` (t,): the largest first; triples inside a group of four that was found are
+    skipped.
+
+    Returns members (g, m) 1 or 0; facts (g, 6): the triple, markers in it, others above and below; roundness (g,):
     altitude over the longest of ``distances`` (m, m) in it.
     """
     count, markers = triples.shape[0], points.shape[0]
@@ -457,7 +470,9 @@ def spread_out(distances: FloatArray, candidates: IntArray, count: int) -> IntAr
 
 @kernel
 def _widest(points: FloatArray, form: FloatArray, distances: FloatArray, candidates: IntArray) -> IntArray:
-    """The three of the ``candidates`` (k,), ascending, of the largest altitude; of many, of those spread out."""
+    """The three of the ``candidates`` (k,), ascending, with the largest altitude; of many, only spread
+    ones are tried.
+    """
     few = spread_out(distances, candidates, WIDEST)
     best = np.zeros(3, np.int64)
     largest = -1.0
@@ -475,10 +490,10 @@ def _widest(points: FloatArray, form: FloatArray, distances: FloatArray, candida
 def near_triples(
     points: FloatArray, covariances: FloatArray, form: FloatArray, distances: FloatArray, limit: float
 ) -> IntArray:
-    """Triples (t, 3), ascending, that tell the planes of markers near one another: each plane's widest ones.
+    """Triples (t, 3), ascending, that determine the planes of neighbouring markers: each plane's widest ones.
 
     From each marker and two of its nearest: the widest triple of their plane among the markers around, then among all,
-    as long as the three that it began with are in its plane.
+    as long as the initial three are in its plane.
     """
     markers = points.shape[0]
     near, local = min(NEAR, markers - 1), min(LOCAL, markers - 1)

@@ -1,9 +1,9 @@
-"""Mobility of an arm at its current posture: which translations and rotations of the body it can make, in words for
-people, and what part of a required motion it lacks (thesis 7.3.3, 8; errata, deficient arms).
+"""Mobility of an arm at its current posture: which translations and rotations of the body it can make, described in
+words, and which part of a required motion it lacks (thesis 7.3.3, 8; errata, deficient arms).
 
-A numerical criterion on the Jacobian of the body's points, in right-angled coordinates whose unit is the body's radius.
-Planning and refusals ask here, the loop calls `mobility_kernel`. No LAPACK, no BLAS: the core refuses goals in these
-words.
+A numerical criterion on the Jacobian of the body's points, in orthogonal coordinates whose unit is the body's radius.
+Used by planning and for refusals; the loop calls `mobility_kernel`. No LAPACK, no BLAS: the core uses its results in
+refusals.
 """
 
 from __future__ import annotations
@@ -28,10 +28,12 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import null_direction, right_singular
 
 FOCAL_PX = 1000.0
-"""A usual focal length."""
+"""A typical focal length."""
 
 GUESS = 1e-3
-"""Weight of a usual focal length and of a principal point where the body is: they decide what nothing else does."""
+"""Weight of the assumptions of a typical focal length and of a principal point at the body: they matter only if nothing
+else determines the metric.
+"""
 
 
 def body_frame(
@@ -41,12 +43,15 @@ def body_frame(
     plane_at_infinity: FloatArray,
     H_projective_to_euclidean: FloatArray | None = None,
 ) -> FloatArray:
-    """``E`` (4, 4) that maps the body's own coordinates to the model's frame: columns x, y, z and the middle.
+    """``E`` (4, 4) that maps the body's own coordinates to the model's frame: columns x, y, z and the centroid.
 
-    x to the right in the image of the first camera, y down, z towards the camera, orthonormal but for one unit, the rms
-    distance of ``points`` (m, 4) from their middle. ``generators`` (n, 4, 4) of rigid motions, ``matrices`` (c, 3, 4).
-    Raises GeometryError for a camera at the body's middle, points that are one, estimates that are no metric, and
-    what is not finite.
+    x to the right in the image of the first camera, y down, z towards the camera, orthonormal except for one unit, the
+    rms distance of ``points`` (m, 4) from their centroid.
+
+    ``generators`` (n, 4, 4): of rigid motions; ``matrices`` (c, 3, 4).
+
+    Raises GeometryError for a camera at the body's centroid, coincident points, estimates that are no metric, and
+    values that are not finite.
     """
     for name, value in (("generators", generators), ("cameras", matrices), ("points", points)):
         if not np.isfinite(value).all():
@@ -64,7 +69,7 @@ def body_frame(
     P = matrices[0]
     m = (P * middle).sum(axis=1)
     centre = plane_of_points(P[0], P[1], P[2])
-    # Towards the camera, of any height: a centre at infinity is a direction. The depth tells the sense.
+    # Towards the camera, of any height: a centre at infinity is a direction. The depth determines the sign.
     towards = multiply(flat.T, (centre - float((centre * plane_at_infinity).sum()) * middle)[:, None])[:, 0]
     size = _length(towards, Q)
     if not (size > 0.0 and radius > 1e-9 * size):
@@ -100,7 +105,7 @@ def _without(v: FloatArray, unit: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def _directions(plane_at_infinity: FloatArray) -> FloatArray:
-    """Orthonormal directions (4, 3) of height 0: what of a reflection is left besides the plane."""
+    """Orthonormal directions (4, 3) of height 0: the columns of a reflection that are orthogonal to the plane."""
     v = plane_at_infinity / np.sqrt((plane_at_infinity**2).sum())
     k = int(np.abs(v).argmax())
     v[k] += 1.0 if v[k] > 0.0 else -1.0
@@ -111,7 +116,7 @@ def _directions(plane_at_infinity: FloatArray) -> FloatArray:
 def _estimated_metric(
     generators: FloatArray, matrices: FloatArray, middle: FloatArray, flat: FloatArray
 ) -> FloatArray:
-    """Scalar product ``Q`` (3, 3) of directions ``flat`` (4, 3), up to scale: ``RᵀQ + QR = 0`` for turns ``R``."""
+    """Scalar product ``Q`` (3, 3) of directions ``flat`` (4, 3), up to scale: ``RᵀQ + QR = 0`` for rotations ``R``."""
     rows = []
     for G in generators:
         R = multiply(multiply(np.ascontiguousarray(flat.T), G), flat)
@@ -121,7 +126,7 @@ def _estimated_metric(
             rows.append(np.stack([(multiply(R.T, S) + multiply(S, R)).ravel() for S in _SYMMETRIC], axis=1))
     for P in matrices:
         m = (P * middle).sum(axis=1)
-        # Body at the origin, pixels in parts of a usual focal length
+        # Body at the origin, pixels in units of a typical focal length
         centred = np.array([[1, 0, -m[0] / m[2]], [0, 1, -m[1] / m[2]], [0, 0, FOCAL_PX]])
         H = multiply(multiply(centred, P), flat)
         columns = np.stack([cross(H[1], H[2]), cross(H[2], H[0]), cross(H[0], H[1])], axis=1)
@@ -167,16 +172,16 @@ FREEDOMS = (
     "rotation about the image's vertical axis",
     "rotation in the image plane",
 )
-"""The six of a rigid body about its middle, as seen by one camera."""
+"""The six of a rigid body about its centroid, as seen by one camera."""
 
 REACH = 0.03
-"""Part of a wanted motion that may be left unmade: error of the operators."""
+"""Fraction of a required motion that may remain undone: error of the operators."""
 
 WEAK = 3e-3
-"""Singular value, relative to the largest, below which motions are large for little effect."""
+"""Singular value, relative to the largest, below which motions are large for a small effect."""
 
 PARALLEL = 0.03
-"""Sine below which motions count as one where freedoms of an arm elsewhere are counted."""
+"""Sine below which motions count as equal when the degrees of freedom of an arm in other postures are counted."""
 
 NAMED = 0.5
 """Components of a motion at least this large, relative to the largest, are named."""
@@ -184,9 +189,9 @@ NAMED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """A motion of the body, ``name`` in words, ``generator`` (4, 4) in the model's frame.
+    """A motion of the body, ``name``: description, ``generator`` (4, 4) in the model's frame.
 
-    ``share`` in [0, 1]: how much of it the arm makes.
+    ``share`` in [0, 1]: fraction of it that the arm can make.
     """
 
     name: str
@@ -196,13 +201,15 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False)
 class Mobility:
-    """The freedoms of an arm of n joints as it stands.
+    """The degrees of freedom of an arm of n joints at its current posture.
 
-    ``rank`` freedoms of the body are drivable, ``capacity`` are elsewhere. ``freedoms``: the six of `FREEDOMS`, with
-    shares. ``missing``: 6 - rank motions of which the arm makes nothing. ``directions`` (n, n): joint motions as
-    columns, in units of the joints, that move the body by ``values`` (n,) [body radii, rms over its points],
-    descending, and by ``pixels`` (n,) [px, rms over points and cameras]. ``self_motions`` (n, n - rank): columns [rad
-    or m] that leave the body where it is. ``block``: indices of joints to hold still here.
+    ``rank``: number of the body's degrees of freedom that can be driven; ``capacity``: the number in other postures.
+    ``freedoms``: the six of `FREEDOMS`, with shares.
+    ``missing``: 6 - rank motions of which the arm can make no part.
+    ``directions`` (n, n): joint motions as columns, in units of the joints, that move the body by ``values`` (n,) [body
+    radii, rms over its points], descending, and by ``pixels`` (n,) [px, rms over points and cameras].
+    ``self_motions`` (n, n - rank): columns [rad or m] that do not move the body.
+    ``block``: indices of joints that should not move in this posture.
     """
 
     rank: int
@@ -225,11 +232,14 @@ def mobility(
     unit: FloatArray | None = None,
     camera: str = "the first camera",
 ) -> Mobility:
-    """The freedoms of an arm: ``operators`` (n, 4, 4) at the current configuration, ``points`` (m, 4) of height 1.
+    """The degrees of freedom of an arm: ``operators`` (n, 4, 4) at the current configuration, ``points`` (m, 4) of
+    height 1.
 
-    ``matrices`` (c, 3, 4), whose first camera names the motions; ``unit`` (n,) [rad or m]: what of each joint's motion
-    is as much, None: 1. Without ``H_projective_to_euclidean`` right angles are estimated (`body_frame`).
-    Raises GeometryError for points on one line, which do not show all freedoms, and as `body_frame` does.
+    ``matrices`` (c, 3, 4): the first camera names the motions.
+    ``unit`` (n,) [rad or m]: equivalent amounts of each joint's motion, None: 1.
+    ``H_projective_to_euclidean``: None: right angles are estimated (`body_frame`).
+
+    Raises GeometryError for collinear points, which do not show all degrees of freedom, and as `body_frame` does.
     """
     n = operators.shape[0]
     units = np.ones(n) if unit is None else np.asarray(unit, dtype=np.float64)
@@ -271,10 +281,11 @@ def missing_freedom(
     camera: str = "the first camera",
     tolerance: float = REACH,
 ) -> Freedom | None:
-    """What of a ``wanted`` motion of the body (4, 4), a generator or twist of any size, the arm cannot make here.
+    """The part of a ``wanted`` motion of the body (4, 4), a generator or twist of any size, that the arm cannot make
+    here.
 
-    None where at most ``tolerance`` of it is left unmade, or nothing is wanted. The ``generator`` is the part that is
-    left. Raises GeometryError as `mobility` does, and for a motion that is not finite.
+    None if at most ``tolerance`` of it remains, or the motion is zero. The ``generator`` is the remaining part. Raises
+    GeometryError as `mobility` does, and for a motion that is not finite.
     """
     if not np.isfinite(wanted).all():
         raise GeometryError("not_finite", f"the wanted motion is not finite: {np.asarray(wanted).tolist()}")
@@ -305,7 +316,9 @@ def _combined(factors: FloatArray, generators: FloatArray) -> FloatArray:
 
 
 def _left_over(named: FloatArray, fields: FloatArray, made: FloatArray, rank: int) -> list[FloatArray]:
-    """Generators of the freedoms that are not ``made`` (3m, rank): those nearest to the named ones, strongest first."""
+    """Generators of the degrees of freedom that are not ``made`` (3m, rank): those nearest to the named ones, strongest
+    first.
+    """
     rest = fields / _lengths(fields)
     rest = rest - multiply(made, multiply(made.T, rest))
     generators = []
@@ -320,7 +333,9 @@ def _left_over(named: FloatArray, fields: FloatArray, made: FloatArray, rank: in
 def _drivable(
     E: FloatArray, operators: FloatArray, points: FloatArray, units: FloatArray
 ) -> tuple[int, int, FloatArray, FloatArray, FloatArray]:
-    """`drivable_freedoms`, at most the arm's capacity, and what they make of the points as orthonormal columns."""
+    """`drivable_freedoms`, at most the arm's capacity, and the motion of the points that they cause, as orthonormal
+    columns.
+    """
     n = operators.shape[0]
     if not n:
         return 0, 0, np.zeros(0), np.zeros((0, 0)), np.zeros((3 * len(points), 0))
@@ -362,14 +377,14 @@ def _refuse_line(fields: FloatArray) -> None:
 
 
 def _describe(E: FloatArray, X: FloatArray, points: FloatArray, camera: str) -> str:
-    """A motion in words: its components by how far they move the body's points."""
+    """Description of a motion: its components by how far they move the body's points."""
     sizes = _lengths(_motions(E, rigid_motions(E), points)) * np.abs(_twist(E, X))
     order = [i for i in np.argsort(-sizes, kind="stable").tolist() if sizes[i] > NAMED * sizes.max()]
     return " together with ".join(FREEDOMS[i] for i in order) + f" of {camera}"
 
 
 def attainable_motions(E: FloatArray, operators: FloatArray) -> FloatArray:
-    """Generators (k, 4, 4) of all motions that the arm has anywhere, k <= 6: its operators and their brackets."""
+    """Generators (k, 4, 4) of all motions that the arm has in any posture, k <= 6: its operators and their brackets."""
     if not len(operators):
         return np.zeros((0, 4, 4))
     named = rigid_motions(E)
@@ -378,7 +393,9 @@ def attainable_motions(E: FloatArray, operators: FloatArray) -> FloatArray:
 
 
 def _closure(twists: FloatArray) -> FloatArray:
-    """Basis (k, 6) of what joints (n, 6), of components as `_twist` gives, have together as they move."""
+    """Basis (k, 6) of the closure of the joints' twists (n, 6), with components as from `_twist`, under
+    their brackets.
+    """
     twists = twists[_lengths(twists.T) > 0.0]
     if not len(twists):
         return twists

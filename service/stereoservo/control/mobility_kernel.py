@@ -1,9 +1,9 @@
-"""Numba kernels of an arm's mobility at its current posture: drivable freedoms by singular values, joints to block
-near a singularity, self-motion away from joint limits.
+"""Numba kernels of an arm's mobility at its current posture: drivable degrees of freedom by singular values, joints to
+block near a singularity, self-motion away from joint limits.
 
-Freedoms count by the motion of the body's points in right-angled coordinates of any unit: ``rows`` (3m, n) is their
-Jacobian (`point_jacobian`). Pixels would tell sideways from depth, not strong joints from weak ones. No BLAS, LAPACK or
-fastmath.
+Degrees of freedom are measured by the motion of the body's points in orthogonal coordinates of any unit: ``rows`` (3m,
+n) is their Jacobian (`point_jacobian`). Pixels would distinguish sideways motion from depth, not strong joints from
+weak ones. No BLAS, LAPACK or fastmath.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ from stereoservo.numerics.linear import add_equation, right_singular
 from stereoservo.planning.visibility_constraints import limit_pull
 
 LOST = 1e-3
-"""Singular value, relative to the largest, below which a freedom is lost; the operators are estimates."""
+"""Singular value, relative to the largest, below which a degree of freedom is lost; the operators are estimates."""
 
 TALL = 512
-"""Rows of a Jacobian from which on its singular values are found by its normal matrix, in one pass over the rows. Their
-errors are then 1e-8 of the largest, where `LOST` asks for 1e-3.
+"""Number of rows of a Jacobian above which its singular values are computed by its normal matrix, in one pass over the
+rows. Their errors are then 1e-8 of the largest; `LOST` requires 1e-3.
 """
 
 EQUAL = 0.05
-"""Difference of two joints' parts in a lost freedom that decides nothing: the one nearer to the base is taken."""
+"""Difference of two joints' components in a lost degree of freedom that is not significant: the joint nearer to the
+base is taken.
+"""
 
 
 def multiply(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -72,7 +74,9 @@ def brackets(twists: FloatArray) -> FloatArray:
 
 @kernel
 def least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
-    """Least ``x`` (n,) of least ``|A x - b|`` for ``A`` (r, n), ``b`` (r,); singular values below `LOST` left out."""
+    """The ``x`` (n,) of least norm with least ``|A x - b|`` for ``A`` (r, n), ``b`` (r,); singular values below `LOST`
+    are left out.
+    """
     V, values = right_singular(A)
     n = values.shape[0]
     x = np.zeros(n)
@@ -90,10 +94,10 @@ def least_squares(A: FloatArray, b: FloatArray) -> FloatArray:
 
 @kernel
 def point_jacobian(operators: FloatArray, points: FloatArray, form: FloatArray) -> FloatArray:
-    """Jacobian (3m, n) of points (m, 4) of height 1: ``form (Ĥ_j M)``, over the root of m.
+    """Jacobian (3m, n) of points (m, 4) of height 1: ``form (Ĥ_j M)``, divided by the square root of m.
 
-    ``form`` (3, 4) maps differences of points to right-angled coordinates: the upper rows of the inverse of
-    `mobility.body_frame`, which hold as long as the model does, whatever the pose.
+    ``form`` (3, 4) maps differences of points to orthogonal coordinates: the upper rows of the inverse of
+    `mobility.body_frame`, which are valid as long as the model, for every pose.
     """
     n, m = operators.shape[0], points.shape[0]
     rows = np.empty((3 * m, n))
@@ -129,10 +133,11 @@ def _scaled(rows: FloatArray, unit: FloatArray) -> FloatArray:
 
 @kernel
 def drivable_freedoms(rows: FloatArray, unit: FloatArray) -> tuple[int, FloatArray, FloatArray]:
-    """Freedoms of the body that the arm drives here, singular values (n,), descending, joint motions as columns (n, n).
+    """Number of the body's degrees of freedom that the arm can drive here, singular values (n,), descending, joint
+    motions as columns (n, n).
 
-    ``rows`` (r, n); ``unit`` (n,) > 0 [rad or m]: what of each joint's motion is as much; columns are in units. 0 and
-    NaN where ``rows`` are not finite.
+    ``rows`` (r, n); ``unit`` (n,) > 0 [rad or m]: equivalent amounts of each joint's motion; columns are in units. 0
+    and NaN if ``rows`` are not finite.
     """
     J = _scaled(rows, unit)
     n = unit.shape[0]
@@ -170,11 +175,12 @@ def _normal_matrix(J: FloatArray) -> FloatArray:
 
 @kernel
 def joints_to_block(rows: FloatArray, unit: FloatArray, capacity: int, least: float) -> BoolArray:
-    """Joints (n,) to hold still so that the rest drives what there is to drive without large motions for little effect.
+    """Joints (n,) to block so that the others drive all drivable degrees of freedom without large motions for a small
+    effect.
 
-    As many as there are singular values below ``least`` times the largest, among the ``capacity`` freedoms that such an
-    arm has elsewhere (6 for six joints, 4 for a SCARA): of a redundant arm's self-motions none is blocked. Each time
-    that joint is taken which has the largest part in the weak motions of those that are left.
+    As many as there are singular values below ``least`` times the largest, among the ``capacity`` degrees of freedom
+    that such an arm has in other postures (6 for six joints, 4 for a SCARA): self-motions of a redundant arm block no
+    joint. In each round the joint with the largest component in the weak motions of the remaining ones is taken.
     """
     J = _scaled(rows, unit)
     n = J.shape[1]
@@ -217,12 +223,14 @@ def joints_to_block(rows: FloatArray, unit: FloatArray, capacity: int, least: fl
 def self_motion_from_limits(
     rows: FloatArray, positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float
 ) -> FloatArray:
-    """A joint velocity (n,) that leaves the body where it is and drives joints from their limits towards the middle.
+    """A joint velocity (n,) that does not move the body and moves joints from their limits towards the middle.
 
-    ``rows`` (r, n): `point_jacobian`, or an image Jacobian. ``positions``, ``lower``, ``upper`` (n,) [rad or m],
-    infinite for a joint without limits; ``rate`` [1/s]: no joint is faster than half its range times ``rate`` (without
-    limits: 1 rad or m times it). The pull rises with the cube of the way from the middle. A motion fades out as it
-    comes to move the body; an arm without self-motions rests.
+    ``rows`` (r, n): `point_jacobian`, or an image Jacobian.
+    ``positions``, ``lower``, ``upper`` (n,) [rad or m]: infinite for a joint without limits.
+    ``rate`` [1/s]: no joint is faster than half its range times ``rate`` (without limits: 1 rad or m times it).
+
+    The pull increases with the cube of the distance from the middle. A motion fades out as it starts to move the body;
+    an arm without self-motions rests.
     """
     n = positions.shape[0]
     pull, half = limit_pull(positions, lower, upper)

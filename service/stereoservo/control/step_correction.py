@@ -1,11 +1,11 @@
 """Correction of a joint velocity that is held for a whole control step: its finite displacement becomes the one that
 the law's instantaneous screws intend (thesis 8.5.2).
 
-The screws of a law hold for an instant: driven together for a whole step, joints turn one another's axes, and what
-comes out is off by the brackets of (8.46). Instead of their series, Newton's method finds the step of the joints that
-displaces the body's points exactly as meant, from the first-order step on.
+The screws of a law are valid for an instant: driven together for a whole step, joints rotate one another's axes, and
+the result deviates by the brackets of (8.46). Instead of their series, Newton's method finds the step of the joints
+that displaces the body's points exactly as intended, starting from the first-order step.
 
-Near a singularity of the arm that step does not exist, or is far too large; `damped_step` is the one to take there.
+Near a singularity of the arm that step does not exist, or is far too large; use `damped_step` there.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from stereoservo.numerics.linear import add_equation, damped_solve, factor_solve
 
 ITERATIONS = 6
 CONVERGED = 1e-12
-"""Of the joints' step: what another iteration would change, below which there is none."""
+"""Change of the joints' step [rad or m] below which no further iteration is made."""
 STEEP = 1e-2
-"""Share of the change before, below which a change tells that the Jacobian is good enough for another round."""
+"""Ratio of a change to the previous one, below which the Jacobian is accurate enough for another iteration."""
 SLACK = 1.0 + 1e-9
-"""What the squared error may grow by: near its least value it does not tell steps apart."""
+"""Factor by which the squared error may grow: near its minimum it does not distinguish steps."""
 BRACKETS = 6
-"""Terms of the series of how exp turns a sum's operators; a step is small."""
+"""Terms of the series by which the exponential rotates the operators of a sum; a step is small."""
 DAMPING = 1e-12
-"""Relative to the largest diagonal of the normal matrix: an arm that can do it in many ways takes the least change."""
+"""Damping relative to the largest diagonal element of the normal matrix: a redundant arm takes the smallest change."""
 
 STRUCTURE = 1e-18
 """Squared relative residue of ``Ĥ³ = −cĤ`` below which the closed form of the exponential holds."""
@@ -40,8 +40,8 @@ TIP_FIRST = 1
 
 
 class JointScrews(NamedTuple):
-    """``operators`` (n, 4, 4) of joints, their ``squares`` (n, 4, 4), and ``rates`` (n,): that of a revolution's
-    angle, 0 for a translation, NaN for a general screw.
+    """``operators`` (n, 4, 4) of joints, their ``squares`` (n, 4, 4), and ``rates`` (n,): that of a rotation's angle, 0
+    for a translation, NaN for a general screw.
     """
 
     operators: FloatArray
@@ -51,7 +51,7 @@ class JointScrews(NamedTuple):
 
 @kernel
 def joint_screws(operators: FloatArray) -> JointScrews:
-    """The operators (n, 4, 4) with what their exponentials are made of."""
+    """The operators (n, 4, 4) with the values needed for their exponentials."""
     n = operators.shape[0]
     found = JointScrews(operators, np.empty((n, 4, 4)), np.empty(n))
     cube = np.empty((4, 4))
@@ -62,8 +62,8 @@ def joint_screws(operators: FloatArray) -> JointScrews:
 
 @kernel
 def _square_into(G: FloatArray, square: FloatArray, cube: FloatArray) -> float:
-    """``G²`` into ``square`` (4, 4); the rate of the revolution ``G³ = −rate² G``, 0 for a translation, NaN where ``G``
-    is neither. ``cube`` (4, 4): scratch.
+    """Write ``G²`` to ``square`` (4, 4); returns the rate of the rotation ``G³ = −rate² G``, 0 for a translation, NaN
+    if ``G`` is neither. ``cube`` (4, 4): scratch.
     """
     multiply4_into(G, G, square)
     multiply4_into(G, square, cube)
@@ -89,7 +89,8 @@ def _closed_form(rate: float, amount: float) -> tuple[float, float]:
 def exponential_into(
     G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray
 ) -> None:
-    """``exp(amount G)`` into (4, 4): in closed form of a revolution or translation (4.27, 3.21), else the series.
+    """Write ``exp(amount G)`` to ``H`` (4, 4): in closed form for a rotation or translation (4.27, 3.21), else by the
+    series.
 
     ``square``, ``cube`` (4, 4): scratch.
     """
@@ -111,7 +112,7 @@ def exponential_into(
 def _exponential_pair_into(
     screws: JointScrews, j: int, amount: float, H: FloatArray, inverse: FloatArray
 ) -> None:
-    """``exp(amount Ĥ_j)`` and its inverse, into (4, 4) each."""
+    """Write ``exp(amount Ĥ_j)`` and its inverse to ``H`` and ``inverse``, (4, 4) each."""
     rate = screws.rates[j]
     if math.isnan(rate):
         whole, back = exp_twist(amount * screws.operators[j]), exp_twist(-amount * screws.operators[j])
@@ -133,8 +134,8 @@ def _exponential_pair_into(
 def displacement_into(
     screws: JointScrews, composition: int, step: FloatArray, H: FloatArray, work: FloatArray
 ) -> None:
-    """The displacement by ``step`` into ``H`` (4, 4); ``work`` (5, 4, 4): scratch, whose last (4, 4) is left with the
-    sum of operators that move at once.
+    """Write the displacement by ``step`` to ``H`` (4, 4). ``work`` (5, 4, 4): scratch; its last (4, 4) contains the sum
+    of operators that move simultaneously afterwards.
     """
     n = step.shape[0]
     first, second, total = work[0], work[1], work[4]
@@ -168,7 +169,7 @@ def step_into(
     turned: FloatArray,
     work: FloatArray,
 ) -> None:
-    """The displacement by ``step`` into ``H`` (4, 4), the joint operators after it into ``turned`` (n, 4, 4).
+    """Write the displacement by ``step`` to ``H`` (4, 4), and the joint operators after it to ``turned`` (n, 4, 4).
 
     ``work`` (5, 4, 4): scratch.
     """
@@ -212,8 +213,9 @@ def corrected_step(
 ) -> FloatArray:
     """Joint step (n,) that displaces ``points`` (m, 4) to ``wanted`` (m, 4), by Newton's method from ``step`` (n,).
 
-    The Jacobian is taken anew only in rounds after one that did not bring the change down by `STEEP`. It ends where
-    another round would change less than `CONVERGED`: changes fall by the ratio of the last two at least.
+    The Jacobian is recomputed only in iterations after one that did not reduce the change to `STEEP` of the previous
+    one. It ends if another iteration would change less than `CONVERGED`: changes decrease at least by the ratio of the
+    last two.
     """
     n, count = step.shape[0], points.shape[0]
     found, best = step.copy(), step.copy()
@@ -280,29 +282,30 @@ FREEDOMS = 6
 SINGULAR = 2e-3
 """Singular value of the stacked operators, over the largest, below which the arm is near a singularity."""
 LEAST_DAMPING = 1e-3
-"""Of a motion that the arm has lost, relative to the largest singular value. Half of `SINGULAR`: the arm goes through
-the singularity, off its line by what it cannot make there; exact steps would turn a wrist by half a turn beside it.
+"""Damping of a motion that the arm has lost, relative to the largest singular value. Half of `SINGULAR`: the arm passes
+through the singularity and leaves its line by the part that it cannot make there; exact steps would rotate a wrist by
+half a turn beside it.
 """
 SPANNED = 1e-3
-"""Share of a bracket beyond the motions that are known, below which it tells no new one."""
+"""Fraction of a bracket outside the known motions, below which it adds no new one."""
 LOST = 0.5
-"""Share of a motion that the damped step does not make, above which the joints set out to leave the singularity."""
+"""Fraction of a motion that the damped step does not make, above which the joints start to leave the singularity."""
 LEAVING = 100.0
-"""Joint motion out of the singularity, over what is lost in units of the largest singular value."""
+"""Joint motion out of the singularity, relative to the lost motion in units of the largest singular value."""
 LEAVING_RATE = 0.5
-"""[rad/s or m/s] at most."""
+"""Largest velocity of that motion [rad/s or m/s]."""
 EXACT = 1e-6
-"""Share of the largest singular value below which the lost motion has no sign."""
+"""Fraction of the largest singular value below which the sign of the lost motion is undetermined."""
 LEADS = 0.3
-"""Share of a unit vector from which a joint tells its sign."""
+"""Least component of a unit vector by which a joint determines the sign."""
 
 
 @kernel
 def rigid_motions(operators: FloatArray, V: FloatArray, values: FloatArray) -> tuple[FloatArray, bool]:
-    """Orthonormal operators (6, 4, 4) of all rigid motions, and whether the arm, near a singularity, tells them.
+    """Orthonormal operators (6, 4, 4) of all rigid motions, and whether the arm, near a singularity, determines them.
 
-    What the arm can still make well is taken from ``operators`` (n, 4, 4), by their singular vectors ``V`` (n, n) and
-    ``values`` (n,); what it has lost, from their brackets (8.46), which are rigid motions, too.
+    The motions that the arm can still make well are taken from ``operators`` (n, 4, 4), by their singular vectors ``V``
+    (n, n) and ``values`` (n,); the lost ones from their brackets (8.46), which are rigid motions, too.
     """
     n = operators.shape[0]
     found = np.zeros((FREEDOMS, 4, 4))
@@ -343,7 +346,9 @@ def rigid_motions(operators: FloatArray, V: FloatArray, values: FloatArray) -> t
 
 @kernel
 def _without(found: FloatArray, count: int, left: FloatArray) -> float:
-    """``left`` (4, 4) less its parts along the first ``count`` of ``found``; the square of what remains."""
+    """Subtract from ``left`` (4, 4) its components along the first ``count`` of ``found``; returns the square of the
+    remainder.
+    """
     for _ in range(2):
         for h in range(count):
             along = 0.0
@@ -364,11 +369,13 @@ def _without(found: FloatArray, count: int, left: FloatArray) -> float:
 def damped_step(
     operators: FloatArray, V: FloatArray, values: FloatArray, wanted: FloatArray, time_s: float
 ) -> FloatArray:
-    """Joint step (n,) near a singularity that makes of the motion ``wanted`` (4, 4) what the arm can, damped.
+    """Damped joint step (n,) near a singularity, for the part of the motion ``wanted`` (4, 4) that the arm can make.
 
-    Where most of it is lost, the joints move in the way that moves the body least (a stretched wrist: its first joint
-    against its last), until the arm can make what is wanted. ``V`` (n, n), ``values`` (n,): of `stacked_singular`;
-    ``time_s``: of the step.
+    If most of it is lost, the joints move along the direction that moves the body least (a stretched wrist: its first
+    joint against its last), until the arm can make the required motion.
+
+    ``V`` (n, n), ``values`` (n,): from `stacked_singular`.
+    ``time_s``: duration of the step.
     """
     n = operators.shape[0]
     rank = min(n, FREEDOMS)

@@ -18,11 +18,11 @@ from stereoservo.numerics.compilation import Fields, kernel
 from stereoservo.numerics.linear import add_pixel_equations, damped_solve
 
 DAMPING = 1e-6
-"""Default damping, relative to the largest diagonal of the normal matrix."""
+"""Default damping, relative to the largest diagonal element of the normal matrix."""
 
 
 class StereoArm(NamedTuple):
-    """An arm before cameras: its ``chain``, whose generators have the ``squares`` (n, 4, 4); cameras ``matrices``
+    """An arm in front of cameras: its ``chain``, whose generators have the ``squares`` (n, 4, 4); cameras ``matrices``
     (c, 3, 4), and marker ``points`` (m, 4) at the chain's zero.
     """
 
@@ -33,8 +33,8 @@ class StereoArm(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """Of a chain of ``generators`` (n, 4, 4) at some joints: its ``exponentials`` (n, 4, 4) in the order of the chain,
-    and the product of those that stand left of each, ``before`` (n + 1, 4, 4), H̄; ``tip_first`` as in `Chain`.
+    """Factors of a chain of ``generators`` (n, 4, 4) at some joints: its ``exponentials`` (n, 4, 4) in the order of the
+    chain, and the product of those to the left of each, ``before`` (n + 1, 4, 4), H̄; ``tip_first`` as in `Chain`.
     """
 
     generators: FloatArray
@@ -44,15 +44,15 @@ class Factors(NamedTuple):
 
 
 class PlacedPoints(NamedTuple):
-    """Points (m, 4) ``now`` and ``at_zero``, where they would be at the chain's zero."""
+    """Current points (m, 4) ``now``, and the same points at the chain's zero, ``at_zero``."""
 
     now: FloatArray
     at_zero: FloatArray
 
 
 class PointRows(NamedTuple):
-    """Of one point in c cameras: ``rows`` ``J_G P Ĥ_j|_Q M`` (c, 2, n) of its Jacobian, and ``gradients`` (c, 2, 4)
-    ``J_G P``.
+    """Jacobian of one point in c cameras: ``rows`` ``J_G P Ĥ_j|_Q M`` (c, 2, n), and ``gradients`` (c,
+    2, 4) ``J_G P``.
     """
 
     rows: FloatArray
@@ -60,7 +60,9 @@ class PointRows(NamedTuple):
 
 
 class Sighted(NamedTuple):
-    """Of m markers in c cameras: ``pixels`` and ``set_points`` (c, m, 2), ``weights`` (c, m) = 1/sigma [1/px]."""
+    """Observations of m markers in c cameras: ``pixels`` and ``set_points`` (c, m, 2), ``weights`` (c, m) = 1/sigma
+    [1/px].
+    """
 
     pixels: FloatArray
     set_points: FloatArray
@@ -68,8 +70,9 @@ class Sighted(NamedTuple):
 
 
 class CycleOptions(NamedTuple):
-    """``gain`` [1/s]; ``damping`` relative to the largest diagonal; ``mean``: whether the Jacobian is the mean of here
-    and of the goal; renormalised iterations of ``triangulations``, -1: the points are those of the joints.
+    """``gain`` [1/s]; ``damping`` relative to the largest diagonal element; ``mean``: whether the Jacobian is the mean
+    of the current one and that at the goal; ``triangulations``: number of renormalised iterations, -1: the points are
+    those of the joints.
     """
 
     gain: float
@@ -80,7 +83,7 @@ class CycleOptions(NamedTuple):
 
 @kernel
 def _factors_into(chain: Chain, squares: FloatArray, q: FloatArray, factors: Factors) -> None:
-    """The factors of a chain at ``q`` (n,); ``squares`` (n, 4, 4) of its generators."""
+    """Compute the factors of a chain at ``q`` (n,); ``squares`` (n, 4, 4) of its generators."""
     generators, kinds, zero, tip_first = chain
     _, _, E, B = factors
     n = q.shape[0]
@@ -112,7 +115,7 @@ def _factors_into(chain: Chain, squares: FloatArray, q: FloatArray, factors: Fac
 def _add_point(
     factors: Factors, matrices: FloatArray, points: PlacedPoints, p: int, share: float, point_rows: PointRows
 ) -> None:
-    """``share`` times the rows of point ``p`` onto ``point_rows``, whose gradients are scratch."""
+    """Add ``share`` times the rows of point ``p`` to ``point_rows``, whose gradients are scratch."""
     generators, tip_first, E, B = factors
     M, M0 = points
     rows, g = point_rows
@@ -304,10 +307,11 @@ class StereoCycle:
         target_points: FloatArray | None = None,
         triangulations: int = -1,
     ) -> tuple[FloatArray, float]:
-        """Velocity (n,) [rad/s or m/s] and conditioning at joints ``q`` (n,); the rest as in `stereo_step`.
+        """Velocity (n,) [rad/s or m/s] and conditioning at joints ``q`` (n,); the other arguments as in `stereo_step`.
 
         Points are those of the joints (8.35), or, with ``triangulations`` >= 0 renormalised iterations, triangulated
-        (8.34) where two cameras see them. With ``target_points`` (m, 4) the Jacobian is the mean of here and there.
+        (8.34) if two cameras see them. With ``target_points`` (m, 4) the Jacobian is the mean of the current one and
+        that at the goal.
         """
         velocity = np.empty(len(q))
         mean = target_points is not None

@@ -1,10 +1,10 @@
-"""The numbers that the stages of a step remember from one step to the next, as one flat record of fixed size, the same
-for cells of any size: compiled kernels take it as one argument, of one type.
+"""The numbers that the stages remember from one step to the next, as one flat record of fixed size, the same for cells
+of any size: compiled kernels take it as one argument, of one type.
 
-The record has room for the largest cell. An array of ``(rows, n)`` values lies packed at the start of its field, so
-that a kernel has it as ``record.field[: rows * n].reshape((rows, n))``, and Python as an attribute of `Block`: a view
-of the same memory. Attributes that are arrays are written in place; assigning one raises AttributeError, for it would
-part it from the record.
+The record is large enough for the largest cell. An array of ``(rows, n)`` values is packed at the start of its field:
+a kernel accesses it as ``record.field[: rows * n].reshape((rows, n))``, and Python as an attribute of `Block`, a view
+of the same memory. Array attributes must be written in place; assigning one raises AttributeError, because it would
+detach the attribute from the record.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 HISTORY = 128
 """Joint samples kept for interpolation: a third of a second at 1 kHz, half of one at 250 Hz."""
 VELOCITY_FILTER_S = 0.01
-"""Time constant of the filtered joint velocities."""
+"""Time constant of the filtered joint velocities [s]."""
 DELAY_SAMPLES = 5
-"""Of a joint's delay, of which the median counts."""
+"""Number of measurements of a joint's delay; their median is used."""
 LONGEST_DELAY_S = 0.25
-"""A drive that is later does not follow."""
+"""Longest delay of a drive [s]; with a longer delay, the joint counts as not following."""
 MAX_RATE_HZ, MAX_WINDOW = 2000, 100
-"""The fastest loop and the longest window of contact that a cell file may state."""
+"""The fastest loop [Hz] and the longest window of collision monitoring [samples] that a cell file may state."""
 
 
 def steps_of_delay(rate_hz: float) -> int:
-    """Steps to remember of a loop at ``rate_hz``, for drives that are late."""
+    """Number of steps to remember in a loop at ``rate_hz``, for delays of drives."""
     return math.ceil(LONGEST_DELAY_S * rate_hz) + 2
 
 
@@ -53,18 +53,21 @@ MOST = {
     "window": MAX_WINDOW,
     "past": steps_of_delay(MAX_RATE_HZ),
 }
-"""Counts of the largest cell: ``rows`` of a frame, markers of the model and static points; ``window`` samples of
-the watch on contact; steps of the ``past``.
+"""Counts of the largest cell: ``rows`` of a frame are the model's markers and static points; ``window``: samples of
+collision monitoring; ``past``: steps remembered for delays.
 """
 
 
 class RunProgress(Kept):
-    """How the law at work has got on since its goal began.
+    """Progress of the active law since its goal started.
 
-    ``moved_s``: how long it has been allowed to move. ``newest_px``: the largest error over markers and cameras, where
-    one was ``measured`` in the last step; ``held``: frames that it has been inside its tolerance, the last ones being
-    counted when the cameras had ``last_frames`` in all. ``first_px``: the largest so far; ``mean_px`` of late;
-    ``least_px``: the smallest such mean, improved for the last time after ``least_s`` of motion.
+    ``moved_s``: time for which it was allowed to move.
+    ``newest_px``: the largest error over markers and cameras, valid if one was ``measured`` in the last step.
+    ``held``: frames in which it has been inside its tolerance; they were last counted when the cameras had
+    ``last_frames`` in total.
+    ``first_px``: the largest error so far.
+    ``mean_px``: recent mean error.
+    ``least_px``: the smallest mean so far, improved for the last time after ``least_s`` of motion.
     """
 
     moved_s: float
@@ -80,7 +83,7 @@ class RunProgress(Kept):
 
 
 class Numbers(ctypes.Structure):
-    """The numbers at the head of a record: the counts, and what is no array. Read and written like attributes."""
+    """The scalar numbers at the head of a record, with the counts. They are read and written like attributes."""
 
     joints: int
     cameras: int
@@ -129,7 +132,7 @@ ARRAYS: Shapes = {
     "settled_count": ("cameras", "markers"), "settled_ns": ("cameras",),
 }  # fmt: skip
 OTHER_TYPES: dict[str, Any] = {"history_ns": np.int64, "seen_ns": np.int64, "settled_ns": np.int64}
-"""Of arrays that are not of float64."""
+"""Types of arrays that are not of float64."""
 CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, ...]]] = {
     "estimates": (CameraEstimate, ("innovation", "sigma", "seen_ns")),
     "sightings": (
@@ -137,19 +140,21 @@ CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, 
         ("frame_innovation", "frame_spread", "frame_seen", "frame_velocity", "frame_q"),
     ),
 }
-"""Of each camera, by name of their field: what has numbers there, and the arrays of which it has a row."""
+"""The records of each camera by the name of their field: the type of their numbers, and the arrays in which each camera
+has a row.
+"""
 SIGHTS = tuple(name for _, names in CAMERAS.values() for name in names)
-"""These arrays are written out with the cameras, and not with the block."""
+"""These arrays are written out with the cameras, not with the block."""
 SETTLED_FRAMES = ("settled_innovation", "settled_variance", "settled_count", "settled_ns")
-"""Sums over frames, which begin anew with another model."""
+"""Sums over frames, which are reset with a new model."""
 
 
 def packed_type(
     numbers: type[ctypes.Structure], arrays: Shapes, others: Mapping[str, Any],
     parts: Mapping[str, type[ctypes.Structure]],
 ) -> np.dtype[Any]:  # fmt: skip
-    """The type of a record of ``numbers`` and room for the ``arrays`` of the largest cell, of float64 or ``others``,
-    and for the ``parts`` of each camera.
+    """The type of a record of ``numbers`` and of the ``arrays`` in the size of the largest cell, of float64 or the
+    types in ``others``, and of the ``parts`` of each camera.
     """
     fields: list[Any] = [(name, np.dtype(kind)) for name, kind, *_ in numbers._fields_]
     fields += [(name, np.dtype(kind), (MAX_CAMERAS,)) for name, kind in parts.items()]
@@ -161,7 +166,7 @@ def packed_type(
 
 
 def shape_of(shape: tuple[str | int, ...], counts: Mapping[str, int]) -> tuple[int, ...]:
-    """A shape in numbers."""
+    """A shape with its names replaced by their counts."""
     return tuple(counts[side] if isinstance(side, str) else side for side in shape)
 
 
@@ -178,34 +183,34 @@ BLOCK = packed_type(Numbers, ARRAYS, OTHER_TYPES, {part: kind for part, (kind, _
 
 
 class Block:
-    """What is remembered; ``record`` (1,) of type `BLOCK` is all of it, and what kernels take.
+    """The remembered numbers; ``record`` (1,) of type `BLOCK` holds all of it, and is what kernels take.
 
-    Joints: their samples of late, ``history_positions`` (k, n) at ``history_ns`` (k,), a ring to which
-    ``history_count`` were ever written; ``velocities``, the last ``command`` and the ``correction`` that explains the
-    innovations best (n,). Stamps of the last step and sample, and of the sample up to which travel is accounted for,
+    Joints: recent samples ``history_positions`` (k, n) at ``history_ns`` (k,), a ring buffer with ``history_count``
+    entries ever written; ``velocities``, the last ``command`` and the ``correction`` that explains the innovations best
+    (n,). Stamps of the last step and sample, and of the last sample processed by following-error monitoring,
     ``last_followed_ns``.
 
-    Following: ``missing_travel`` (n,), commanded less measured travel of late [rad or m], and ``untold_travel``,
-    commanded since the last sample; ``last_positions`` (n,), where travel is ``followed``. While ``silence_known``:
-    readings ``silent_from`` (n,) when each last changed, ``silent_travel`` sent since, with its sign, less what
-    friction may hold back, and for how long, ``silent_s``. ``delay_…``: the arrays of `monitor_state.DriveDelays`,
-    after ``delay_steps`` steps.
+    Following: ``missing_travel`` (n,), recent commanded minus measured travel [rad or m], and ``untold_travel``,
+    commanded since the last sample; ``last_positions`` (n,), valid if travel is ``followed``. While ``silence_known``:
+    readings ``silent_from`` (n,) when each last changed, ``silent_travel`` commanded since, with its sign, less the
+    travel that friction may hold back, and its duration ``silent_s``. ``delay_…``: the arrays of
+    `monitor_state.DriveDelays`, after ``delay_steps`` steps.
 
-    Friction, while something works on a goal (see `core.move`): ``friction`` (n,) [rad/s or m/s], the velocity that is
-    added for it; ``friction_from`` (n,): readings from which travel is compared; ``friction_sent`` (n,): commanded
-    since [rad or m], in the time ``friction_s`` (n,). ``run``: how the law at work gets on.
+    Friction, while a goal is active (see `core.move`): ``friction`` (n,) [rad/s or m/s], the velocity that is added for
+    it; ``friction_from`` (n,): readings from which travel is compared; ``friction_sent`` (n,): commanded since [rad or
+    m], in the time ``friction_s`` (n,). ``run``: progress of the active law.
 
     Loads (see `core.monitors.collision`): ``mean_efforts`` (n,), moving mean; ``effort_excess``, ``following_excess``
-    (samples, n), newest last: how far the last samples lay beyond what is expected; ``contact_low``, ``contact_high``
-    (2, n), of efforts and following errors: what a contact has brought, and what it may take away again in the next
-    ``leave_s`` of motion. ``efforts``, ``following_errors`` (n,) of the sample at ``loads_ns``, where it tells
+    (samples, n), newest last: excess of the last samples over the expected value; ``contact_low``, ``contact_high`` (2,
+    n), of efforts and following errors: the range of loads during a collision, which they may leave again within the
+    next ``leave_s`` of motion. ``efforts``, ``following_errors`` (n,) of the sample at ``loads_ns``, if it contains
     them.
 
-    Cameras: ``round_due``: one has given two frames since the last round, the others are not waited for; ``estimates``
-    and ``sightings``, one each, of which ``innovation`` (c, m, 2), ``sigma`` (c, m), ``seen_ns`` (c, m), and
-    ``frame_…`` (c, k, …) for the newest frames, have the arrays, a row a camera. Of the frames in which the error of
-    the law at work has been inside its tolerance (see `core.sources.progress`): the sums of their innovations,
-    ``settled_innovation`` (c, m, 2), and variances, ``settled_variance`` (c, m) [px²], how many they are,
+    Cameras: ``round_due``: one camera has delivered two frames since the last round, so the round does not wait for the
+    others. ``estimates`` and ``sightings``: one record a camera; a row of each of the arrays ``innovation`` (c, m, 2),
+    ``sigma`` (c, m), ``seen_ns`` (c, m), and ``frame_…`` (c, k, …) of the newest frames belongs to it. Sums over the
+    frames in which the error of the active law was inside its tolerance (see `core.sources.progress`): of their
+    innovations, ``settled_innovation`` (c, m, 2), and variances, ``settled_variance`` (c, m) [px²], their number,
     ``settled_count`` (c, m), and the stamp of each camera's last one, ``settled_ns`` (c,).
     """
 
@@ -259,7 +264,7 @@ class Block:
     sightings: list[CameraMonitor]
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Nothing known, in a cell with these ``counts``. Raises ValueError."""
+        """An empty block for a cell with these ``counts``. Raises ValueError."""
         for name, most in MOST.items():
             if not 0 <= counts[name] <= most:
                 raise ValueError(f"{counts[name]} {name}; {most} are possible")
@@ -286,7 +291,7 @@ class Block:
             self.__dict__[part] = [self._of_camera(c, part) for c in range(counts["cameras"])]
 
     def _of_camera(self, c: int, part: str) -> Any:
-        """What lies in the record of one camera, with its rows of the arrays."""
+        """The record of one camera, with its rows of the arrays."""
         assert BLOCK.fields is not None
         kind, arrays = CAMERAS[part]
         at = BLOCK.fields[part][1] + c * ctypes.sizeof(kind)
@@ -295,11 +300,11 @@ class Block:
         return found
 
     def counts(self) -> dict[str, int]:
-        """Of each of `MOST`, how many the cell has."""
+        """The cell's count for each name in `MOST`."""
         return {name: getattr(self.numbers, name) for name in MOST}
 
     def begin_sights(self, markers: int, rows: int) -> None:
-        """Cameras that have seen nothing yet of so many markers, ``rows`` with the static points."""
+        """Reset the cameras' estimates and frames for so many markers; ``rows`` includes the static points."""
         self._count({**self.counts(), "markers": markers, "rows": rows})
         for name in SIGHTS:
             getattr(self, name)[:] = 0
@@ -309,12 +314,12 @@ class Block:
             frame.count_as(NOTHING_SEEN)
 
     def remember_steps(self, past: int) -> None:
-        """Room for so many steps of the past, of which nothing is known."""
+        """Size the memory of past steps to so many steps, and reset it."""
         self._count({**self.counts(), "past": past})
         self.delay_past[:] = 0.0
 
     def kept(self) -> dict[str, Any]:
-        """All that is to be written out but the `SIGHTS`, by name: numbers, then arrays."""
+        """All values to be written out except the `SIGHTS`, by name: numbers, then arrays."""
         return {
             **{name: getattr(self.numbers, name) for name, *_ in Numbers._fields_ if name != "run"},
             "run": self.numbers.run.kept(),
@@ -323,8 +328,8 @@ class Block:
 
 
 def restored(kept: Mapping[str, Any]) -> Block:
-    """The block of which `Block.kept` wrote ``kept``; what it does not name is as in the beginning. Raises ValueError,
-    TypeError where it is none.
+    """The block from the values ``kept`` written by `Block.kept`; values that are missing are initial ones. Raises
+    ValueError or TypeError if ``kept`` is invalid.
     """
     counts = {"rows": 0, **{name: kept.get(name) for name in MOST if name != "rows" or name in kept}}
     if not all(isinstance(count, int) for count in counts.values()):

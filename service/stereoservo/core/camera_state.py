@@ -1,5 +1,5 @@
-"""What is known of each camera from step to step: its estimate and its newest frame. Both are numbers and arrays that
-lie in the block (`core.block`), where kernels have them by the number of the camera.
+"""State of each camera from step to step: its estimate and its newest frame. Both are numbers and arrays in the block
+(`core.block`), where kernels access them by the number of the camera.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ class Kept(ctypes.Structure):
     """Numbers with their arrays, all of which are written out by name, in the order of the class."""
 
     def kept(self) -> dict[str, Any]:
-        """All of it by name."""
+        """All values by name."""
         return {name: getattr(self, name) for name in type(self).__annotations__}
 
     def count_as(self, other: Self) -> None:
-        """Have the numbers of another one."""
+        """Copy the numbers of another one."""
         ctypes.memmove(ctypes.byref(self), ctypes.byref(other), ctypes.sizeof(self))
 
     def become(self, other: Self) -> None:
-        """Have numbers and arrays of another one, of the same size. Raises ValueError."""
+        """Copy numbers and arrays of another one, of the same size. Raises ValueError."""
         self.count_as(other)
         for name, array in vars(self).items():
             array[:] = getattr(other, name)
 
 
 class CameraEstimate(Kept):
-    """What one camera said, per marker of the model.
+    """Estimate from the frames of one camera, for each marker of the model.
 
-    ``innovation`` (m, 2) [px]: filtered difference observed - predicted; ``sigma`` (m,) [px] of one observation;
-    ``seen_ns`` (m,): shutter time of the last accepted sight, 0 = never.
+    ``innovation`` (m, 2) [px]: filtered difference observed - predicted.
+    ``sigma`` (m,) [px]: of one observation.
+    ``seen_ns`` (m,): shutter time of the last accepted observation, 0 = never.
     """
 
     innovation: FloatArray
@@ -49,23 +50,23 @@ class CameraEstimate(Kept):
     """Shutter time of the last frame with three or more accepted markers."""
     frames: int
     rejected_frames: int
-    """Consecutive frames of which the gate refused more than half of the markers."""
+    """Consecutive frames of which the gate rejected more than half of the markers."""
     agreeing_frames: int
-    """Consecutive frames that the model explains well: what a suspect model needs to be trusted again."""
+    """Consecutive frames that the model explains well: required for a suspect model to be trusted again."""
     rms_px: float
     offset_ns: int
-    """By which its shutter opens later than its stamps tell, as far as known."""
+    """Delay of its shutter relative to its stamps [ns], as far as known."""
     _fields_ = [(name, KINDS[kind]) for name, kind in __annotations__.items() if kind in KINDS]
 
     def __init__(self, markers: int, offset_ns: int = 0) -> None:
-        """Nothing seen, with ``markers`` markers; ``offset_ns``: of the shutter stamps."""
+        """No observations of ``markers`` markers; ``offset_ns``: of the shutter stamps."""
         super().__init__(last_seq=-1, offset_ns=offset_ns)
         self.innovation, self.sigma = np.zeros((markers, 2)), np.ones(markers)
         self.seen_ns = np.zeros(markers, np.int64)
 
 
 class CameraTiming(Kept):
-    """Sums over frames of one camera: ``product`` of velocities and innovations, ``square`` of velocities, weighted."""
+    """Sums over frames of one camera, weighted: ``product`` of velocities and innovations, ``square`` of velocities."""
 
     product: float
     square: float
@@ -74,12 +75,16 @@ class CameraTiming(Kept):
 
 
 class CameraMonitor(Kept):
-    """The newest frame of one camera against the prediction at its shutter: markers of the model, then static points.
+    """Residuals of one camera's newest frame from the prediction at its shutter time: markers of the model, then static
+    points.
 
-    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2) by detector and timing, ``seen`` (k,) 1 or 0, ``velocity`` (k, 2)
-    [px/s]; joints ``q`` (n,); ``timing``: what moving markers have said of the stamps.
-    ``fresh``: it came in this step; ``looked``: a round has looked at it. ``chi2`` a freedom, ``rms_px`` and the
-    ``worst`` row are its own.
+    ``innovation`` (k, 2) [px], ``spread`` (k, 2, 2): covariance from detector and timing, ``seen`` (k,) 1 or 0,
+    ``velocity`` (k, 2) [px/s].
+    ``q`` (n,): joints.
+    ``timing``: timing sums from moving markers.
+    ``fresh``: the frame arrived in this step.
+    ``looked``: a round has examined it.
+    ``chi2`` per degree of freedom, ``rms_px`` and the ``worst`` row: of this frame alone.
     """
 
     innovation: FloatArray
@@ -101,19 +106,19 @@ class CameraMonitor(Kept):
     ]
 
     def __init__(self, rows: int, joints: int) -> None:
-        """Nothing seen of ``rows`` markers and static points."""
+        """No observations of ``rows`` markers and static points."""
         super().__init__(looked=True, worst=-1)
         self.innovation, self.spread, self.seen = np.zeros((rows, 2)), np.zeros((rows, 2, 2)), np.zeros(rows)
         self.velocity, self.q = np.zeros((rows, 2)), np.zeros(joints)
 
 
 NOTHING_KNOWN, NOTHING_SEEN = CameraEstimate(0), CameraMonitor(0, 0)
-"""Not to be written to."""
+"""Read-only."""
 
 
 def camera_read(kind: type, kept: Mapping[str, Any]) -> CameraEstimate | CameraMonitor:
-    """The estimate or the frame of which `kept` wrote ``kept``; numbers that it does not name are as in the beginning.
-    Raises ValueError, TypeError where it is none.
+    """The estimate or the frame from the values ``kept`` written by `kept`; numbers that are missing are initial ones.
+    Raises ValueError or TypeError if ``kept`` is invalid.
     """
     sizes = ("sigma",) if kind is CameraEstimate else ("seen", "q")
     if not all(isinstance(kept.get(name), np.ndarray) for name in sizes):

@@ -1,13 +1,13 @@
-"""What becomes of the motion source's velocity, in one kernel: what friction takes is added, late drives are looked
-ahead of, and the safety stage, the last one, makes a command of it.
+"""Stage 6: computes the command from the motion source's velocity, in one kernel: friction compensation, look-ahead for
+late drives, and the safety stage, which is the last one.
 
-Friction is estimated for each joint from small commands and the travel that they have brought: an integral action for a
-joint that stands, and none for one that follows. Play and sag wind nothing up, since the encoder of a motor that turns
-through its play does move; for encoders behind the play see `friction_bounds`.
+The friction of each joint is estimated from small commands and the resulting travel: an integral action for a joint
+that does not move, and none for one that follows. Play and sag cause no wind-up, since the encoder of a motor that
+turns through its play does move; for encoders on the output side of the play see `friction_bounds`.
 
 The safety stage limits joint velocities in this order: finite check, stale-input policy (coast on prediction, then
 brake), uniform velocity scale, braking-aware position margins and joint-space keep-outs, uniform acceleration limit. It
-is not a safety function in the sense of the standards: it limits commands, it does not watch the machine.
+is not a safety function in the sense of the standards: it limits commands, it does not monitor the machine.
 """
 
 from __future__ import annotations
@@ -32,9 +32,11 @@ from stereoservo.numerics.compilation import kernel
 
 @kernel
 def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
-    """Stage 6: the ``command`` (n,) of the block by the ``velocity`` (n,) of the motion in the ``room``; zero where the
-    drives are not active. ``limited`` of the room: whether there is anything to tell of it;
-    ``result``: the values that recordings keep, whose error is that of a law's kernel here.
+    """Stage 6: compute the ``command`` (n,) of the block from the ``velocity`` (n,) of the motion in the workspace
+    ``room``; zero if the drives are not active.
+
+    Also written to the workspace: ``limited``, whether there is anything to report about the command; ``result``, the
+    values that recordings keep, where the error is that of a law's kernel.
     """
     memory, work = block[0], room[0]
     n = memory.joints
@@ -76,8 +78,9 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
 
 @kernel
 def _foresee(block: Record, room: Record) -> None:
-    """Into ``outermost`` (n,) of the ``room``, where joints are, or, of late drives, will be before they obey the
-    velocity, farthest towards where they go.
+    """Write to ``outermost`` (n,) of the workspace ``room`` the extreme position of each joint in its direction of
+    motion: the current position, or for a late drive the position that the joint reaches before it executes the
+    velocity.
     """
     memory, work = block[0], room[0]
     for j in range(memory.joints):
@@ -91,17 +94,19 @@ def _foresee(block: Record, room: Record) -> None:
 
 
 RISE_S = 0.25
-"""Time constant of the estimate; a joint that stands is sent its source's velocity once more in this time."""
+"""Time constant of the estimate [s]; the command of a joint that does not move grows by its source's velocity in this
+time.
+"""
 LAG_S = 0.06
-"""Of a healthy drive: its travel is compared over longer."""
+"""Lag of a healthy drive [s]; travel is compared over longer times."""
 MOST = {"revolute": 0.015, "prismatic": 0.0015}
-"""[rad/s, m/s] Half as much again as the friction of a healthy joint; see `monitors.following.FRICTION`."""
+"""Largest compensation [rad/s, m/s]: 1.5 times the friction of a healthy joint; see `monitors.following.FRICTION`."""
 SMALL = 2.0
-"""Times ``MOST``, up to which a wanted velocity is small."""
+"""Factor on ``MOST``: velocities requested below it are small."""
 LEAST_TRAVEL = {"revolute": 2e-4, "prismatic": 2e-5}
-"""[rad, m] over which travel is compared, beside what lags, where encoders are fine."""
+"""Least travel that is compared [rad, m], in addition to the lag, for fine encoders."""
 LEAST_STEPS = 5.0
-"""Steps of the encoder likewise."""
+"""The same in steps of the encoder."""
 
 
 # -- friction -----------------------------------------------------------------------------------------------------
@@ -110,11 +115,12 @@ LEAST_STEPS = 5.0
 def friction_bounds(
     kinds: tuple[str, ...], resolution: tuple[float, ...], inexact: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared; not to be
-    written to.
+    """The largest compensation (n,) [rad/s or m/s], and the least travel (n,) [rad or m] that is compared; both are
+    read-only.
 
-    Nothing is added to joints with coarse encoders where the model states errors of joint readings (``inexact``): play
-    before the encoder looks like friction, and steps show too late that it is taken up; the joint would hunt.
+    Joints with coarse encoders are not compensated if the model states errors of joint readings (``inexact``). Play
+    before the encoder looks like friction, and a coarse encoder shows too late that the play is taken up; the joint
+    would hunt.
     """
     most, travel = (np.array([value[kind] for kind in kinds]) for value in (MOST, LEAST_TRAVEL))
     if resolution:
@@ -126,11 +132,11 @@ def friction_bounds(
 
 @kernel
 def add_friction(block: Record, room: Record, looks: bool) -> bool:
-    """Into ``raw`` (n,) of the ``room``, its motion's ``velocity`` (n,) with the friction on top, and whether there is
-    any. Zero stays zero: nothing is added to a joint that is not to move.
+    """Write to ``raw`` (n,) of the workspace ``room`` the motion's ``velocity`` (n,) plus the friction compensation;
+    returns whether there is any compensation. Zero remains zero: a joint that shall not move is not compensated.
 
-    Where it ``looks``, the travel that was sent, as it arrives, once it is enough, is compared with what came of it,
-    and begins again where it reverses.
+    If ``looks`` is True, the commanded travel, at the time of its arrival, is compared with the measured travel once it
+    is large enough. The comparison restarts when the direction reverses.
     """
     memory, work = block[0], room[0]
     n, dt_s, q = memory.joints, work.dt_s, work.q[: memory.joints]
@@ -177,18 +183,18 @@ ACCELERATION_LIMITED = "ACCELERATION_LIMITED"
 BRAKING = "BRAKING"
 
 TOUCHED = 1e-9
-"""Relative change of a command that is worth a reason."""
+"""Relative change of a command above which a reason is given."""
 MARGIN, TIMEOUT, FRESH, COAST = range(4)
-"""Of `SafetyLimits.bounds`."""
+"""Indices of `SafetyLimits.bounds`."""
 TINY = 1e-300
-"""Share of a command's step that is none."""
+"""Smallest fraction used as a divisor: avoids division by zero."""
 
 
-# -- the safety stage: limits, and what is told of them ----------------------------------------------------------
+# -- the safety stage: limits and their reasons -----------------------------------------------------------------
 
 
 class SafetyConfigurationError(ValueError):
-    """Limits or a step that the stage cannot work with; ``data`` holds the values the message speaks of."""
+    """Invalid limits, or an invalid step; ``data`` holds the values named in the message."""
 
     def __init__(self, message: str, **data: object) -> None:
         super().__init__(message)
@@ -197,13 +203,15 @@ class SafetyConfigurationError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class SafetyLimits:
-    """What may never be exceeded; all arrays in joint order, [rad] or [m] and seconds.
+    """The limits of the safety stage; all arrays in joint order, in [rad] or [m] and seconds.
 
-    ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box. The
-    boxes and the position range are kept away from by ``position_margin``. ``coast_s``: how long a law may
-    run on prediction; ``features_fresh_s``: the age of the newest features up to which a law does not coast
-    at all (a frame or two); the arm brakes when they are older than both. Raises
-    SafetyConfigurationError.
+    ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box.
+    ``position_margin``: distance kept from the boxes and the ends of the position range.
+    ``coast_s``: how long a law may run on prediction [s].
+    ``features_fresh_s``: age of the newest features up to which a law does not coast (one or two frames) [s]. The arm
+    brakes when the features are older than both.
+
+    Raises SafetyConfigurationError.
     """
 
     joint_names: tuple[str, ...]
@@ -225,7 +233,9 @@ class SafetyLimits:
 
     @cached_property
     def bounds(self) -> FloatArray:
-        """Likewise the margin of positions, and the longest ages of joints and features: fresh ones, and at all."""
+        """The scalar limits as the kernel takes them (4,): position margin, and the longest ages of joints, of fresh
+        features and of any features.
+        """
         return np.array([self.position_margin, self.joint_timeout_s, self.features_fresh_s, self.coast_s])
 
     def __post_init__(self) -> None:
@@ -277,12 +287,14 @@ class SafetyLimits:
 
 
 class SafetyInputs(msgspec.Struct, frozen=True, eq=False):
-    """One step: ``raw`` (n,) what the motion source wants, ``positions`` (n,) as measured, ``previous`` (n,)
-    command.
+    """Inputs of one step: ``raw`` (n,) requested by the motion source, measured ``positions`` (n,), ``previous``
+    command (n,).
 
-    ``joint_age_s``, ``feature_age_s``: ages of the newest joint sample and of the newest accepted features
-    [s]; negative and not finite ones are stale. ``needs_features``: whether the source may not go on without.
-    ``speed_scale`` in [0, 1]. ``brake``: stop or hold.
+    ``joint_age_s``, ``feature_age_s``: ages of the newest joint sample and of the newest accepted features [s];
+    negative or non-finite ages count as stale.
+    ``needs_features``: whether the source must stop without features.
+    ``speed_scale``: in [0, 1].
+    ``brake``: stop or hold.
     """
 
     raw: FloatArray
@@ -297,8 +309,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, eq=False):
 
 
 class SafetyResult(msgspec.Struct, frozen=True, eq=False):
-    """``raw`` and ``limited`` joint velocities (n,) and why they differ; ``braking``: the stage overrules the
-    source.
+    """``raw`` and ``limited`` joint velocities (n,) and the reasons of their difference; ``braking``: the stage
+    overrides the source.
     """
 
     raw: FloatArray
@@ -310,7 +322,7 @@ class SafetyResult(msgspec.Struct, frozen=True, eq=False):
 def explained(
     inputs: SafetyInputs, limits: SafetyLimits, limited: FloatArray, found: LimitsFound, acted: FloatArray
 ) -> SafetyResult:
-    """The result with its reasons, by what `limit_velocity` has ``found`` and ``acted`` (n,)."""
+    """The result with its reasons, from the results ``found`` and ``acted`` (n,) of `limit_velocity`."""
     reasons: list[Reason] = []
     brake = _stale(inputs, limits, reasons) or inputs.brake
     finite, speed_scale, scale, scaled_by, share, shared_by = found
@@ -350,7 +362,7 @@ def explained(
 
 
 def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
-    """What the safety stage has made of this step's motion, with its reasons."""
+    """The safety stage's result for this step's motion, with its reasons."""
     room, block = context.derived.room, context.state.block
     work, given = room.numbers, room.arrays
     raw, command = given["raw"].copy(), block.command.copy()
@@ -386,12 +398,12 @@ def safety_limits(settings: CoreSettings, features_fresh_s: float) -> SafetyLimi
 
 
 def _within(age_s: float, limit_s: float) -> bool:
-    """Whether an age can be trusted: neither NaN nor of the future, and not beyond its limit."""
+    """Whether an age is valid: not NaN, not negative, and within its limit."""
     return 0.0 <= age_s <= limit_s
 
 
 def _stale(inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) -> bool:
-    """Whether the inputs are too old, or of no credible age, to move on."""
+    """Whether the inputs are too old to move, or their age is not credible."""
     brake = False
     if not _within(inputs.joint_age_s, limits.joint_timeout_s):
         brake = True
@@ -483,7 +495,7 @@ def _braking(limited: FloatArray, limits: SafetyLimits, asked: bool) -> Reason:
 
 
 def _number(value: float) -> float | None:
-    """JSON carries no NaN or infinity."""
+    """The value, or None for NaN and infinity, which JSON cannot represent."""
     return value if math.isfinite(value) else None
 
 
@@ -492,10 +504,10 @@ def _number(value: float) -> float | None:
 
 @kernel
 def stoppable_speed(distance: float, acceleration: float, dt: float) -> float:
-    """Largest speed to hold for ``dt`` and still brake within ``distance``: ``v·dt + v²/2a = d``; 0 for d <=
-    0.
+    """Largest speed that can be held for ``dt`` and still allows braking within ``distance``: ``v·dt + v²/2a = d``; 0
+    if d <= 0.
 
-    The discrete braking ``v, v − a·dt, …`` needs no more than that, and each of its steps is stoppable again.
+    The discrete braking ``v, v − a·dt, …`` needs no more distance, and each of its steps can be stopped likewise.
     """
     if not distance > 0.0:
         return 0.0
@@ -516,7 +528,7 @@ class JointLimits(NamedTuple):
 
 
 class VelocityCaps(NamedTuple):
-    """Velocity caps ``low``, ``high`` (n,) and who set them (n,): -1 the position limit, k >= 0 keep-out box k."""
+    """Velocity caps ``low``, ``high`` (n,) and their sources (n,): -1 the position limit, k >= 0 keep-out box k."""
 
     low: FloatArray
     high: FloatArray
@@ -528,10 +540,9 @@ class VelocityCaps(NamedTuple):
 def _position_caps(
     ahead: FloatArray, behind: FloatArray, previous: FloatArray, dt: float, limits: JointLimits
 ) -> VelocityCaps:
-    """The caps that position limits and keep-outs set.
+    """The velocity caps of position limits and keep-outs.
 
-    ``ahead`` and ``behind`` (n,): the joint's extreme positions, given the age of its sample; NaN caps
-    nothing.
+    ``ahead`` and ``behind`` (n,): the joint's extreme positions, given the age of its sample; NaN sets no cap.
     """
     position_min, position_max, velocity_max, acceleration_max, margin, keep_outs = limits
     n = previous.shape[0]
@@ -547,8 +558,8 @@ def _position_caps(
         high[j] = stoppable_speed(position_max[j] - margin - ahead[j], acceleration_max[j], dt)
         low[j] = -stoppable_speed(behind[j] - (position_min[j] + margin), acceleration_max[j], dt)
     for k in range(keep_outs.shape[0]):
-        # The joint that keeps the arm out of the box with the most time to spare answers for it: as long as
-        # one joint can always stop outside, the box is never entered.
+        # Of the joints that keep the arm out of the box, the one with the most time to spare is limited.
+        # As long as one joint can always stop outside, the box is never entered.
         best = -1
         best_above = False
         best_slack = -math.inf
@@ -588,7 +599,7 @@ def _position_caps(
 
 @kernel
 def _within_speed_limits(previous: FloatArray, velocity_max: FloatArray) -> FloatArray:
-    """The previous command (n,) scaled into the speed limits: nothing may continue from beyond them."""
+    """The previous command (n,) scaled into the speed limits, so that no motion continues above them."""
     before = np.zeros(previous.shape[0])
     shrink = 1.0
     for j in range(before.shape[0]):
@@ -605,7 +616,7 @@ def _within_speed_limits(previous: FloatArray, velocity_max: FloatArray) -> Floa
 def _velocity_scale(
     wanted: FloatArray, low: FloatArray, high: FloatArray, velocity_max: FloatArray, speed_scale: float
 ) -> tuple[float, int]:
-    """The factor that brings all joints within their speed limits, and the joint that asks for it, -1 for none.
+    """The factor that brings all joints within their speed limits, and the joint that requires it, -1 for none.
 
     A joint that brakes for its position limit is held below its speed limit by its cap: it slows no other joint.
     """
@@ -620,8 +631,8 @@ def _velocity_scale(
 
 
 class Wanted(NamedTuple):
-    """What a motion asks for: ``raw``, with joints at ``positions`` after the command ``previous``, (n,) each; the rest
-    as in `SafetyInputs`.
+    """The requested motion: ``raw`` velocity, joint ``positions`` and the ``previous`` command, (n,) each; the other
+    fields as in `SafetyInputs`.
     """
 
     raw: FloatArray
@@ -644,8 +655,8 @@ class Bounds(NamedTuple):
 
 
 class LimitsFound(NamedTuple):
-    """Whether all was ``finite``; the ``speed_scale`` that holds; velocity ``scale`` and acceleration ``share``, each
-    with the joint that asks for it, -1 for none.
+    """Whether all values were ``finite``; the ``speed_scale`` in effect; velocity ``scale`` and acceleration ``share``,
+    each with the joint that requires it, -1 for none.
     """
 
     finite: bool
@@ -660,11 +671,13 @@ class LimitsFound(NamedTuple):
 def limit_velocity(
     wanted: Wanted, by: Bounds, limited: FloatArray, acted: FloatArray
 ) -> tuple[bool, LimitsFound]:
-    """Staleness, braking, velocity, positions and keep-outs, acceleration, in this order; whether there is anything to
-    tell, and what.
+    """Apply staleness, braking, velocity, position, keep-out and acceleration limits, in this order. Returns whether
+    there is anything to report, and the `LimitsFound`.
 
-    Where velocity or positions are not finite it brakes, too. Into ``limited`` the velocity (n,), and into ``acted``
-    (n,) who has acted on each joint: 0 nobody, 1 position limit, 2 + k keep-out k.
+    The arm also brakes if velocity or positions are not finite.
+
+    ``limited`` (n,): receives the velocity.
+    ``acted`` (n,): receives the limit that acted on each joint: 0 none, 1 position limit, 2 + k keep-out k.
     """
     raw, positions, previous, brake, dt, joint_age, feature_age, needs_features, speed_scale = wanted
     table, bounds, keep_outs = by
@@ -686,7 +699,7 @@ def limit_velocity(
     before = _within_speed_limits(previous, velocity_max)
     ahead, behind = np.empty(n), np.empty(n)
     for j in range(n):
-        # since the sample the joint may have been faster than now, by what it can have braked
+        # since the sample the joint may have been faster than now, by the speed it can have braked
         drift = before[j] * sample_age
         faster = 0.5 * acceleration_max[j] * sample_age * sample_age
         position = positions[j] if math.isfinite(positions[j]) else math.nan
@@ -698,7 +711,7 @@ def limit_velocity(
         limited[j] = 0.0 if brake else raw[j]
     scale, scaled_by = _velocity_scale(limited, low, high, velocity_max, speed_scale)
     for j in range(n):
-        # Scaled before it is compared with its caps: far from its limits no joint is clipped, whatever was asked.
+        # Scaled before the comparison with its caps: far from its limits no joint is clipped, whatever is requested.
         limited[j] *= scale
         if limited[j] > high[j]:
             limited[j] = high[j]
@@ -717,7 +730,7 @@ def limit_velocity(
     for j in range(n):
         if share < 1.0:
             limited[j] = before[j] + share * (limited[j] - before[j])
-        # The share of another joint may leave this one above its cap: then it brakes with all it has.
+        # Scaling by another joint may leave this one above its cap: then it brakes with full acceleration.
         step = acceleration_max[j] * dt
         if limited[j] > high[j]:
             limited[j] = min(limited[j], max(high[j], before[j] - step))

@@ -1,9 +1,9 @@
-"""What the stages of one core step share: the workspace of the kernels, and, for Python, accepted inputs, monitors'
-findings, velocity output and refused requests.
+"""Data that the stages of one core step share: the workspace of the kernels, and, for Python, accepted inputs, the
+monitors' findings, the velocity output and refused requests.
 
-Workspace: what kernels take beside the block, as one flat record of fixed size: the inputs of one step, the constants
-of settings and model, what the core's Python state says of this step, and room for the results. Nothing of it is
-remembered: it follows from inputs, settings, model and state.
+Workspace: the second argument of the kernels beside the block, one flat record of fixed size. It holds the inputs of
+one step, the constants of settings and model, the core's Python state as far as this step needs it, and the results. It
+is not part of the memory: it follows from inputs, settings, model and state.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.ports.devices import CameraObservation, JointState
 
 LENS_SIZE = 7
-"""Numbers of a lens, at most."""
+"""Largest number of lens parameters."""
 MAX_FRAMES = 4 * MAX_CAMERAS
-"""Frames that a step looks at, at most: the newest ones."""
+"""Largest number of frames that a step processes: the newest ones."""
 
 
 class Numbers(ctypes.Structure):
@@ -173,55 +173,59 @@ INTEGERS = (
 OTHER_TYPES = {"kinds": np.uint8, "frame_seen": np.uint8, **dict.fromkeys(INTEGERS, np.int64)}
 WORKSPACE = packed_type(Numbers, ARRAYS, OTHER_TYPES, {})
 _INPUTS = struct.Struct("=qd9q")
-"""The numbers of a step's inputs, ``now_ns`` to ``tells_following``, as they lie in the record."""
+"""Layout of the numbers of a step's inputs in the record, ``now_ns`` to ``tells_following``."""
 _INPUTS_AT = Numbers.now_ns.offset  # type: ignore[attr-defined]
 NOISE_CHI2 = np.array([improbable(2.0 * count) for count in range(MAX_MARKERS + 1)])
-"""Of so many markers: what `improbable` says of a frame that is nothing but noise."""
+"""Limit of a frame's chi-square by its number of markers: `improbable` for pure noise."""
 Limits = tuple[FloatArray, FloatArray]
 
 
 class Workspace:
-    """Constants and room; ``record`` (1,) of type `WORKSPACE` is all of it, and what kernels take.
+    """Workspace of the kernels: constants, inputs and results. ``record`` (1,) of type `WORKSPACE` holds all of it, and
+    is what kernels take.
 
-    Inputs of the step, put there by `core.ingest`: the time ``now_ns`` and the period ``dt_s``, at most the nominal one
+    Inputs of the step, written by `core.ingest`: the time ``now_ns`` and the period ``dt_s``, at most the nominal one
     ``nominal_s``; whether the ``stop`` was raised; the joint ``sample`` (4, n) (positions, velocities, efforts,
-    following errors; ``joints_given``, ``joints_whole``: of every joint) with ``joints_ns`` and ``joints_seq``; what
-    the driver ``sent`` (n,) in place of the last command, where ``has_sent``; and ``frames`` that have ``arrived_…``,
-    each with its ``camera`` (-1: unknown), ``seq``, stamp ``ns``, ``count`` of markers (-1: arrays of other shapes),
-    ``ids``, ``pixels``, ``covariances``.
+    following errors; ``joints_given``: there is a sample, ``joints_whole``: it is complete for every joint) with
+    ``joints_ns`` and ``joints_seq``; the velocity ``sent`` (n,) by the driver in place of the last command, if
+    ``has_sent``; and ``frames`` in arrays ``arrived_…``, for each its ``camera`` (-1: unknown), ``seq``, stamp ``ns``,
+    ``count`` of markers (-1: arrays of other shapes), ``ids``, ``pixels``, ``covariances``.
 
-    Of the settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad
-    or m] of a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,); for
-    how long a sight has a weight, ``lasting_ns``; of a frame's gate: the squared distance ``gate``, for how long an
-    innovation is known, ``known_s``, and the time constant ``filter_s`` of its filter; ``camera_rates`` (c,),
-    ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): of the model, and those that the cell file
-    states. ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.command.SafetyLimits`. Of the
-    model: as in `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of readings that err.
+    Settings: ``period_s`` of the loop, and the longest ages of inputs; ``velocity_max`` (n,); the ``lag`` [rad or m] of
+    a healthy joint's drive and ``play``, ``answers``, ``friction`` of `monitors.following.of_kinds` (n,);
+    ``lasting_ns``, the time for which an observation has a weight; for the gate of a frame: the squared distance
+    ``gate``, the time ``known_s`` for which an innovation is valid, and the time constant ``filter_s`` of its filter;
+    ``camera_rates`` (c,), ``image_sizes`` (c, 2). ``effort_limits``, ``following_limits`` (n,): those of the model, and
+    those stated in the cell file.
+    ``limits`` (4, n) and ``bounds`` (4,): of the safety stage, see `core.command.SafetyLimits`. Model: the fields of
+    `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of joint readings with errors.
 
-    What the state says of the step, by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's newest
-    news and ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python has looked at the frames;
-    ``erring``: joints may stand beside their readings; the arm is ``stopped``, ``paused``; what is watched;
-    ``rounds_apart``: Python looks at the rounds of frames, and ``quiet``: none of the last ones needed an explanation;
-    ``masked`` (m,); of each camera whether its place is ``unknown`` and what becomes of the offset of its stamps
+    State for this step, written by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's last report
+    and ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python processes the frames;
+    ``erring``: joints may deviate from their readings; the arm is ``stopped``, ``paused``; what is monitored;
+    ``rounds_apart``: Python examines the rounds of frames, and ``quiet``: none of the last ones needed an explanation;
+    ``masked`` (m,); for each camera whether its pose is ``unknown`` and the rule for the offset of its stamps
     (``offset_rule``).
 
-    Of a step: the joints ``q`` (n,), what `ingest` has found of ``joints``, ``frames`` and the ``gap`` of the loop; the
-    fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); what the monitors have found:
-    ``contact``, ``following``, of which joint ``worst`` with what it is ``missing``; of a round the cameras that were
-    ``looked_at`` and are ``odd``, as bits. Of the frame that was looked at last: joints ``frame_q`` (n,), what
-    `residuals` gives, and until the present is there the prediction of its camera alone, ``of_frame``.
+    Results of a step: the joints ``q`` (n,), the results of `ingest` for ``joints``, ``frames`` and the ``gap`` of the
+    loop; the fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); the results of the monitors:
+    ``contact``, ``following``, the joint ``worst`` with its travel ``missing``; for a round the cameras that were
+    examined (``looked_at``) and those that are ``odd``, as bit masks. For the frame processed last: joints ``frame_q``
+    (n,), the fields of `residuals`, and until the prediction of the present is written that of its camera alone,
+    ``of_frame``.
 
-    Of the goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that are
-    ``wanted`` (c, m), where its markers are to be, its centre, the three markers of its ``face`` and the centres
-    ``eyes`` of the ``eye_count`` cameras that keep sight of it; as in `sources.law.GoalError`, ``usable``, ``body`` and
-    ``centre`` now, and whether an ``error_px`` was ``measured``; whether it was ``followed`` in this step, how many of
-    its markers were ``seen`` and what `account_run` has ``run_found``. Its ``gain`` now, and the goal's gains,
-    tolerance and limits, as in `state.LawRun`. What a law finds: see `control.law.Law`. ``scene`` and ``task``: those
-    that laws take; ``aim`` and ``faced``: of which goal and face they are.
+    Goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that count,
+    ``wanted`` (c, m), the target positions of its markers, its centre, the three markers of its ``face`` and the
+    centres ``eyes`` of the ``eye_count`` cameras that must keep it visible; as in `sources.law.GoalError`, ``usable``,
+    and ``body`` and ``centre`` at present, and whether an ``error_px`` was ``measured``; whether its progress was
+    measured in this step (``followed``), how many of its markers were ``seen``, and the result ``run_found`` of
+    `account_run`. Its ``gain`` at present, and the goal's gains, tolerance and limits, as in `state.LawRun`. Results of
+    a law: see `control.law.Law`. ``scene`` and ``task``: those that laws take; ``aim`` and ``faced``: the goal and face
+    that they belong to.
 
-    Of the motion: the source's ``velocity`` (n,), what else `core.context.SourceOutput` says of it, and ``raw``
-    (n,), with what friction takes. What `core.command` has found: ``finite`` to ``shared_by``, ``acted`` (n,),
-    ``previous`` (n,) the command before. ``result`` (1 + 3n,): what recordings keep of a step, see
+    Motion: the source's ``velocity`` (n,), the other fields of `core.context.SourceOutput`, and ``raw`` (n,), the
+    velocity with friction compensation. Results of `core.command`: ``finite`` to ``shared_by``, ``acted`` (n,),
+    ``previous`` (n,), the previous command. ``result`` (1 + 3n,): values of a step for recordings, see
     `core.cycle.StepResult`. ``arrays``: all arrays by name.
     """
 
@@ -259,13 +263,15 @@ class Workspace:
         given["stated_effort_limits"][:], given["stated_following_limits"][:] = efforts, following
 
     def limit_loads(self, limits: Limits | None) -> None:
-        """Collision thresholds (n,), (n,) from here on; None: nothing reaches them."""
+        """Set the collision thresholds of efforts and following errors, (n,) each; None: infinite, so they are never
+        exceeded.
+        """
         self.numbers.watches_loads = limits is not None
         efforts, following = limits or (np.inf, np.inf)
         self.arrays["effort_limits"][:], self.arrays["following_limits"][:] = efforts, following
 
     def use(self, arrays: ModelArrays) -> None:
-        """Work with a model from here on."""
+        """Use a model from now on."""
         self._counts["markers"], self._counts["rows"] = len(arrays.marker_points), len(arrays.row_ids)
         self._view()
         numbers, given = self.numbers, self.arrays
@@ -301,16 +307,19 @@ class Workspace:
         self.faced: FaceChoice | None = None
 
     def put_numbers(self, *numbers: float) -> None:
-        """The numbers of a step's inputs, in their order in `Numbers`. Raises struct.error for integers of more than 64
-        bits.
+        """Write the numbers of a step's inputs, in their order in `Numbers`. Raises struct.error for integers of more
+        than 64 bits.
         """
         _INPUTS.pack_into(self._bytes, _INPUTS_AT, *numbers)
 
     def put_frame(
         self, k: int, camera: int, stamp: tuple[int, int], sights: tuple[IntArray, FloatArray, FloatArray]
     ) -> None:
-        """Frame ``k`` of a step: number of its camera, sequence number and shutter stamp [ns]; ids (s,), raw pixels
-        (s, 2) and covariances (s, 2, 2) of its markers. Arrays of other shapes count as wrong.
+        """Write frame ``k`` of a step. Arrays of other shapes than stated count as wrong.
+
+        ``camera``: index of its camera.
+        ``stamp``: sequence number and shutter stamp [ns].
+        ``sights``: ids (s,), raw pixels (s, 2) and covariances (s, 2, 2) of its markers.
         """
         given, count = self.arrays, len(sights[0])
         if count > MAX_MARKERS or sights[1].shape != (count, 2) or sights[2].shape != (count, 2, 2):
@@ -343,7 +352,7 @@ class Workspace:
         self.unseen_px: FloatArray = given["unseen_px"]
 
     def residuals(self, t_shutter_ns: int) -> FrameResiduals:
-        """The frame that was looked at last."""
+        """The residuals of the frame that was processed last."""
         given = self.arrays
         return FrameResiduals(
             t_shutter_ns, given["frame_innovation"], given["frame_spread"], given["frame_noise"],
@@ -352,22 +361,27 @@ class Workspace:
 
 
 Motion = tuple[Callable[[Any, "StepContext"], "SourceOutput | None"], str]
-"""The step of a motion source, and the id of the goal that it works on, '' where there is none."""
+"""The step of a motion source, and the id of the goal that it works on, '' if there is none."""
 Emit = Callable[..., None]
 """Appends an event to the step's outputs: its kind, and the event's other fields by keyword."""
 
 
 @dataclass
 class Derived:
-    """Values that follow from the settings and the model in use: kept from step to step, but no part of the state.
+    """Values derived from the settings and the model in use: they are kept from step to step, but are no part of the
+    state.
 
-    ``nominal_period_ns``: of the loop. ``longest_gap_s``: time without a step after which the arm is stopped.
-    ``frame_timeout_s``: age from which on a frame is refused; ``features_fresh_s``: up to which features are fresh
-    enough not to coast. ``prior_every``: steps between priors; ``look_every``: between two
-    examinations of why a law is slow or stuck. ``laws``: those
-    that are installed, by name. ``cameras``: indices by name. ``room``: for the results of kernels, with the constants
-    that they take. ``load_limits``:
-    collision thresholds of efforts and following errors, (n,) each; None: collisions are not monitored.
+    ``nominal_period_ns``: period of the loop.
+    ``longest_gap_s``: time without a step after which the arm is stopped.
+    ``frame_timeout_s``: age from which on a frame is rejected.
+    ``features_fresh_s``: age up to which the features are fresh enough for a law not to coast.
+    ``prior_every``: steps between priors.
+    ``look_every``: steps between two examinations of why a law is slow or stuck.
+    ``laws``: the installed laws, by name.
+    ``cameras``: indices by name.
+    ``room``: the workspace of the kernels, with the constants that they take.
+    ``load_limits``: collision thresholds of efforts and following errors, (n,) each; None: collisions are not
+    monitored.
     """
 
     nominal_period_ns: int
@@ -382,24 +396,27 @@ class Derived:
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
-    """What the status last said of the model's health, and of what."""
+    """The last reported health of the model, with the values that it was built from."""
     motion: Motion = (lambda source, context: None, "")
-    """Of the active source, as `core.move` arranges it."""
+    """The active source's motion, as `core.move` has arranged it."""
     parameters: tuple[CellModel, Any] | None = None
-    """The model whose parameters `core.sources.progress` has, and these."""
+    """The model whose parameters `core.sources.progress` has computed, and these parameters."""
 
     def use(self, arrays: ModelArrays) -> None:
-        """Work with a model from here on."""
+        """Use a model from now on."""
         self.arrays = arrays
         self.room.use(arrays)
 
 
 class Ingested(msgspec.Struct, frozen=True, eq=False):
-    """What passed the gate in one step, and why the rest did not.
+    """The inputs accepted in one step, and the reasons for rejecting the others.
 
-    ``joints``: the sample, if it is new. ``observations``: new ones, each with the index of its camera. ``elapsed_s``:
-    since the last step. ``refused_joints`` and ``refused_frames`` (index of the camera, reason): of refused samples;
-    ``gap``: of a loop that stood still for too long. ``stops``: those of these reasons that stop the arm.
+    ``joints``: the sample, if it is new.
+    ``observations``: the new ones, each with the index of its camera.
+    ``elapsed_s``: time since the last step.
+    ``refused_joints``, ``refused_frames`` (index of the camera, reason): of rejected samples and frames.
+    ``gap``: reason if the loop was interrupted for too long.
+    ``stops``: those of these reasons that stop the arm.
     """
 
     joints: JointState | None
@@ -415,15 +432,16 @@ NOTHING = Ingested(None, (), 0.0, None, (), None, ())
 
 
 class StepContext:
-    """A step as Python sees it: its inputs, the state, and views of what kernels have found so far. One object serves
-    all steps of a core; what a goal is to keep of a step, it copies. ``ingested``: what of the inputs has passed, in
-    steps in which Python looks at them.
+    """A step as Python sees it: its inputs, the state, and views of the kernels' results so far. One object serves all
+    steps of a core, so a goal must copy what it keeps of a step. ``ingested``: the accepted inputs, in steps in which
+    Python examines them.
 
     `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m,
-    2) of the markers, which need a model. ``goals_read``: ids of the goals that were looked at in this step: one at
-    most, for it is work. ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few
-    markers. ``output``: what a motion source in Python has given; None where a kernel has moved the arm, or nothing
-    did. ``moved_arrays``: the model with a body that is a target where it is now.
+    2) of the markers; these need a model.
+    ``goals_read``: ids of the goals whose requests were handled in this step; at most one, to limit the computing time.
+    ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few markers.
+    ``output``: the output of a motion source in Python; None if a kernel has moved the arm, or nothing did.
+    ``moved_arrays``: the model with the target body at its current pose.
     """
 
     def __init__(
@@ -435,9 +453,9 @@ class StepContext:
         self.begin(inputs)
 
     def begin(self, inputs: StepInputs) -> None:
-        """Nothing is known yet of a step but its inputs."""
+        """Start a step: reset everything but its inputs."""
         self.inputs, self.now_ns = inputs, inputs.now_ns
-        # Whatever the last period was, a command may change by one step of the next.
+        # However long the last period was, a command may change only by the step of one nominal period.
         self.dt_s = min(inputs.period_ns, self.derived.nominal_period_ns) * 1e-9
         self._q: FloatArray | None = None
         self.ingested = NOTHING
@@ -460,14 +478,14 @@ class StepContext:
 
     @property
     def q(self) -> FloatArray:
-        """The measured joints (n,), of this step alone."""
+        """The measured joint positions (n,), valid for this step only."""
         if self._q is None:
             self._q = self.derived.room.q.copy()
         return self._q
 
     @property
     def observations(self) -> tuple[CameraObservation, ...]:
-        """The frames that have passed, where Python looks at the step's inputs."""
+        """The accepted frames, if Python examines the step's inputs."""
         return tuple([observation for _, observation in self.ingested.observations])
 
     @property
@@ -477,11 +495,14 @@ class StepContext:
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """What a monitor has found, as the stage `monitor` acts on it.
+    """A finding of a monitor, as the stage `monitor` acts on it.
 
-    ``stop``: the arm brakes and holds, every goal ends; ``fault``: likewise, and the drives go off until a reset;
-    ``abort``: the active goal ends. ``ended``: message of the goals that end; ``message``: of the event of the stop or
-    fault. ``latched``: whether ``reason`` is shown until the cell is resumed.
+    ``stop``: the arm brakes and holds, and every goal ends.
+    ``fault``: likewise, and the drives are switched off until a reset.
+    ``abort``: the active goal ends.
+    ``ended``: message of the goals that end.
+    ``message``: message of the event of the stop or fault.
+    ``latched``: whether ``reason`` is shown until the cell is resumed.
     """
 
     effect: Literal["stop", "fault", "abort"]
@@ -492,8 +513,8 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 class SourceOutput(msgspec.Struct, frozen=True, eq=False):
-    """The output of a motion source: joint velocity (n,), whether it may not go on without features, whether it has
-    finished, and whether because its goal is ``reached``.
+    """The output of a motion source: joint velocity (n,), whether it must stop without features, whether it has
+    finished, and whether it has finished because its goal is ``reached``.
     """
 
     velocity: FloatArray
@@ -507,7 +528,9 @@ class SourceOutput(msgspec.Struct, frozen=True, eq=False):
 
 
 class RefusalError(Exception):
-    """A request is refused: the reason, ``further`` ones, and of a goal without a path the ``plan`` that was tried."""
+    """A request is refused: the reason, ``further`` reasons, and for a goal without a path the ``plan``
+    that was tried.
+    """
 
     def __init__(
         self,
@@ -532,11 +555,11 @@ COMPILING = (
     "being compiled, which takes a minute or two. Calibration, jog, home and joint goals work already; a model waits, "
     "and goals in the images, teaching and checks are refused: ask again when this reason has gone from the status"
 )
-"""What is not ready, and what is."""
+"""Message: what is not ready yet, and what is ready."""
 
 
 def no_model(context: StepContext, hint: str) -> RefusalError:
-    """The refusal of what needs a model, where none is in use; ``hint``: how to get one."""
+    """The refusal of a request that needs a model if none is in use; ``hint``: how to get one."""
     if context.inputs.compiling:
         return RefusalError("COMPILING", COMPILING)
     return RefusalError("NO_MODEL", hint)

@@ -27,9 +27,9 @@ class DriverFault(msgspec.Struct, frozen=True):
 
 
 class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
-    """A model enters the core: only at rest, with an epoch.
+    """A new model for the core: taken only at rest, with an epoch.
 
-    ``reanchored``: cameras whose matrices alone are new, in the same frame as before: a suspended goal goes on.
+    ``reanchored``: cameras of which only the matrices are new, in the same frame as before: a suspended goal continues.
     """
 
     model: CellModel
@@ -37,12 +37,14 @@ class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
 
 
 class StepInputs(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
-    """Everything that one step may depend on. ``stop``: the stop slot was raised since the last step. ``compiling``:
-    the kernels that work with a model are not loaded yet (the first start on a computer); a model waits for them.
+    """Everything that one step may depend on.
 
-    ``driver_active``: what the servo process did with the driver (it owns enable and disable); the core's lifecycle
-    follows ``driver_active`` and asks for transitions through ``StepOutputs.driver_request``. ``sent``: velocities (n,)
-    that it sent to the drives in place of the last step's command; None: that command.
+    ``stop``: the stop slot was raised since the last step.
+    ``compiling``: the kernels that need a model are not loaded yet (the first start on a computer); a model waits for
+    them.
+    ``driver_active``: the state of the driver as the servo process has set it (it owns enable and disable). The core's
+    lifecycle follows ``driver_active`` and requests transitions through ``StepOutputs.driver_request``.
+    ``sent``: velocities (n,) sent to the drives in place of the last step's command; None: that command.
     """
 
     now_ns: int
@@ -65,10 +67,10 @@ EventKind = Literal[
     "lifecycle",
     "model",
     "goal_started",
-    "goal_face",  # the law works on another face of the body from here on
-    "target_seen",  # the target that a goal follows is found, or is there again
-    "target_unseen",  # it is not seen any more: the arm waits
-    "target_met",  # it moves, and the goal holds on it all the same
+    "goal_face",  # the law uses another face of the body from now on
+    "target_seen",  # the target that a goal follows is found, or is visible again
+    "target_unseen",  # it is not visible any more: the arm waits
+    "target_met",  # the target moves, and its goal is held nevertheless
     "goal_acknowledged",
     "goal_reached",
     "goal_aborted",
@@ -83,11 +85,11 @@ EventKind = Literal[
     "calibration_finished",
     "calibration_aborted",
     "check_finished",
-    "health",  # the watch over the model has come to another verdict
-    "reanchor",  # cameras have moved, the arm rests, and these are the sights to re-anchor them by
-    "reanchored",  # the cameras are known again; a goal that was suspended goes on
-    "camera_adjusted",  # a mobile camera stands again, and its matrix is the one found while it moved
-    "reanchor_failed",  # they are not: what is suspended stays so
+    "health",  # the diagnosis of the model has changed
+    "reanchor",  # cameras have moved, the arm rests, and the observations for their relocalization follow
+    "reanchored",  # the cameras' poses are known again; a suspended goal continues
+    "camera_adjusted",  # a mobile camera is static again; its matrix is the one estimated in motion
+    "reanchor_failed",  # they are not: a suspended goal remains suspended
     "taught",
     "warning",
 ]
@@ -96,8 +98,9 @@ EventKind = Literal[
 class Sample(msgspec.Struct, frozen=True, eq=False):
     """Markers averaged at rest in one camera: ``ids`` (k,), ``pixels`` (k, 2), ``covariances`` (k, 2, 2) of the mean.
 
-    The covariances are the detector's: its noise over the number of sights, plus its systematic part. ``sights`` (k,)
-    and ``scatter`` (k,) [px²], the variance of a coordinate over these sights, tell how far its noise is as stated.
+    The covariances are the detector's: its noise divided by the number of observations, plus its systematic part.
+    ``sights`` (k,), the number of observations, and ``scatter`` (k,) [px²], the variance of a coordinate over them,
+    allow a test of the stated noise.
     """
 
     camera: str
@@ -110,8 +113,8 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
 
 
 class WayFrame(msgspec.Struct, frozen=True, eq=False):
-    """A frame taken on the way: number of its ``camera`` in the cell, stated shutter time, some markers' ``ids`` (k,)
-    and raw ``pixels`` (k, 2).
+    """A frame taken during motion to a stop: number of its ``camera`` in the cell, stated shutter time, some markers'
+    ``ids`` (k,) and raw ``pixels`` (k, 2).
     """
 
     camera: int
@@ -121,7 +124,7 @@ class WayFrame(msgspec.Struct, frozen=True, eq=False):
 
 
 class WayRecord(msgspec.Struct, frozen=True, eq=False):
-    """What was seen on the way to a stop: ``frames``, and joint samples ``positions`` (k, n) at ``joints_ns`` (k,)."""
+    """Data recorded on the path to a stop: ``frames``, and joint samples ``positions`` (k, n) at ``joints_ns`` (k,)."""
 
     frames: tuple[WayFrame, ...]
     joints_ns: IntArray
@@ -129,7 +132,7 @@ class WayRecord(msgspec.Struct, frozen=True, eq=False):
 
 
 class Event(msgspec.Struct, frozen=True, eq=False):
-    """Something a client may not miss. ``seq`` counts from the core's start; ``t_ns`` monotonic."""
+    """A message that a client must not miss. ``seq`` counts from the core's start; ``t_ns`` monotonic."""
 
     seq: int
     t_ns: int
@@ -148,14 +151,14 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     plan: PlanReport | None = None
     """Of a reply to a goal that was planned."""
     way: WayRecord | None = None
-    """Of the way to a calibration's stop."""
+    """Of the path to a calibration's stop."""
     loads: JointLoads | None = None
-    """Of finished trial motions, where the drives tell."""
+    """Of finished trial motions, if the drives report loads."""
     cameras: tuple[str, ...] = ()
-    """Of ``reanchor`` and what follows it: cameras that have moved; ``rigid``: as one body."""
+    """Of ``reanchor`` and the events after it: cameras that have moved; ``rigid``: as one body."""
     rigid: bool = False
     matrix: FloatArray | None = None
-    """Of ``camera_adjusted``: where the camera ``name`` stands now (3, 4), in the frame of model ``epoch``."""
+    """Of ``camera_adjusted``: the matrix (3, 4) of the camera ``name``, in the frame of model ``epoch``."""
     epoch: int = 0
 
 
@@ -164,7 +167,7 @@ class Status(CoreStatus[FloatArray], frozen=True, eq=False):
 
 
 class StepOutputs(msgspec.Struct, frozen=True, eq=False):
-    """``command`` (n,) to write, or None where nothing may be written in this lifecycle state."""
+    """Outputs of a step. ``command`` (n,) to write, or None if nothing may be written in this lifecycle state."""
 
     command: FloatArray | None
     status: Status
@@ -184,7 +187,7 @@ class StepOutputs(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def values(self) -> FloatArray:
-        """As in `StepResult`."""
+        """The values of `StepResult`."""
         status, command = self.status, self.command
         error_px = NOT_MEASURED if status.error_px is None else status.error_px
         given = np.zeros_like(status.command_raw) if command is None else command
@@ -192,13 +195,13 @@ class StepOutputs(msgspec.Struct, frozen=True, eq=False):
 
 
 NOT_MEASURED = -1e300
-"""Stands for an error that is not measured."""
+"""Value of an error that is not measured."""
 
 
 class StepResult(Protocol):
-    """What a recording keeps of a step's outputs, as in `StepOutputs`. ``values`` (1 + 3n,): the error [px] of the
-    active goal, the velocity before the safety stage, the filtered velocities of the joints, and the command, zero
-    where there is none.
+    """The values of a step's outputs that a recording keeps, as in `StepOutputs`. ``values`` (1 + 3n,): the error [px]
+    of the active goal, the velocity before the safety stage, the filtered velocities of the joints, and the command
+    (zero if there is none).
     """
 
     @property
@@ -216,7 +219,7 @@ class StepResult(Protocol):
 
 
 _DTYPES = {dtype.str: dtype for dtype in map(np.dtype, "?bBhHiIqQfd")}
-"""Types of arrays that are read: `numpy.dtype` of any text would run a parser on it."""
+"""Types of arrays that are accepted: `numpy.dtype` of arbitrary text would run a parser on it."""
 
 
 def encode_array(value: object) -> object:
@@ -227,8 +230,8 @@ def encode_array(value: object) -> object:
 
 
 def decode_array(kind: type, value: object) -> object:
-    """msgspec ``dec_hook``, inverse of :func:`encode_array`. Raises ValueError, TypeError, before anything is
-    allocated.
+    """msgspec ``dec_hook``, inverse of :func:`encode_array`. Raises ValueError or TypeError before
+    memory is allocated.
     """
     parts: Any = value
     name, shape, data = parts
@@ -245,13 +248,13 @@ _encoder = msgspec.msgpack.Encoder(enc_hook=encode_array)
 
 
 def encode(value: object) -> bytes:
-    """A struct, or anything made of structs and arrays, as msgpack; arrays bit for bit."""
+    """A struct, or any object made of structs and arrays, as msgpack; arrays bit for bit."""
     return _encoder.encode(value)
 
 
 def check_observation(observation: CameraObservation) -> None:
-    """Raise ValueError where an observation's arrays are not of the shapes and types that it is to have: compiled
-    kernels take no others.
+    """Raise ValueError unless an observation's arrays have the required shapes and types; compiled kernels accept no
+    others.
     """
     ids = observation.ids
     if ids.ndim != 1 or ids.dtype.kind not in "iu":

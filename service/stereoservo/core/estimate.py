@@ -2,8 +2,8 @@
 its own time stamp. At rest it puts a new model in use, with its readiness and collision thresholds.
 
 The innovation of a marker is observed minus predicted pixel at the frame's shutter time, with the joints interpolated
-from a short history; no trigger is needed. It is gated statistically, filtered, and carried to the present by the
-kinematics (`core.prediction`), so that control goes on between frames and through a lost camera.
+from a short history; no trigger is needed. It is gated statistically, filtered, and extrapolated to the present by the
+kinematics (`core.prediction`), so that control continues between frames and during the loss of a camera.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 
 AT_REST = 1e-3
-"""[rad/s or m/s]"""
+"""Joint command below which the arm counts as at rest [rad/s or m/s]."""
 
 
 @kernel
 def estimate(block: Record, room: Record) -> None:
-    """Stage 2: the frames in the ``room`` that passed are folded into the estimates of their cameras, those that Python
-    has not looked at; then the present is predicted.
+    """Stage 2: update the cameras' estimates by the accepted frames in the workspace ``room``, except those that Python
+    processes (`take_frames_apart`); then predict the current markers.
     """
     memory, work = block[0], room[0]
     if work.frames_apart == 0:
@@ -72,7 +72,7 @@ def estimate(block: Record, room: Record) -> None:
 
 @kernel
 def note_frames(block: Record, room: Record) -> None:
-    """Stage 2 of a cell without a model: of the frames that passed their numbers, and how many markers they show."""
+    """Stage 2 of a cell without a model: store sequence number and number of markers of each accepted frame."""
     memory, work = block[0], room[0]
     for c in range(memory.cameras):
         memory.sightings[c].fresh = False
@@ -83,15 +83,15 @@ def note_frames(block: Record, room: Record) -> None:
 
 @kernel
 def note_frame(block: Record, room: Record, k: int) -> None:
-    """Frame ``k`` in the ``room`` is the newest one of its camera."""
+    """Store frame ``k`` in the workspace ``room`` as the newest one of its camera."""
     work = room[0]
     estimate = block[0].estimates[work.arrived_camera[k]]
     estimate.last_seq, estimate.last_visible = work.arrived_seq[k], work.arrived_count[k]
 
 
 def take_frames_apart(context: StepContext) -> None:
-    """The frames of cells with cameras that may move, or with a target that is followed: Python looks at them one after
-    the other, and `estimate` at none.
+    """Process the frames of a cell with cameras that may move or with a target that is followed. Python processes them
+    one by one; `estimate` then processes none.
     """
     state, room = context.state, context.derived.room
     for sighting in state.watching.sightings:
@@ -108,13 +108,13 @@ def take_frames_apart(context: StepContext) -> None:
 
 
 def _take_frame_apart(camera: int, k: int, t_ns: int, context: StepContext) -> None:
-    """`take_frame`, with a look at whether the camera moves."""
+    """Process a frame like `take_frame`, and check whether the camera moves."""
     state, room = context.state, context.derived.room
     if context.derived.arrays is None:
         note_frame(state.block.record, room.record, k)
         return
     found = see_frame(state.block.record, room.record, k)
-    if found & TOLD:  # where the arm was is known, and not only expected
+    if found & TOLD:  # the arm's position is measured, not only predicted
         _look_for_motion(camera, t_ns, context)
     room.arrays["unknown"][camera] = place_unknown(camera, state, context.settings)
     fold_frame(state.block.record, room.record, k, found)
@@ -124,8 +124,8 @@ def _take_frame_apart(camera: int, k: int, t_ns: int, context: StepContext) -> N
 
 
 def take_model(context: StepContext) -> None:
-    """A new model waits until the arm rests and no law runs, and until the kernels that it needs are loaded; then every
-    estimate starts again.
+    """Put a new model in use. It waits until the arm rests, no law runs, and the kernels that it needs are loaded; then
+    every estimate starts again.
     """
     state, update = context.state, context.inputs.model_update
     if update is not None:
@@ -163,7 +163,7 @@ def take_model(context: StepContext) -> None:
 
 
 def _await_model(update: ModelUpdate, context: StepContext) -> None:
-    """Keep a model until it may be used; a re-anchored one must be the one that is waited for."""
+    """Store a model until it may be used; a model of a relocalization must be the one that is expected."""
     state = context.state
     if update.reanchored:
         refusal = camera_relocalization.misfit(state, update)
@@ -195,20 +195,22 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
 
 
 def fitted_readiness(model: CellModel) -> ModelReadiness:
-    """The readiness of a model before the images have confirmed or contradicted it."""
+    """The readiness of a model before images have confirmed or contradicted it."""
     good = model.statistics is not None and model.statistics.chi2_ok
     return ModelReadiness.VALID if good else ModelReadiness.CANDIDATE
 
 
 def load_limits(settings: CoreSettings, model: CellModel | None) -> tuple[FloatArray, FloatArray] | None:
-    """Collision thresholds (n,), (n,) by cell file and model; None: collisions are not monitored."""
+    """Collision thresholds of efforts and following errors, (n,) each, from cell file and model; None: collisions are
+    not monitored.
+    """
     if not settings.watch_following:
         return None
     return collision_thresholds(settings, None if model is None else model.loads)
 
 
 def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
-    """Room for the steps of a core, with the constants of the cell, and the limits of what ``model`` says of loads."""
+    """Workspace for the steps of a core, with the constants of the cell and the load limits of the ``model``."""
     return Workspace(settings, load_limits(settings, model), stated_thresholds(settings))
 
 
@@ -216,7 +218,7 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 
 
 def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
-    """Of a mobile camera: whether it moves; while it does, its newest frame is compared with nothing."""
+    """Check whether a mobile camera moves; while it does, its newest frame is not compared with the prediction."""
     state, room, arrays = context.state, context.derived.room, context.derived.arrays
     if state.mobile[camera] is None or arrays is None:
         return
@@ -227,28 +229,30 @@ def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
 
 
 FOLLOWED_S = 0.02
-"""How far the offset of shutter stamps may be followed from what the trial motions have shown."""
+"""Largest deviation [s] of a corrected offset of shutter stamps from the offset measured by the trial motions."""
 FOLLOWED_DEVIATION_S = 0.001
-"""Standard deviation at which motion has shown an offset well enough to follow it."""
+"""Standard deviation [s] at which the offset is measured accurately enough to be corrected."""
 NO_STAMPS = (*MOVED, "cameras_or_arm")
-"""Verdicts on cameras whose innovations say nothing of their stamps."""
+"""Diagnoses under which a camera's innovations contain no information about its stamps."""
 
 
 def stated_offsets(model: CellModel) -> dict[str, int]:
-    """Offsets [ns] of the shutter stamps by camera, as the trial motions have shown them."""
+    """Offsets of the shutter stamps [ns] by camera, as measured by the trial motions."""
     return {offset.camera: round(1e9 * offset.offset_s) for offset in model.shutter_offsets}
 
 
 LEAVES, FOLLOWS_MOTION, AS_STATED = range(3)
-"""What becomes of the offset of a camera's stamps."""
+"""Rules for the offset of a camera's stamps: leave it, correct it by the motion of the markers, or reset it to the
+stated one.
+"""
 
 
 def offset_rules(state: CoreState, settings: CoreSettings) -> list[tuple[int, int]]:
-    """What becomes of the offset of each camera's stamps, and the stated one [ns].
+    """The rule for the offset of each camera's stamps, and the stated offset [ns].
 
-    It is corrected only where the trial motions have shown it, and none of the joints: play of a joint looks like a
-    late picture. A camera that was moved looks like one, too: its offset is the stated one from the verdict until it
-    is known again, and with any other verdict the offset stays.
+    The offset is corrected only if the trial motions have measured it and the model states no errors of joint readings:
+    play of a joint looks like a late frame. A displaced camera looks like a late frame, too: its offset is the stated
+    one from the diagnosis until its pose is known again. With any other diagnosis the offset does not change.
     """
     model, verdict = state.model, state.watching.verdict
     if model is None or model.joint_accuracy is not None or not model.shutter_offsets:
@@ -268,8 +272,8 @@ def offset_rules(state: CoreState, settings: CoreSettings) -> list[tuple[int, in
 
 @kernel
 def _follow_offset(block: Record, room: Record, k: int) -> None:
-    """Correct the offset of a camera's stamps by what its markers have shown in motion, within a bound: see
-    `offset_rules`. No shutter opens after its frame ``k`` has come.
+    """Correct the offset of a camera's stamps by the motion of its markers, within a bound: see `offset_rules`. The
+    corrected shutter time is not later than the arrival of frame ``k``.
     """
     memory, work = block[0], room[0]
     camera = work.arrived_camera[k]
@@ -287,7 +291,7 @@ def _follow_offset(block: Record, room: Record, k: int) -> None:
 
 
 def place_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
-    """Whether the place of a camera is not known: it is being found again, or it moves now."""
+    """Whether the pose of a camera is unknown: it is being relocalized, or it moves."""
     mobile = state.mobile[camera]
     if mobile is not None and mobile.moving:
         return True
@@ -297,7 +301,7 @@ def place_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool
 
 
 def masked_ids(state: CoreState) -> tuple[int, ...]:
-    """Ids of markers that are not used."""
+    """Ids of the markers that are not used."""
     if state.model is None:
         return ()
     masked = state.watching.masked
@@ -312,24 +316,25 @@ AGREEING_PX = 1.5
 
 
 KNOWN, TOLD = 1, 2
-"""What `see_frame` has found, added up: the joints are known at the shutter, and by samples on both sides of it."""
+"""Bits of the result of `see_frame`: the joints are known at the shutter time; samples on both sides of it exist."""
 
 
 @kernel
 def take_frame(block: Record, room: Record, k: int) -> None:
-    """Compare frame ``k`` in the ``room`` with the prediction at its shutter, and fold it into its camera's
-    estimate.
+    """Compare frame ``k`` in the workspace ``room`` with the prediction at its shutter time, and update the estimate of
+    its camera.
     """
     fold_frame(block, room, k, see_frame(block, room, k))
 
 
 @kernel
 def see_frame(block: Record, room: Record, k: int) -> int:
-    """Compare frame ``k`` in the ``room`` with the prediction at its shutter; into the room, what it holds of the frame
-    that was looked at last. Whether the joints are known then, and told by samples on both sides.
+    """Compare frame ``k`` in the workspace ``room`` with the prediction at its shutter time and write the residuals to
+    the workspace. Returns bits: `KNOWN` if the joints are known at that time, `TOLD` if there are samples on both sides
+    of it.
 
-    The velocities of the joints at present are those of a frame that is newer than their last sample. Sights that the
-    camera's lens cannot have made are left out.
+    For a frame newer than the last joint sample, the current joint velocities are used. Observations that the camera's
+    lens cannot produce are ignored.
     """
     note_frame(block, room, k)
     memory, work = block[0], room[0]
@@ -373,9 +378,9 @@ def see_frame(block: Record, room: Record, k: int) -> int:
 
 @kernel
 def fold_frame(block: Record, room: Record, k: int, found: int) -> None:
-    """What the ``room`` holds of frame ``k``, of which `see_frame` has ``found`` what of the joints, goes to the
-    monitors where these are told, and into its camera's estimate where the place of that is known; nothing where the
-    joints are not known.
+    """Pass the residuals of frame ``k`` in the workspace ``room`` on; ``found`` is the result of `see_frame`. The
+    monitors receive them if the joints were sampled on both sides of the shutter time. The camera's estimate is updated
+    if the camera's pose is known. Nothing happens if the joints are unknown.
     """
     work = room[0]
     if found & KNOWN == 0:
@@ -389,8 +394,8 @@ def fold_frame(block: Record, room: Record, k: int, found: int) -> None:
 
 @kernel
 def fold_residuals(block: Record, room: Record, k: int) -> None:
-    """What the ``room`` holds of frame ``k`` is the newest one of its camera; a round is due where none has looked at
-    the one before.
+    """Store the residuals of frame ``k`` in the workspace ``room`` as the newest ones of its camera. A round becomes
+    due if no round has examined the frame before it.
     """
     memory, work = block[0], room[0]
     n, rows, m = memory.joints, memory.rows, memory.markers
@@ -421,14 +426,14 @@ def fold_residuals(block: Record, room: Record, k: int) -> None:
 
 
 FORGETTING_S = 30.0
-"""Time constant, in seconds of seen motion, with which old frames are forgotten."""
+"""Time constant [s] with which old frames are forgotten, in time during which motion is visible."""
 MOVING_PX_S = 20.0
-"""Mean pixel speed below which a frame says nothing of time."""
+"""Mean pixel speed [px/s] below which a frame contains no information about timing."""
 
 
 class Moved(NamedTuple):
-    """Of the rows of a frame: ``innovations`` (k, 2) [px], ``velocities`` (k, 2) [px/s], and the variance ``noise``
-    (k,) [px²] of a coordinate.
+    """Moving markers of a frame, one a row: ``innovations`` (k, 2) [px], ``velocities`` (k, 2) [px/s], and the variance
+    ``noise`` (k,) [px²] of one coordinate.
     """
 
     innovations: FloatArray
@@ -446,9 +451,9 @@ class TimingSums(NamedTuple):
 
 @kernel
 def fold_timing(sums: TimingSums, t_ns: int, frame: Moved, used: FloatArray) -> TimingSums:
-    """The ``sums`` with the rows of a frame that are ``used`` (k,) > 0.
+    """Add the rows of a frame with ``used`` (k,) > 0 to the ``sums``; returns the new sums.
 
-    The markers of a frame share what the model is off by: they count as one sight, not as k.
+    The markers of a frame share the model's error, so they count as one observation, not as k.
     """
     k, speed, along, squared = _timing_sums(frame, used)
     if k == 0 or speed < MOVING_PX_S * k:
@@ -460,8 +465,8 @@ def fold_timing(sums: TimingSums, t_ns: int, frame: Moved, used: FloatArray) -> 
 
 @kernel
 def _timing_sums(frame: Moved, used: FloatArray) -> tuple[int, float, float, float]:
-    """How many markers of a frame are ``used`` (k,) > 0, and sums over these: pixel speeds, and of the weighted fit of
-    innovations to velocities.
+    """Number of a frame's markers with ``used`` (k,) > 0, and sums over these: the pixel speeds, and the two sums
+    (product, square) of the weighted fit of innovations to velocities.
     """
     innovations, velocities, variances = frame
     count, speed, product, square = 0, 0.0, 0.0, 0.0
@@ -479,12 +484,12 @@ def _timing_sums(frame: Moved, used: FloatArray) -> tuple[int, float, float, flo
 
 @kernel
 def accept_sights(block: Record, room: Record, k: int) -> None:
-    """Gate frame ``k``, of which the ``room`` holds the residuals, and fold it into its camera's estimate; markers that
-    are masked are left out.
+    """Gate frame ``k``, whose residuals are in the workspace ``room``, and update the estimate of its camera. Masked
+    markers are ignored.
 
-    The gate is chi-square with two freedoms on the deviation from the filtered innovation and its common change (see
-    `_common_change`), with the covariances of detector, timing and model. Near the gate a sight counts less: in the
-    filter, and in triangulation by its sigma.
+    The gate is a chi-square test with two degrees of freedom on the deviation from the filtered innovation and its
+    common change (see `_common_change`), with the covariances of detector, timing and model. An observation near the
+    gate has a smaller weight in the filter, and a larger sigma in triangulation.
     """
     memory, work = block[0], room[0]
     m, camera = memory.markers, work.arrived_camera[k]
@@ -507,15 +512,17 @@ def accept_sights(block: Record, room: Record, k: int) -> None:
 
 
 COMMON_ROUNDS = 8
-"""Of reweighting, in which sights that the joints do not explain lose their weight."""
+"""Iterations of reweighting, which reduce the weight of observations that the joints do not explain."""
 
 
 @kernel
 def _common_change(block: Record, room: Record, camera: int, used: BoolArray, common: FloatArray) -> None:
-    """Into ``common`` (m, 2) [px], the change of the innovations since the filtered ones that joints explain which pass
-    through their play or step, within the errors that the model states of them; zeros where nothing changed.
+    """Write the common change of the innovations to ``common`` (m, 2) [px]: the change since the filtered ones that is
+    explained by joints passing through their play or a step, within the errors of joint readings that the model states.
+    Zeros if nothing changed.
 
-    Markers that are ``used`` (m,). By iterated weights of Huber: what is common moves all markers, an outlier one.
+    ``used`` (m,): markers to use. Huber's weights are iterated: a common change moves all markers, an outlier moves
+    one.
     """
     memory, work = block[0], room[0]
     m, n, at = memory.markers, memory.joints, memory.markers * camera
@@ -571,8 +578,8 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
 
 
 class Sights(NamedTuple):
-    """Of k sights: their ``rows`` (k,) among the model's markers and static points, -1 for none; ideal ``pixels``
-    (k, 2), ``covariances`` (k, 2, 2) [px²].
+    """k observations: their ``rows`` (k,) among the model's markers and static points (-1: none); ideal ``pixels`` (k,
+    2) and ``covariances`` (k, 2, 2) [px²].
     """
 
     rows: IntArray
@@ -589,10 +596,11 @@ def _compare(
     jacobian: FloatArray,
     speed: FloatArray,
 ) -> None:
-    """Into the ``room``, the fields of `FrameResiduals`: observed less ``predicted`` (m, 2) or ``standing`` (s, 2)
-    [px].
+    """Write the fields of `FrameResiduals` to the workspace ``room``: observed minus predicted pixels [px].
 
-    ``jacobian`` (m, 2, n), ``speed`` (n,): what a shutter stamp that is off by `TIMING_SIGMA_S` moves.
+    ``predicted`` (m, 2), ``standing`` (s, 2): predicted pixels of markers and of static points.
+    ``jacobian`` (m, 2, n), ``speed`` (n,): give the pixel velocities; a shutter stamp that is off by `TIMING_SIGMA_S`
+    adds to the covariance by them.
     """
     work, markers, n = room[0], jacobian.shape[0], jacobian.shape[2]
     rows, pixels, covariances = sights
@@ -628,12 +636,14 @@ def _compare(
 def _fold_in(
     block: Record, room: Record, k: int, used: BoolArray, common: FloatArray
 ) -> tuple[int, int, float]:
-    """Fold the innovations of frame ``k`` into the filtered ones, each by its weight; those refused leave it alone.
+    """Update the filtered innovations by those of frame ``k``, each by its weight; rejected ones change nothing.
+    Returns the numbers of accepted and rejected innovations, and the sum of squares of the accepted ones [px²].
 
-    Markers that are ``used`` (m,). A prediction may be off by `MODEL_SIGMA_PX`, or, of markers that were not seen of
-    late, by `FIRST_SIGHT_SIGMA_PX`; ``common`` (m, 2) [px]: change of all of them together since the filtered ones,
-    which the gate leaves out. Gives how many were accepted and refused, and the sum of squares of the accepted
-    innovations [px²].
+    ``used`` (m,): markers to use.
+    ``common`` (m, 2) [px]: the common change of all markers since the filtered innovations, which the gate subtracts.
+
+    The model error in the gate has the standard deviation `MODEL_SIGMA_PX`, or `FIRST_SIGHT_SIGMA_PX` for markers that
+    were not seen recently.
     """
     memory, work = block[0], room[0]
     m, t_ns = memory.markers, work.arrived_ns[k]

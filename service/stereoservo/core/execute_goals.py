@@ -47,13 +47,15 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
 
 AT_REST = 1e-3
-"""[rad/s or m/s]"""
+"""Joint command below which the arm counts as at rest [rad/s or m/s]."""
 MOVED_SINCE = 0.01
-"""Joint motion [rad or m] since a plan was begun from which on a way that is followed is planned anew."""
+"""Joint motion [rad or m] since planning began, above which a path that is followed is planned again."""
 
 
 def execute_goals(context: StepContext) -> Source:
-    """The source that is active from here on: one step's share of planning, the next goal, leases, the lifecycle."""
+    """Do one step's share of planning, and handle the next goal, leases and the lifecycle; returns the
+    active source.
+    """
     state = context.state
     if (
         state.planning is not None
@@ -74,7 +76,7 @@ def execute_goals(context: StepContext) -> Source:
 
 
 def _end_inactive(context: StepContext) -> None:
-    """Nothing moves, and nothing waits to move, outside ACTIVE."""
+    """End every goal, active or queued: no motion is allowed outside ACTIVE."""
     state = context.state
     reason = Reason("NOT_ACTIVE", "hold", hint=f"the cell became {state.lifecycle}")
     end_source(context, "goal_aborted", (reason, *state.fault), f"the cell became {state.lifecycle}")
@@ -82,7 +84,7 @@ def _end_inactive(context: StepContext) -> None:
 
 
 def _watch_lease(source: Any, context: StepContext) -> None:
-    """End a source whose client was silent for too long."""
+    """End a source whose client has not renewed its lease in time."""
     if source.lease_s is None or context.now_ns <= source.lease_until_ns:
         return
     hint = "the client did not renew its lease: is it alive?"
@@ -91,7 +93,7 @@ def _watch_lease(source: Any, context: StepContext) -> None:
 
 
 def _advance(context: StepContext) -> None:
-    """One step's share of planning, and what follows from it: replies, the next goal, a blend into it."""
+    """Do one step's share of planning and act on its result: replies, the next goal, blending into it."""
     state = context.state
     if isinstance(state.source, AwaitingAcknowledgement) and context.now_ns > state.source.until_ns:
         _not_acknowledged(state.source, context)
@@ -114,7 +116,7 @@ def _not_acknowledged(source: AwaitingAcknowledgement, context: StepContext) -> 
 
 
 def _watch_leases(context: StepContext) -> None:
-    """A goal whose client dies while it is queued does not begin."""
+    """End queued goals whose lease has expired."""
     state = context.state
     expired = [i for i, until_ns in state.queued_until_ns.items() if context.now_ns > until_ns]
     for goal in [goal for goal in state.queue if goal.id in expired]:
@@ -133,7 +135,7 @@ def _watch_leases(context: StepContext) -> None:
 def _plan_on(job: PlanJob, context: StepContext) -> None:
     state = context.state
     if job.resolution is not None and job.goal.id in context.goals_read:
-        return  # of a large body: its markers' faces were this step's work
+        return  # a large body: computing its markers' faces took this step's time
     try:
         trusted_model(context)
         if job.planning is None:
@@ -151,7 +153,7 @@ def _plan_on(job: PlanJob, context: StepContext) -> None:
 
 
 def _report_of(job: PlanJob, context: StepContext) -> PlanReport | None:
-    """Of a goal that is looked at: its plan, and of those that cannot be planned why. Raises RefusalError."""
+    """The plan of a resolved goal; for a goal that is not planned, the report without a plan. Raises RefusalError."""
     assert job.source is not None
     if job.planning is not None:
         return plan_report(job, context)
@@ -159,7 +161,7 @@ def _report_of(job: PlanJob, context: StepContext) -> PlanReport | None:
 
 
 def _end_job(job: PlanJob, report: PlanReport | None, context: StepContext) -> None:
-    """Do what a goal was looked at for."""
+    """Act on the result of a planning job according to its purpose."""
     state, source, goal = context.state, job.source, job.goal
     assert source is not None
     try:
@@ -170,7 +172,7 @@ def _end_job(job: PlanJob, report: PlanReport | None, context: StepContext) -> N
             _fresh(job, source, context)
             message, _ = accept(goal, source, report, context)
         elif job.purpose == "queue":
-            begin(source, context)  # in hold, too: it waits to be resumed
+            begin(source, context)  # in hold, too: it waits for resume
         elif job.purpose == "ahead" and source.pose_known:
             state.ahead = source
         elif job.purpose == "ahead":
@@ -183,7 +185,9 @@ def _end_job(job: PlanJob, report: PlanReport | None, context: StepContext) -> N
 
 
 def _fresh(job: PlanJob, source: ServoGoal, context: StepContext) -> None:
-    """A way that is followed begins where the arm rests: one that has moved since plans anew when it rests."""
+    """Discard a plan if the arm has moved since: a path that is followed must start where the arm rests, so it is
+    planned again at rest.
+    """
     if source.plan is not None and bool((np.abs(context.q - job.joints) > MOVED_SINCE).any()):
         source.plan = None
 
@@ -200,11 +204,11 @@ def _refused(job: PlanJob, refusal: RefusalError, context: StepContext) -> None:
     elif job.purpose == "again" and state.source is job.source:
         end_source(context, "goal_aborted", refusal.reasons, str(refusal))
     elif job.purpose == "ahead":
-        state.not_ahead = goal.id  # planned again from where the arm comes to rest, and told then
+        state.not_ahead = goal.id  # planned again from where the arm comes to rest, and reported then
 
 
 def _next_plan(context: StepContext) -> None:
-    """Plan what is to be planned without being asked: a way anew, the next goal, the one after this."""
+    """Start the planning that needs no request: a path again, the next goal, the goal after the active one."""
     state = context.state
     source = state.source
     if state.reanchoring is not None:
@@ -236,7 +240,7 @@ def _next_plan(context: StepContext) -> None:
 
 
 def _not_begun(goal: Goal, refusal: RefusalError, context: StepContext) -> None:
-    """A queued goal cannot be driven from where the arm is now."""
+    """A queued goal cannot be executed from the arm's current position."""
     context.emit("goal_aborted", id=goal.id, message=str(refusal), reasons=refusal.reasons)
     if goal.acknowledge_s is not None:
         end_followers(context, goal.id, refusal.reasons)
@@ -253,7 +257,7 @@ def _blends(source: Source) -> bool:
 
 
 def _plan_ahead(goal: Goal, source: Source, context: StepContext) -> None:
-    """Plan the next goal from where this one ends, while the arm is still on its way there."""
+    """Plan the next goal from where the active one ends, while the arm still moves there."""
     state = context.state
     assert isinstance(source, ServoGoal)
     if source.goal_joints is None:
@@ -264,7 +268,7 @@ def _plan_ahead(goal: Goal, source: Source, context: StepContext) -> None:
     try:
         prepared = prepare(goal, context, "ahead", place=place, joints=source.goal_joints)
     except RefusalError:
-        state.not_ahead = goal.id  # told when its turn comes
+        state.not_ahead = goal.id  # reported when its turn comes
         return
     if isinstance(prepared, PlanJob):
         state.planning = prepared
@@ -273,7 +277,7 @@ def _plan_ahead(goal: Goal, source: Source, context: StepContext) -> None:
 
 
 def _blend_into_next(context: StepContext) -> None:
-    """Leave a goal that blends into the next, near enough and with its way planned, without a stop."""
+    """Leave a goal that blends into the next without a stop, once it is close enough and the next path is planned."""
     state = context.state
     source, following = state.source, state.ahead
     if following is None or not isinstance(source, ServoGoal) or source.goal.blend_px is None:

@@ -1,8 +1,10 @@
 """Stage 1 of a core step: accepts or rejects joint samples and camera frames by time stamp, sequence number and values,
-keeps the history of the joints, and follows the lifecycle of the joint driver. Also the time-outs of these inputs.
+keeps the history of the joints, and follows the lifecycle of the joint driver. It also defines the time-outs of these
+inputs.
 
-Stamps and ``now_ns`` are of one clock, and the servo process takes ``now_ns`` after it has read everything: a sample
-of the future is wrong, however little. What is refused is not stored, so that one wrong sample spoils no later one.
+Stamps and ``now_ns`` are of one clock. The servo process reads ``now_ns`` after all inputs, so a sample from the future
+is wrong, however small the difference. Rejected inputs are not stored, so one wrong sample cannot invalidate later
+ones.
 """
 
 from __future__ import annotations
@@ -26,36 +28,40 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation, JointState
 
 LONGEST_GAP_S = 0.5
-"""Without a step for so long the arm stops, however patient its drives are: it moves unwatched meanwhile."""
+"""Longest time without a step before the arm stops [s], however long the drives' own time-out is: the arm is not
+monitored meanwhile.
+"""
 LEAST_GAP_PERIODS = 2
-"""A step that comes one period late is no gap, however impatient the drives are."""
+"""A step that is one period late is no gap, however short the drives' time-out is."""
 FASTEST = 2.0
-"""Times its ``velocity_max`` a joint cannot move."""
+"""Factor on ``velocity_max``: no joint can move faster than that."""
 STAMP_JITTER_S = 0.05
-"""By which the stamps of two joint samples may be off, on top of which a jump counts as one."""
+"""Possible error of the time between two joint samples [s]; a larger displacement counts as a jump."""
 FARTHEST = 1e6
-"""[rad or m] No joint is so far from its zero."""
+"""Largest plausible joint position [rad or m]."""
 FARTHEST_INTEGER = 1 << 62
 LARGEST_SIGMA_PX = 1e4
 FRESH_S = 0.15
-FRESH_FRAMES = 2.5  # without a frame for so many periods a law is said to coast
+FRESH_FRAMES = 2.5  # without a frame for so many periods, a law counts as coasting
 
 
 STAMP, VALUES = 2, 3
-"""Why a joint sample or a frame is refused; `TAKEN` where it is not, and `NO_NEWS` where it was here before."""
+"""Results for a joint sample or a frame: `STAMP` and `VALUES` are reasons of rejection, `TAKEN` is accepted, `NO_NEWS`
+was received before.
+"""
 NO_NEWS, TAKEN = 0, 1
 REFUSED = 1
-"""Of what the stages find, as bits of a number: an input that cannot be right, or a loop that stood still."""
+"""Bit of the stages' detections: an impossible input, or a loop that was interrupted."""
 
 
 @kernel
 def ingest(block: Record, room: Record) -> int:
-    """Pass what is new and stamped within [now - time-out, now], and keep the joints; `REFUSED` where anything is not
-    passed, and why in the ``room``.
+    """Accept inputs that are new and stamped within [now - time-out, now], and store the joints. Returns `REFUSED` if
+    any input is rejected; the reasons are written to the workspace ``room``.
 
-    Of what is refused nothing is kept. After a gap the drives were left alone, and the last command is not what they
-    do: commands begin from rest. A clock that went back makes all stamps of before ones of a time to come, which would
-    refuse all that is new: they are forgotten.
+    Rejected inputs are not stored. After a gap the drives have stopped by their own time-out and no longer execute the
+    last command, so commands start from rest. If the clock went back, all earlier stamps lie in the future and would
+    cause the rejection of every new input: they are reset.
     """
     memory, work = block[0], room[0]
     work.followed = 0
@@ -76,7 +82,7 @@ def ingest(block: Record, room: Record) -> int:
 
 @kernel
 def forget_travel(block: Record) -> None:
-    """Begin anew: what the drives did of late was not what they were sent."""
+    """Reset the comparison of travel, because the drives did not execute the recent commands."""
     memory = block[0]
     memory.missing_travel[: memory.joints] = 0.0
     memory.untold_travel[: memory.joints] = 0.0
@@ -85,7 +91,7 @@ def forget_travel(block: Record) -> None:
 
 @kernel
 def _forget_stamps(block: Record) -> None:
-    """All that is stamped is forgotten, but what was seen stays known."""
+    """Reset all time stamps, but keep the estimates."""
     memory = block[0]
     memory.history_count, memory.last_joints_ns, memory.last_joints_seq = 0, 0, -1
     for c in range(memory.cameras):
@@ -95,7 +101,9 @@ def _forget_stamps(block: Record) -> None:
 
 @kernel
 def _take_joints(block: Record, room: Record) -> int:
-    """Take the joint sample in the ``room`` where it is new and in time: `NO_NEWS`, `TAKEN`, `STAMP` or `VALUES`."""
+    """Store the joint sample in the workspace ``room`` if it is new and in time; returns `NO_NEWS`, `TAKEN`, `STAMP` or
+    `VALUES`.
+    """
     memory, work = block[0], room[0]
     fresh = work.joints_seq != memory.last_joints_seq and work.joints_ns > memory.last_joints_ns
     if work.joints_given == 0 or not fresh:
@@ -111,9 +119,12 @@ def _take_joints(block: Record, room: Record) -> int:
 
 @kernel
 def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, positions: FloatArray) -> int:
-    """Append joint ``positions`` (n,) at ``t_ns`` to a ring of ``stamps`` (k,) and positions ``kept`` (k, n), to which
-    ``count`` were ever written; the new count. They take the place of the last ones where these are close to the ones
-    before.
+    """Append joint positions to a ring buffer; returns the new count. They replace the last entry if that is close to
+    the one before it in time.
+
+    ``stamps`` (k,) [ns] and ``kept`` (k, n): the ring's stamps and positions.
+    ``count``: number of entries ever written.
+    ``t_ns``, ``positions`` (n,): the new entry.
     """
     size = stamps.size
     if count > 1 and 0 <= stamps[(count - 1) % size] - stamps[(count - 2) % size] < LEAST_APART_NS:
@@ -127,11 +138,12 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
 
 @kernel
 def take_sample(block: Record, room: Record, told: bool) -> bool:
-    """Whether the joint sample in the ``room`` may be right; then it is the newest one of the ``block``, and the
-    filtered velocities are those since the last one. Into ``q`` (n,) of the room: the newest positions, zero before the
-    first. Without a sample (``told``): nothing is wrong.
+    """Store the joint sample in the workspace ``room`` as the newest one of the ``block`` if it is plausible, and
+    filter the velocities since the last one; returns whether it is plausible. Returns True if there is no sample
+    (``told`` is False).
 
-    The history begins again where an arm that is not driven stands elsewhere at once: an encoder was set.
+    ``q`` (n,) of the workspace is set to the newest positions, zero before the first sample. The history restarts if
+    the positions of an arm that is not driven jump: an encoder was set.
     """
     memory, work = block[0], room[0]
     n, q = memory.joints, work.q
@@ -157,14 +169,14 @@ def take_sample(block: Record, room: Record, told: bool) -> bool:
 
 
 class Samples(NamedTuple):
-    """A ring of joint samples: ``stamps`` (k,) [ns] and ``positions`` (k, n)."""
+    """A ring buffer of joint samples: ``stamps`` (k,) [ns] and ``positions`` (k, n)."""
 
     stamps: IntArray
     positions: FloatArray
 
 
 class Velocities(NamedTuple):
-    """Filtered joint velocities (n,), as of the sample at ``last_ns``."""
+    """Filtered joint velocities (n,) at the sample at ``last_ns``."""
 
     last_ns: int
     values: FloatArray
@@ -179,7 +191,9 @@ def _append_sample(
     velocity_max: FloatArray,
     filtered: Velocities,
 ) -> int:
-    """`remember_joints`, and the ``filtered`` velocities since the last sample, in place."""
+    """Append a sample as `remember_joints` does, and update the ``filtered`` velocities in place; returns the new
+    count.
+    """
     stamps, kept, velocities = ring.stamps, ring.positions, filtered.values
     if count > 0:
         elapsed_s = (t_ns - filtered.last_ns) * 1e-9
@@ -197,7 +211,7 @@ def _append_sample(
 
 @kernel
 def _jumped(positions: FloatArray, previous: FloatArray, velocity_max: FloatArray, elapsed_s: float) -> bool:
-    """Whether a joint cannot have come from its ``previous`` position (n,) to this one within ``elapsed_s``."""
+    """Whether a joint cannot have moved from its ``previous`` position (n,) to this one within ``elapsed_s``."""
     for j in range(positions.size):
         possible = velocity_max[j] * (FASTEST * elapsed_s + STAMP_JITTER_S)
         if not abs(positions[j] - previous[j]) <= possible:
@@ -209,8 +223,10 @@ def _jumped(positions: FloatArray, previous: FloatArray, velocity_max: FloatArra
 def _sound(
     values: FloatArray, kept: FloatArray, count: int, elapsed_s: float, velocity_max: FloatArray, active: bool
 ) -> bool:
-    """Whether positions, and velocities, efforts and following errors, the rows of ``values`` (4, n), may be right,
-    and, while the drives are ``active``, the positions are no jump from the newest ones ``kept`` (k, n).
+    """Whether a joint sample is plausible: all values are finite, and while the drives are ``active``, the positions do
+    not jump from the newest ones in ``kept`` (k, n).
+
+    ``values`` (4, n): rows of positions, velocities, efforts and following errors.
     """
     for j in range(values.shape[1]):
         if not (
@@ -231,7 +247,7 @@ def _sound(
 
 
 def follow_driver(context: StepContext) -> None:
-    """The lifecycle follows what the servo process did with the driver; a fault is latched."""
+    """Update the lifecycle by what the servo process did with the driver; a fault is latched."""
     state, inputs = context.state, context.inputs
     before = state.lifecycle
     if inputs.driver_fault is not None and (before != Lifecycle.FAULT or not state.fault):
@@ -256,26 +272,26 @@ def follow_driver(context: StepContext) -> None:
 
 
 def nominal_period_ns(settings: CoreSettings) -> int:
-    """The period that the loop is to keep [ns]."""
+    """The nominal period of the loop [ns]."""
     return round(1e9 / settings.rate_hz)
 
 
 def longest_gap_s(settings: CoreSettings) -> float:
-    """Time between two steps [s] after which the arm's motion is no longer the core's.
+    """Longest time between two steps [s] before the arm no longer executes the core's commands.
 
-    Drives come to rest by themselves after their ``command_timeout_s``: they no longer do what they were last sent.
+    Drives stop after their own ``command_timeout_s``.
     """
     patience_s = min(LONGEST_GAP_S, settings.limits.command_timeout_s)
     return max(patience_s, LEAST_GAP_PERIODS * nominal_period_ns(settings) * 1e-9)
 
 
 def features_fresh_s(settings: CoreSettings) -> float:
-    """Age of features [s] up to which a law does not coast at all: a frame or two of the slowest camera."""
+    """Age of features [s] up to which a law does not coast: one or two frames of the slowest camera."""
     return max(FRESH_S, FRESH_FRAMES / min((c.rate_hz for c in settings.cameras), default=30.0))
 
 
 def frame_timeout_s(settings: CoreSettings) -> float:
-    """Age of a frame [s] from which on no law may move by it."""
+    """Age of a frame [s] beyond which no law may use it."""
     return max(settings.limits.coast_s, features_fresh_s(settings))
 
 
@@ -283,7 +299,7 @@ def frame_timeout_s(settings: CoreSettings) -> float:
 
 
 def put_inputs(context: StepContext) -> None:
-    """The step's inputs into the workspace."""
+    """Write the step's inputs into the workspace."""
     inputs, room = context.inputs, context.derived.room
     has_sent = (
         inputs.sent is not None
@@ -311,17 +327,19 @@ def put_inputs(context: StepContext) -> None:
 
 
 def _within_bounds(number: int) -> int:
-    """A number that a record can hold: a stamp that is beyond all bounds stays too far to be right."""
+    """The number, limited to what a record can hold: a stamp out of range remains too far away to be accepted."""
     return max(-FARTHEST_INTEGER, min(number, FARTHEST_INTEGER))
 
 
 def newest_frames(inputs: StepInputs) -> tuple[CameraObservation, ...]:
-    """The frames that a step looks at: no more than `MAX_FRAMES`."""
+    """The newest frames of a step, at most `MAX_FRAMES`."""
     return inputs.observations[-MAX_FRAMES:]
 
 
 def fill_sample(sample: JointState, values: FloatArray) -> bool:
-    """Whether all that a sample tells is of every joint; into ``values`` (4, n), what it does not tell being zero."""
+    """Whether every field of a sample has a value for each joint. Writes the fields to ``values`` (4, n), missing ones
+    as zero.
+    """
     shape, efforts, following = values.shape[1:], sample.efforts, sample.following_errors
     if (
         sample.positions.shape != shape
@@ -337,10 +355,11 @@ def fill_sample(sample: JointState, values: FloatArray) -> bool:
 
 @kernel
 def pass_frames(block: Record, room: Record) -> None:
-    """What is to be done with each frame in the ``room``: `TAKEN`, `STAMP`, `VALUES`, or `NO_NEWS`.
+    """Decide for each frame in the workspace ``room``: `TAKEN`, `STAMP`, `VALUES`, or `NO_NEWS`.
 
-    A frame that is too old stops nothing: the law coasts as if it had been lost, and brakes in time. A camera that
-    counts its frames anew is known by their stamps, which are checked; numbers alone are not trusted.
+    A frame that is too old does not stop the arm: the law coasts as if the frame had been lost, and brakes in time. If
+    a camera restarts its sequence numbers, its frames are recognised by their stamps, which are checked; sequence
+    numbers alone are not trusted.
     """
     memory, work = block[0], room[0]
     last_seq, accepted_ns = np.empty(memory.cameras, np.int64), np.empty(memory.cameras, np.int64)
@@ -362,7 +381,7 @@ def pass_frames(block: Record, room: Record) -> None:
 
 @kernel
 def _judged(room: Record, k: int) -> int:
-    """Whether frame ``k`` of the ``room``, which is new, is `TAKEN`, or why not."""
+    """Result for the new frame ``k`` of the workspace ``room``: `TAKEN`, or the reason of rejection."""
     work = room[0]
     if not 0.0 <= (work.now_ns - work.arrived_ns[k]) * 1e-9 <= work.frame_timeout_s:
         return STAMP
@@ -372,8 +391,8 @@ def _judged(room: Record, k: int) -> int:
 
 @kernel
 def first_wrong(room: Record, k: int) -> tuple[int, int]:
-    """Of frame ``k`` of the ``room``, the first marker farther from the image than its own size, and the first whose
-    covariance is none; -1 where there is none such.
+    """The first marker of frame ``k`` of the workspace ``room`` that is farther outside the image than the image's own
+    size, and the first one whose covariance is invalid; -1 if there is none.
     """
     work = room[0]
     c, count = work.arrived_camera[k], work.arrived_count[k]
@@ -394,19 +413,19 @@ def first_wrong(room: Record, k: int) -> tuple[int, int]:
     return outside, vague
 
 
-# -- what is refused, in words -----------------------------------------------------------------------------------
+# -- reasons of rejection ----------------------------------------------------------------------------------------
 
 
 def passed_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], ...]:
-    """The frames that passed, each with the index of its camera."""
+    """The accepted frames, each with the index of its camera."""
     found, cameras = context.derived.room.arrays["arrived_found"], context.derived.cameras
     frames = newest_frames(context.inputs)
     return tuple([(cameras[frame.camera], frame) for k, frame in enumerate(frames) if found[k] == TAKEN])
 
 
 def account_inputs(context: StepContext) -> Ingested:
-    """What `ingest` has come to in this step, in words; of each source what is refused since its last good sample is
-    counted.
+    """The results of `ingest` in this step, with reasons. Rejected inputs of each source are counted since its last
+    accepted one.
     """
     state, work = context.state, context.derived.room.numbers
     joints, sample = work.joints_found, context.inputs.joints
@@ -437,7 +456,7 @@ def _count(refused: Refused, reason: Reason) -> None:
 
 
 def _gap(gap_s: float, context: StepContext) -> Reason:
-    """The loop stood still while the drives were on."""
+    """Reason: the loop was interrupted while the drives were on."""
     limit_s = context.derived.longest_gap_s
     return Reason(
         "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
@@ -473,7 +492,7 @@ def _wrong(sample: JointState, context: StepContext) -> Reason:
 
 
 def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
-    """What cannot be in the values of a joint sample; empty where they may be right."""
+    """What is impossible in the values of a joint sample; empty if they are plausible."""
     for what, values in (
         ("position", sample.positions),
         ("velocity", sample.velocities),
@@ -492,7 +511,7 @@ def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
 
 
 def _jump(sample: JointState, context: StepContext) -> Reason:
-    """That a joint cannot have come from its last position to this one in the time between."""
+    """Reason: a joint cannot have moved from its last position to this one in the time between."""
     block, settings = context.state.block, context.settings
     elapsed_s = (sample.t_ns - block.numbers.last_joints_ns) * 1e-9
     travel = np.abs(sample.positions - block.history_positions[(block.numbers.history_count - 1) % HISTORY])
@@ -507,7 +526,7 @@ def _jump(sample: JointState, context: StepContext) -> Reason:
 
 
 def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
-    """The reasons of refused frames, each with the index of its camera."""
+    """The reasons of rejected frames, each with the index of its camera."""
     room, cameras = context.derived.room, context.derived.cameras
     found = room.arrays["arrived_found"]
     refused: list[tuple[int, Reason]] = []
@@ -523,7 +542,7 @@ def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
 
 
 def _wrong_sights(frame: CameraObservation, k: int, context: StepContext) -> str:
-    """What cannot be in the markers of frame ``k``."""
+    """What is impossible in the markers of frame ``k``."""
     count = len(frame.ids)
     if count > MAX_MARKERS:
         return f"it has {count} markers, {MAX_MARKERS} are allowed"

@@ -19,7 +19,7 @@ from stereoservo.kinematics.model import CellModel, lens_size
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 FIRST_SIGHT_SIGMA_PX = 6.0
-"""Deviation of a marker whose innovation is not known."""
+"""Standard deviation [px] of a marker whose innovation is not known."""
 
 
 @dataclass(frozen=True)
@@ -38,37 +38,37 @@ class ModelArrays:
     plane_at_infinity: FloatArray
     camera_centres: FloatArray
     metric_basis: FloatArray | None
-    """Six twists (6, 4, 4) that span all displacements, where the model is metric."""
+    """Six twists (6, 4, 4) that span all displacements, if the model is metric."""
     to_euclidean: FloatArray | None
-    """The map (4, 4) from the model's frame to a Euclidean one, where it is metric."""
+    """The map (4, 4) from the model's frame to a Euclidean one, if the model is metric."""
     marker_ids: tuple[int, ...]
     index: dict[int, int]
     scene_ids: tuple[int, ...]
     scene_points: FloatArray
     scene_pixels: FloatArray
-    """Static points in the images (c, s, 2): they never move there."""
+    """Pixels (c, s, 2) of the static points; they are constant."""
     row_ids: IntArray
     """Ids of the markers and static points (k,), ascending; ``row_of`` (k,): their rows in `FrameResiduals`, which has
     the markers, then the static points.
     """
     row_of: IntArray
     groups: MarkerGroups | None
-    """Coplanar markers, of which a goal takes the faces of the body; None: of a model that came without."""
+    """Coplanar markers, from which the faces of the body are chosen; None: the model states none."""
     sights: int
-    """Markers times cameras: what the work of a step grows with."""
+    """Number of markers times number of cameras; the computing time of a step grows with it."""
     joint_accuracy: JointAccuracy | None
-    """Errors of joint readings, where the trials have shown some; none larger than `LARGEST_JOINT_ERROR`."""
+    """Errors of joint readings, if the trials have shown some; none larger than `LARGEST_JOINT_ERROR`."""
     joint_variances: FloatArray
-    """The most that these are at any posture (n,) [rad² or m²]; zeros where there are none."""
+    """The largest variances of these errors over all postures (n,) [rad² or m²]; zeros if there are none."""
     ids: IntArray = field(init=False)
-    """`marker_ids` as an array (m,), and the deviation ``unseen_px`` (m,) [px] of markers before they are seen, where
-    joints are read exactly; not to be written to.
+    """`marker_ids` as an array (m,), and the standard deviation ``unseen_px`` (m,) [px] of markers before they are
+    seen, if joint readings are exact; read-only.
     """
     unseen_px: FloatArray = field(init=False)
     no_rates: FloatArray = field(init=False)
-    """Pixel velocities (c, m, 2) of set-points that stand; not to be written to."""
+    """Pixel velocities (c, m, 2) of static set-points (zeros); read-only."""
     known: FloatArray = field(init=False)
-    """Whether the markers' points are known (2, m): of none, and of all; not to be written to."""
+    """Whether the markers' points are known (2, m): a row for none, and a row for all; read-only."""
 
     def __post_init__(self) -> None:
         count = len(self.marker_ids)
@@ -83,7 +83,7 @@ class ModelArrays:
 
 
 def _require_numbers(model: CellModel) -> None:
-    """Raises ValueError naming an array of ``model`` that has not its shape, or numbers that are not finite."""
+    """Raises ValueError naming an array of ``model`` that has the wrong shape, or numbers that are not finite."""
     joints, markers, scene = len(model.joint_names), len(model.marker_ids), len(model.scene_ids)
     arrays = [
         ("generators", model.generators, (joints, 4, 4)),
@@ -110,7 +110,7 @@ def _require_numbers(model: CellModel) -> None:
 
 
 def require_fitting(model: CellModel, settings: CoreSettings) -> None:
-    """Raises ValueError naming what of ``model`` does not fit the cell."""
+    """Raises ValueError naming the part of ``model`` that does not fit the cell."""
     if model.joint_names != settings.joint_names:
         raise ValueError(
             f"model is of joints {', '.join(model.joint_names)}; the cell has {', '.join(settings.joint_names)}"
@@ -137,7 +137,7 @@ def require_fitting(model: CellModel, settings: CoreSettings) -> None:
 
 
 def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
-    """Kernel arrays of ``model``. Raises ValueError naming what does not fit the cell."""
+    """Kernel arrays of ``model``. Raises ValueError naming the part that does not fit the cell."""
     require_fitting(model, settings)
     by_name = {camera.name: camera for camera in model.cameras}
     matrices = np.ascontiguousarray(
@@ -178,18 +178,20 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
 
 
 def rows_by_id(ids: tuple[int, ...]) -> tuple[IntArray, IntArray]:
-    """The ``ids`` (k,), ascending, and the place of each among those given."""
+    """The ``ids`` (k,), ascending, and the position of each among those given."""
     given = np.array(ids, dtype=np.int64)
     order = np.argsort(given, kind="stable")
     return given[order], order
 
 
 LARGEST_JOINT_ERROR = 0.1
-"""[rad or m]: nothing that a model states of its joints lets the monitors take a cell for sound beyond it."""
+"""Largest error of joint readings [rad or m] that monitors accept: a larger one, stated by a model, must not hide a
+fault.
+"""
 
 
 def _bounded_accuracy(model: CellModel) -> JointAccuracy | None:
-    """The errors of joint readings that monitors believe."""
+    """The errors of joint readings that monitors accept."""
     accuracy = model.joint_accuracy
     if accuracy is None:
         return None
@@ -198,7 +200,7 @@ def _bounded_accuracy(model: CellModel) -> JointAccuracy | None:
 
 
 def _metric_basis(model: CellModel) -> FloatArray | None:
-    """Translations along, and rotations about, three axes through the markers' middle, in the projective frame."""
+    """Translations along, and rotations about, three axes through the markers' centroid, in the projective frame."""
     H = model.projective_to_euclidean
     if H is None:
         return None
@@ -224,6 +226,6 @@ def _product(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def with_unit_height(points: FloatArray, plane_at_infinity: FloatArray) -> FloatArray:
-    """Points (m, 4) scaled to a∞ᵀM = 1, so that differences and middles mean something (errata, orbital height)."""
+    """Points (m, 4) scaled to a∞ᵀM = 1, so that differences and centroids are meaningful (errata, orbital height)."""
     height = (points * plane_at_infinity).sum(axis=-1)
     return points / np.where(height == 0.0, 1.0, height)[:, None]

@@ -1,20 +1,20 @@
-"""Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or
-ends its goal.
+"""Stage 3 of a core step: answers requests; detects collision, following error and a wrong model; stops the arm or ends
+its goal.
 
-What is detected in every step is one kernel, `detect`, which writes what it has found into the workspace. Where that is
-anything, or the state asks to be looked after (`attends`), each monitor of `MONITORS` is called with the context, in
-the order of the table, and gives its findings, on which the stage acts at once: what one monitor stops, the next ones
-see stopped. To add one: a function, and a line in the table.
+The detection of every step is one kernel, `detect`, which writes its results into the workspace. If it detects
+anything, or the state needs attention (`attends`), each monitor of `MONITORS` is called with the context, in the order
+of the table, and returns its findings. The stage acts on each finding immediately, so later monitors see its effect. To
+add a monitor: a function, and a line in the table.
 
-Requests are answered here, after the stop and before all other monitors: hold, resume, enable, teach and jog change
-what is monitored in this very step, and a goal that is accepted in a step in which something is found ends in that step
-with an event of its own.
+Requests are answered here, after the stop and before all other monitors, because hold, resume, enable, teach and jog
+change what is monitored in the same step. If a goal is accepted in a step with a finding that ends goals, it ends in
+that step with an event of its own.
 
-The detection that runs in every step is in this module: contact, joints that do not follow, and whether innovations,
-unfiltered, still look like noise. A round is one frame of every camera that delivers. Its chi-square, with the
-covariances of detector, timing and model, is cheap; only where it is improbable does `monitors.fault_isolation` ask
-which single change explains it: a moved camera, cameras moved as one, a slipped marker, a drifted joint zero. A
-diagnosis needs two rounds of the last three.
+This module contains the detection that runs in every step: collision, following error, and whether the unfiltered
+innovations still look like noise. A round is one frame of every camera that delivers. Its chi-square, with the
+covariances of detector, timing and model, is cheap to compute. Only if it is improbable does `monitors.fault_isolation`
+test which single change explains it: a displaced camera, all cameras displaced together, a slipped marker, a drifted
+joint zero. A diagnosis needs two of the last three rounds.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ Findings = Iterable[Finding]
 
 
 class Monitor(NamedTuple):
-    """A monitor: ``watch`` accounts for one step and gives what it has found. ``attends``: whether it has to be called
-    in a step in which `detect` has found nothing; a monitor that does not say is called in every step.
+    """A monitor: ``watch`` processes one step and returns its findings. ``attends`` returns whether it must be called
+    in a step in which `detect` has detected nothing; by default a monitor is called in every step.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Monitor(NamedTuple):
 
 
 def monitor(context: StepContext) -> tuple[Finding, ...]:
-    """What the monitors have found in this step, all of it acted on."""
+    """Call the monitors and act on their findings; returns all findings of this step."""
     found: list[Finding] = []
     for entry in MONITORS:
         for finding in entry.watch(context):
@@ -119,7 +119,7 @@ def _act(finding: Finding, context: StepContext) -> None:
 
 
 def _monitor_stop(context: StepContext) -> Findings:
-    """Somebody has raised the stop."""
+    """Stop the arm if the stop was raised."""
     if not context.inputs.stop:
         return ()
     reason = Reason("STOPPED", "hold", hint="resume, then send the goal again")
@@ -127,14 +127,14 @@ def _monitor_stop(context: StepContext) -> Findings:
 
 
 def _answer_requests(context: StepContext) -> Findings:
-    """Requests of clients; none is a finding."""
+    """Answer the clients' requests; returns no findings."""
     if context.inputs.requests:
         answer_all(context.inputs.requests, context)
     return ()
 
 
 def _monitor_inputs(context: StepContext) -> Findings:
-    """Inputs that cannot be right, or a loop that stood still, stop an arm that may move."""
+    """Stop an arm that may move if inputs are impossible or the loop was interrupted."""
     stops = context.ingested.stops
     if not stops or context.state.lifecycle != Lifecycle.ACTIVE or context.state.stopped:
         return ()
@@ -143,24 +143,28 @@ def _monitor_inputs(context: StepContext) -> Findings:
 
 
 MEAN_S = 0.25
-"""Time constant of the moving mean in motion: a full brake ramp is done in it, gravity hardly changes."""
+"""Time constant of the moving mean in motion [s]: longer than a full brake ramp, short compared with changes of gravity
+load.
+"""
 REST_S = 0.05
-"""And at rest, where brakes open and people lean on the arm: nothing is watched."""
+"""Time constant at rest [s], where brakes open and people may lean on the arm; nothing is monitored."""
 LEAVE_S = 1.0
-"""Of motion after a contact, in which what it brought may go again: a retreat is no contact."""
+"""Duration of motion after a collision [s] in which the collision's loads may decrease again, so that a retreat is not
+a new collision.
+"""
 MOVING = 1e-3  # [rad/s or m/s] of commanded velocity
-GAP_S = 0.5  # without a sample for so long, means are of another time
+GAP_S = 0.5  # without a sample for so long, the means are outdated
 
 
 CONTACT, NOT_FOLLOWING, ROUND, CONTRADICTED = 2, 4, 8, 16
-"""Of what the stages find, as bits of a number: a joint beyond a limit of its load; one that does not follow; a round
-of frames that is to be explained; a camera that contradicts the model.
+"""Bits of `detect`: a joint beyond a load limit; a joint that does not follow; a round of frames that needs an
+explanation; a camera that contradicts the model.
 """
 
 
 @kernel
 def detect(block: Record, room: Record) -> int:
-    """Stage 3, in every step: account for loads, travel and frames; what was found, as bits."""
+    """Stage 3, in every step: update loads, travel and frames; returns the detections as bits."""
     memory, work = block[0], room[0]
     halted = work.stopped != 0 or work.stop != 0 or (work.active != 0 and stops_arm(room))
     found = 0
@@ -174,8 +178,8 @@ def detect(block: Record, room: Record) -> int:
     if work.watches_following != 0 and memory.history_count > 0:
         work.following = account_following(block, room)
         if work.active == 0:
-            memory.silence_known = 0  # what was sent before is no matter of what is sent next
-            work.following = FOLLOWS  # an arm that is off may be moved by hand
+            memory.silence_known = 0  # what was sent before does not apply to later commands
+            work.following = FOLLOWS  # an arm whose drives are off may be moved by hand
     if work.following != FOLLOWS:
         return found | NOT_FOLLOWING
     if work.modelled == 0:
@@ -193,7 +197,7 @@ def detect(block: Record, room: Record) -> int:
 
 @kernel
 def stops_arm(room: Record) -> bool:
-    """Whether inputs that `ingest` has refused stop an arm that may move."""
+    """Whether inputs rejected by `ingest` stop an arm that may move."""
     work = room[0]
     if work.gap != 0 or work.joints_found > TAKEN:
         return True
@@ -206,7 +210,7 @@ def stops_arm(room: Record) -> bool:
 
 @kernel
 def round_is_due(block: Record) -> bool:
-    """Whether the newest frames are to be looked at together; then they are not due any more."""
+    """Whether the newest frames are due to be examined together; resets the due flag."""
     memory = block[0]
     if memory.round_due == 0 and not round_complete(block):
         return False
@@ -215,7 +219,9 @@ def round_is_due(block: Record) -> bool:
 
 
 def explain_contact(state: CoreState, settings: CoreSettings, room: Workspace) -> Reason | None:
-    """The reason where a joint (worst first) is in contact, by what `account_loads` has found in this step."""
+    """The reason for the joint in collision (the worst one), from the result of `account_loads` in this step; None if
+    there is no collision.
+    """
     block, work = state.block, room.numbers
     learning = isinstance(state.source, CalibrationMotion)
     efforts, following = room.sample[2], room.sample[3]
@@ -234,15 +240,16 @@ def explain_contact(state: CoreState, settings: CoreSettings, room: Workspace) -
 
 
 class Loads(NamedTuple):
-    """Of the joints (n,): ``efforts`` and ``following`` errors of a sample, or the limits of these."""
+    """Loads of the joints, (n,) each: ``efforts`` and ``following`` errors of a sample, or their limits."""
 
     efforts: FloatArray
     following: FloatArray
 
 
 class LoadHistory(NamedTuple):
-    """Of the block: the moving ``mean`` (n,) of efforts; how far samples of late lay beyond what is expected,
-    ``effort`` and ``following`` (samples, n); what a contact has brought, ``low`` and ``high`` (2, n).
+    """Load history in the block: the moving ``mean`` (n,) of efforts; the excess of recent samples over the expected
+    value, ``effort`` and ``following`` (samples, n); the range of loads during the last collision, ``low`` and ``high``
+    (2, n).
     """
 
     mean: FloatArray
@@ -253,8 +260,8 @@ class LoadHistory(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """Of a sample: the time since the one before, whether what was before is forgotten, whether the arm moves and is
-    watched, and whether it is leaving a contact.
+    """Conditions of a sample: the time since the previous one, whether the history is reset, whether the arm moves and
+    is monitored, and whether it is leaving a collision.
     """
 
     elapsed_s: float
@@ -265,11 +272,11 @@ class Situation(NamedTuple):
 
 @kernel
 def account_loads(block: Record, room: Record, halted: bool) -> tuple[bool, bool]:
-    """Take the efforts and following errors of the sample in the ``room`` into the ``block``; whether the arm moves,
-    not ``halted``, and is watched, and whether a joint is beyond a limit then: see `_account_loads`.
+    """Update the load history of the ``block`` by the sample in the workspace ``room``. Returns whether the arm moves
+    (is not ``halted``) and is monitored, and whether a joint is beyond a limit then: see `_account_loads`.
 
-    What a sample does not tell, or what is no number, becomes what is expected, in the ``room``, too. The block's
-    command is still that of the last step.
+    Values that are missing or not finite are replaced by the expected ones, in the workspace, too. The block's command
+    is still that of the last step.
     """
     memory, work = block[0], room[0]
     n, window = memory.joints, memory.window
@@ -314,12 +321,12 @@ def _moves(command: FloatArray) -> bool:
 
 @kernel
 def _account_loads(sample: Loads, history: LoadHistory, situation: Situation, limits: Loads) -> bool:
-    """Take a ``sample`` into the ``history``; whether all samples of a window are beyond a limit on one side, or a
-    limit is none.
+    """Update the ``history`` by a ``sample``; returns whether all samples of a window are beyond a limit on the same
+    side, or a limit is not a number.
 
-    Readings that are no numbers become what is expected. The mean begins anew where it forgets (the drives were off, or
-    nothing was heard for long); at rest what comes while the arm is leaving a contact belongs to it. In motion a
-    reading is compared with the mean and zero, or with anything that a contact brought of late.
+    Readings that are not finite are replaced by the expected ones. The mean restarts after a reset (the drives were
+    off, or no sample came for long). At rest while the arm is leaving a collision, readings extend the collision's
+    range. In motion a reading is compared with the mean and zero, or with the range of a recent collision.
     """
     efforts, following = sample
     mean, effort_excess, following_excess, low, high = history
@@ -336,7 +343,7 @@ def _account_loads(sample: Loads, history: LoadHistory, situation: Situation, li
             if leaving:
                 excess = efforts[j] - min(max(efforts[j], min(mean[j], low[0, j])), max(mean[j], high[0, j]))
                 lag -= min(max(lag, min(low[1, j], 0.0)), max(high[1, j], 0.0))
-            if not abs(excess) > effort_limits[j]:  # a contact is no new mean
+            if not abs(excess) > effort_limits[j]:  # a collision does not change the mean
                 mean[j] += elapsed_s / (elapsed_s + MEAN_S) * (efforts[j] - mean[j])
             lasting = _push(effort_excess[:, j], excess) / effort_limits[j]
             lasting_lag = _push(following_excess[:, j], lag) / following_limits[j]
@@ -355,7 +362,7 @@ def _account_loads(sample: Loads, history: LoadHistory, situation: Situation, li
 
 @kernel
 def _push(window: FloatArray, newest: float) -> float:
-    """Append to a window (samples,), the oldest one going; how far all of it is beyond zero on one side."""
+    """Append to a window (samples,) and drop its oldest value; returns how far all of it exceeds zero on one side."""
     least, most = newest, newest
     for k in range(window.size - 1):
         window[k] = window[k + 1]
@@ -365,11 +372,13 @@ def _push(window: FloatArray, newest: float) -> float:
 
 
 FOLLOWS, LACKS, SILENT = range(3)
-"""What `account_following` has found."""
+"""Results of `account_following`."""
 
 
 def explain_following(state: CoreState, settings: CoreSettings, room: Workspace) -> Reason | None:
-    """The reason where a joint (worst first) does not follow, by what `account_following` has found in this step."""
+    """The reason for the joint that does not follow (the worst one), from the result of `account_following` in this
+    step; None if all joints follow.
+    """
     block, work = state.block, room.numbers
     if work.following == FOLLOWS:
         return None
@@ -382,12 +391,14 @@ def explain_following(state: CoreState, settings: CoreSettings, room: Workspace)
 
 @kernel
 def account_following(block: Record, room: Record) -> int:
-    """Account for the time since the last step at the last command, or at what the driver has sent in its place; what
-    was found, of which joint and how much is missing being in the ``room``.
+    """Compare the travel since the last step with the last command, or with the velocity that the driver has sent in
+    its place. Returns `FOLLOWS`, `LACKS` or `SILENT`; the joint and its missing travel are written to the workspace
+    ``room``.
 
-    A joint's missing travel is its commanded minus its measured one, forgotten over ``MEMORY_S``; it may reach
-    ``LAG_S`` at full speed, beside what its drive's delay explains. What is sent to a joint whose reading stands still
-    is not forgotten, so that a slow command to a stuck encoder ends, too. Without a new sample nothing is concluded.
+    A joint's missing travel is its commanded minus its measured travel, with exponential forgetting over ``MEMORY_S``.
+    Its limit is the travel in ``LAG_S`` at full speed, plus the travel explained by the drive's delay. Travel commanded
+    to a joint whose reading does not change is not forgotten, so a slow command to a stuck encoder is detected, too.
+    Without a new sample there is no decision.
     """
     memory, work = block[0], room[0]
     n, dt_s = memory.joints, work.elapsed_s
@@ -428,7 +439,7 @@ def account_following(block: Record, room: Record) -> int:
 
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
-    """The arm has met something: it stops with its drives on, as if a person had stopped it."""
+    """Collision: the arm stops with its drives on, as for a stop by a person."""
     reason = explain_contact(context.state, context.settings, context.derived.room)
     if reason is None:
         return ()
@@ -436,7 +447,7 @@ def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
 
 
 def monitor_following(context: StepContext) -> tuple[Finding, ...]:
-    """A joint that does not go where it is sent: its encoder, brake or drive is at fault, and so is the cell."""
+    """A joint does not follow its command: its encoder, brake or drive is faulty, so the cell goes to fault."""
     reason = explain_following(context.state, context.settings, context.derived.room)
     if reason is None:
         return ()
@@ -444,20 +455,20 @@ def monitor_following(context: StepContext) -> tuple[Finding, ...]:
 
 
 def _monitor_teaching(context: StepContext) -> Findings:
-    """A goal that is being taught, which motion ends."""
+    """Motion ends the teaching of a goal."""
     if context.state.teaching is not None:
         teach_step(context)
     return ()
 
 
 def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
-    """What explains the images, where that has changed: an event, and what follows from it."""
+    """If the explanation of the images has changed: an event, and its consequences."""
     state = context.state
     run = state.reanchoring
     if run is not None and run.phase != "verify":
         if run.phase == "collect":
-            finish_round(context)  # for `camera_relocalization`: have they moved at all?
-        return  # at rest, what stands is watched by `camera_relocalization`
+            finish_round(context)  # for `camera_relocalization`: have the cameras moved?
+        return  # at rest, static cameras are checked by `camera_relocalization`
     verdict = finish_round(context)
     if any(state.mobile) and moving_camera.takes(context):
         return
@@ -467,7 +478,7 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
         return
     emit_diagnosis(verdict, context)
     if verdict.kind == "joint_zero":
-        for estimate in state.cameras:  # images decide where the arm goes: they are believed from here on
+        for estimate in state.cameras:  # from here on images control the arm: they are trusted
             estimate.seen_ns[:] = 0
     if verdict.kind == "marker_slipped" and mask_marker(verdict, context):
         subject = ", ".join(verdict.subjects)
@@ -475,21 +486,21 @@ def _monitor_innovations(context: StepContext) -> Iterator[Finding]:
 
 
 AGREE, OF = 2, 3
-"""Rounds of the last ones that must say the same."""
+"""Number of the last rounds that must agree, and number of rounds considered."""
 LATEST_S = 0.15
-"""By which at most, where nothing but noise is left then."""
+"""Largest delay [s] of a late frame, if only noise remains once it is corrected."""
 LATEST_MODEL_PX = 0.1
-"""What the model may be off by besides, at the latest."""
+"""Model error [px] allowed in addition in the test for late frames."""
 
 
 NOISE = ModelDiagnosis()
-"""Of a round that needs no explanation."""
+"""Diagnosis of a round that needs no explanation."""
 QUIET = [NOISE] * OF
-"""Verdicts of the last rounds, where none needed one."""
+"""Diagnoses of the last rounds if none needed an explanation."""
 
 
 def finish_round(context: StepContext) -> ModelDiagnosis | None:
-    """Finish a round where one is complete; the new verdict where it has changed."""
+    """Evaluate a round if one is complete; returns the new diagnosis if it has changed."""
     state, arrays, work = context.state, context.arrays, context.derived.room.numbers
     watching = state.watching
     if arrays is None:
@@ -513,8 +524,8 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
 
 
 def _judge_round_apart(context: StepContext) -> None:
-    """`judge_round` where it is due, without the cameras that move. Joints that a faulty drive tells are no measure of
-    cameras.
+    """Run `judge_round` if a round is due, without the cameras that move. Readings from a faulty drive must not be used
+    to judge cameras.
     """
     state, room = context.state, context.derived.room
     faulty = state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED
@@ -526,16 +537,16 @@ def _judge_round_apart(context: StepContext) -> None:
 
 
 def _cameras(bits: int) -> list[int]:
-    """Numbers of the cameras that ``bits`` stands for."""
+    """Numbers of the cameras whose ``bits`` are set."""
     return [c for c in range(bits.bit_length()) if bits >> c & 1]
 
 
 @kernel
 def judge_round(block: Record, room: Record, moving: int) -> tuple[int, int, bool]:
-    """Look at the newest frame of each camera: those that are recent, and of them those whose innovations do not look
-    like noise, all together and each of them; and whether any marker is masked.
+    """Examine the newest frame of each camera. Returns the cameras with a recent frame; those of them whose innovations
+    do not look like noise, of all markers together and of each; and whether any marker is masked.
 
-    Cameras are bits of a number, as are those that are ``moving``, which are left out.
+    Sets of cameras are bit masks. Cameras in ``moving`` are ignored.
     """
     memory, work = block[0], room[0]
     rows, masked, now_ns = memory.rows, work.masked[: memory.markers], work.now_ns
@@ -560,15 +571,15 @@ def judge_round(block: Record, room: Record, moving: int) -> tuple[int, int, boo
 
 
 def _all_late(cameras: list[int], watching: ModelMonitor, settings: CoreSettings) -> bool:
-    """Whether the newest frame of each of these ``cameras`` is `_late`."""
+    """Whether the newest frame of each of these ``cameras`` is late (`_late`)."""
     frames = [watching.sightings[c] for c in cameras]
     return all(_late(frame, used_rows(watching, frame), settings) for frame in frames)
 
 
 def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> bool:
-    """Whether a frame that was taken a little earlier or later than stated explains its innovations.
+    """Whether a shutter time slightly earlier or later than stated explains a frame's innovations.
 
-    Pictures are late where a computer is busy; a camera that was moved shows it at rest, too.
+    Frames are late if a computer is busy. A displaced camera shows innovations at rest, too.
     """
     moved = sighting.velocity * used[:, None]
     square = float((moved * moved).sum())
@@ -584,12 +595,12 @@ def _late(sighting: CameraMonitor, used: FloatArray, settings: CoreSettings) -> 
 
 
 def _key(verdict: ModelDiagnosis) -> tuple[str, ...]:
-    """What two rounds must agree in."""
+    """The part of a diagnosis in which two rounds must agree."""
     return (verdict.kind, *verdict.subjects)
 
 
 def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
-    """The verdict that two of the last three rounds agree in, where it is another than before."""
+    """The diagnosis on which two of the last three rounds agree, if it differs from the previous one."""
     keys = [_key(verdict) for verdict in watching.last]
     for verdict in reversed(watching.last):
         if keys.count(_key(verdict)) < (OF if verdict.kind == "ok" else AGREE):
@@ -603,7 +614,7 @@ def _changed(watching: ModelMonitor) -> ModelDiagnosis | None:
 
 
 def _monitor_model(context: StepContext) -> Iterator[Finding]:
-    """Images that contradict the model for many frames make it SUSPECT; ones that agree with it clear it."""
+    """Images that contradict the model for many frames make it SUSPECT; images that agree with it clear it."""
     state = context.state
     if state.reanchoring is not None:
         return
@@ -630,26 +641,26 @@ def _monitor_model(context: StepContext) -> Iterator[Finding]:
 
 
 def _monitor_relocalization(context: StepContext) -> Findings:
-    """Cameras that are being found again; laws wait meanwhile."""
+    """Cameras that are being relocalized; laws wait meanwhile."""
     if context.state.reanchoring is not None:
         camera_relocalization.step(context)
     return ()
 
 
 def _never(state: CoreState) -> bool:
-    """Of monitors that act on what `detect`, or a request, brings."""
+    """For monitors that act only on detections of `detect` or on requests."""
     return False
 
 
 def _refuses(state: CoreState) -> bool:
-    """Whether the newest sample of some source is one that was refused: the next one may be good."""
+    """Whether the newest sample of some source was rejected: the next one may be good."""
     return state.refused_joints.reason is not None or any(
         refused.reason is not None for refused in state.refused_frames
     )
 
 
 def looks_apart(state: CoreState) -> bool:
-    """Whether Python looks at the rounds of frames: where cameras may move, or are found anew."""
+    """Whether Python examines the rounds of frames: some cameras may move or are being relocalized."""
     return state.reanchoring is not None or any(state.mobile)
 
 

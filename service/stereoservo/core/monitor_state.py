@@ -14,13 +14,13 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 LOST_FRAMES = 3
-"""Frames in a row that nothing explains, after which nobody knows where a moving camera is."""
+"""Consecutive unexplained frames after which the pose of a moving camera counts as lost."""
 
 
 STALE_PERIODS = 2.5
-"""Frames that are older than so many periods of their camera are left out of a round."""
+"""Frames older than so many periods of their camera are left out of a round."""
 LATE_S = 0.02
-"""By which a busy computer may get a stamp wrong."""
+"""Possible error of a stamp on a busy computer [s]."""
 
 
 VerdictKind = Literal[
@@ -33,12 +33,12 @@ VerdictKind = Literal[
     "unclear",
 ]
 MOVED = ("camera_moved", "cameras_moved_together")
-"""Verdicts by which cameras, and not the arm, have moved."""
+"""Diagnoses by which cameras, and not the arm, have moved."""
 
 
 class ModelDiagnosis(msgspec.Struct, frozen=True):
-    """What explains the innovations: ``subjects`` names cameras, the marker or the joint; ``size`` in ``unit``, its
-    standard ``deviation``; ``moved_px``: what it moves in the images, rms; ``text`` in words.
+    """Explanation of the innovations: ``subjects`` names cameras, the marker or the joint; ``size`` in ``unit``, its
+    standard ``deviation``; ``moved_px``: resulting rms displacement in the images; ``text``: description.
     """
 
     kind: VerdictKind = "ok"
@@ -51,8 +51,9 @@ class ModelDiagnosis(msgspec.Struct, frozen=True):
 
 
 class ModelMonitor(msgspec.Struct, eq=False):
-    """The watch over the model. ``last``: verdicts of the last rounds of frames, newest last. ``masked`` (m,): 1 for
-    markers that have slipped and are not used; ``back`` (m,): rounds in a row in which such a one was in its place.
+    """State of the model monitor. ``last``: diagnoses of the last rounds of frames, newest last. ``masked`` (m,): 1 for
+    markers that have slipped and are not used; ``back`` (m,): consecutive rounds in which such a marker was in its
+    place again.
     """
 
     sightings: list[CameraMonitor]
@@ -63,11 +64,13 @@ class ModelMonitor(msgspec.Struct, eq=False):
 
 
 class MobileCamera(msgspec.Struct, eq=False):
-    """A camera declared mobile; see `moving_camera`. While it is ``moving``, the model has it where it stood last.
+    """A camera declared mobile; see `moving_camera`. While it is ``moving``, the model keeps its last static matrix.
 
-    ``way`` (4, 4): from there to where its newest frame has it, ``P way``. ``reference`` (4, 4): likewise of the first
-    of the ``still`` frames that agree with each other; ``twists`` (6,): sum of theirs from there, in the metric basis.
-    ``lost``: frames in a row that nothing explained; ``moved_px``: from where it stood last, rms.
+    ``way`` (4, 4): displacement from there to the pose in its newest frame, ``P way``.
+    ``reference`` (4, 4): the same for the first of the ``still`` frames that agree with each other.
+    ``twists`` (6,): sum of the displacements of these frames from the reference, in the metric basis.
+    ``lost``: consecutive frames without an explanation.
+    ``moved_px``: rms displacement in the image since the last static pose.
     """
 
     way: FloatArray
@@ -78,36 +81,39 @@ class MobileCamera(msgspec.Struct, eq=False):
     lost: int = 0
     moved_px: float = 0.0
     seen: int = 0
-    """Known points in its newest frame."""
+    """Number of known points in its newest frame."""
     since_ns: int = 0
     found_ns: int = 0
-    """Of the newest frame that was explained."""
+    """Time of the newest frame that was explained."""
     static_moved: bool = False
-    """Its newest frame showed enough static points moved with it: the camera moves, and not the arm."""
+    """Enough static points moved in its newest frame: the camera moves, and not the arm."""
     doubtful: bool = False
-    """Its frames agree, but nothing proves that it was the camera, and not the arm."""
+    """Its frames agree, but do not prove that the camera, and not the arm, has moved."""
 
     @property
     def place(self) -> Literal["stands", "moving", "lost"]:
-        """What is known of where it is, in a word."""
+        """The state of its pose, in a word."""
         if not self.moving:
             return "stands"
         return "lost" if self.lost >= LOST_FRAMES else "moving"
 
 
 def standing_camera() -> MobileCamera:
-    """A mobile camera where the model has it."""
+    """A mobile camera at the pose that the model states."""
     return MobileCamera(np.eye(4), np.eye(4), np.zeros(6))
 
 
 class Relocalization(msgspec.Struct, eq=False, kw_only=True):
-    """Cameras that have moved and are being found anew; see `camera_relocalization`.
+    """Relocalization of cameras that have moved; see `camera_relocalization`.
 
-    ``together``: they moved as one body. ``sums``, ``joint_sum`` (n,): sights at rest. ``reference`` (c, k, 2) [px]:
-    the innovations of the first frame at rest, and ``referred`` (c, k) 1 where there is one: what stands keeps them.
-    ``doubt``: why it is not proven yet that they, and not the arm, have moved; empty where it is.
-    ``poses``: handed out so far, ``tried_at`` (n,) the joints of the last and ``tried_seen`` how much the moved cameras
-    saw there. ``reason``: why it has failed.
+    ``together``: they moved as one body.
+    ``sums``, ``joint_sum`` (n,): observations at rest.
+    ``reference`` (c, k, 2) [px]: the innovations of the first frame at rest, and ``referred`` (c, k) 1 where there is
+    one; they do not change for static objects.
+    ``doubt``: why it is not proven yet that the cameras, and not the arm, have moved; empty if it is proven.
+    ``poses``: number handed out so far.
+    ``tried_at`` (n,), ``tried_seen``: joints of the last pose, and number of markers that the moved cameras saw there.
+    ``reason``: why it has failed.
     """
 
     phase: Literal["brake", "collect", "wait", "take", "verify", "failed"]
@@ -127,27 +133,27 @@ class Relocalization(msgspec.Struct, eq=False, kw_only=True):
     tried_seen: int = 0
     tries: int = 0
     contradicting: int = 0
-    """Frames in a row in which what stands has moved."""
+    """Consecutive frames in which static objects have moved."""
     doubt: str = ""
     reason: Reason | None = None
 
 
 def nothing_sighted(cameras: int, rows: int, joints: int, markers: int) -> ModelMonitor:
-    """A watch that has seen nothing: ``rows`` markers and static points, of them ``markers`` of the model."""
+    """A model monitor without observations: ``rows`` markers and static points, of them ``markers`` of the model."""
     return ModelMonitor(
         [CameraMonitor(rows, joints) for _ in range(cameras)], np.zeros(markers), np.zeros(markers, np.int64)
     )
 
 
 class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
-    """Sights of the markers, summed up while the arm rests; see `measure_at_pose`."""
+    """Statistics of the observations of the markers while the arm rests; see `measure_at_pose`."""
 
     counts: FloatArray
-    """Sights of each marker in each camera, (c, m)."""
+    """Number of observations of each marker in each camera, (c, m)."""
     sums: FloatArray
     """(c, m, 2)"""
     first: FloatArray
-    """Pixels at the first sight (c, m, 2), against which the scatter is taken."""
+    """Pixels at the first observation (c, m, 2), relative to which the scatter is computed."""
     deviation_sums: FloatArray
     """(c, m, 2)"""
     square_sums: FloatArray
@@ -155,16 +161,20 @@ class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
     covariance_sums: FloatArray
     """(c, m, 2, 2)"""
     frames: IntArray
-    """Frames taken, by camera."""
+    """Number of frames used, by camera."""
 
 
 class DriveDelays(NamedTuple):
-    """How late the joints' drives are, and what they lack of their travel besides; see `core.monitors.following`.
+    """Delays of the joints' drives, and the travel missing apart from them; see `core.monitors.following`.
 
-    ``delay_s`` (n,) as measured, 0 before and where it is no matter: the median of ``samples`` (k, n) [s]. ``onset``
-    (7, n): the measurement in progress. ``sent`` (n,) [rad or m] in all, and ``past`` (r, n) of the last r steps.
-    ``velocity`` (n,): the commands that arrive now; ``under_way`` (n,): travel that is sent and has not arrived yet.
-    ``missing`` (n,): arrived less measured travel of late, ``accounted`` (n,): arrived when the joints last told.
+    ``delay_s`` (n,): the measured delays, 0 before the measurement and where they are negligible: the median of
+    ``samples`` (k, n) [s].
+    ``onset`` (7, n): the measurement in progress.
+    ``sent`` (n,) [rad or m]: total commanded travel, and ``past`` (r, n) that of the last r steps.
+    ``velocity`` (n,): the commands that take effect now.
+    ``under_way`` (n,): travel that is commanded and has not taken effect yet.
+    ``missing`` (n,): recent effective minus measured travel.
+    ``accounted`` (n,): effective travel at the last joint sample.
     """
 
     delay_s: FloatArray

@@ -1,7 +1,7 @@
 """Stage 5 of a core step: the joint velocity of the active motion source (hold, jog, joint move, control law,
 calibration motion, …), and the table of all motion sources.
 
-A motion source is a kind of state (`core.state.Source`) with what the stages must know of it, a `MotionSource`, found
+A motion source is a kind of state (`core.state.Source`) with a description for the stages, a `MotionSource`, registered
 by the type of the state in `MOTION_SOURCES`. To add one: a state of its own, a step, and a line in the table.
 """
 
@@ -50,11 +50,11 @@ from stereoservo.numerics.compilation import kernel
 
 
 def _rest(source: Source, context: StepContext) -> None:
-    """No motion: the workspace holds none."""
+    """No motion: the velocity in the workspace is zero."""
 
 
 def _jog(source: Jogging, context: StepContext) -> SourceOutput:
-    """The velocity that is asked for, until the dead man's lease runs out."""
+    """The requested velocity, until the lease of the dead man's switch expires."""
     if context.now_ns >= source.until_ns:
         context.state.source = Holding()
         return SourceOutput(np.zeros_like(context.q))
@@ -83,19 +83,25 @@ def _activate_joint_move(source: JointMove, context: StepContext) -> None:
 
 @dataclass(frozen=True)
 class MotionSource:
-    """What a kind of motion does, and what the stages of the core must know of it.
+    """A kind of motion, as the stages of the core need to know it.
 
-    ``name``: in the status. ``step``: its joint velocity; None where that is in the workspace, as of laws with a
-    kernel, or where there is none. ``goal``: id of the goal it works on, '' where there is none;
-    ``subject``: id that the status shows. ``label``: what ``goal_started`` names it, where it has no ``law``.
-    ``leased``: it ends when its client does not renew the lease in time. ``by_images``: it works by the images, so that
-    a frame with an impossible stamp stops the arm. ``runs_law``: its set-points rest on the model: it pauses while
-    cameras are found again, ends with a model that is suspect, and no new model is taken meanwhile. ``measures``: it
-    measures at poses, and ends with the event ``calibration_aborted``. ``acknowledge_s``: time in which a client has to
-    acknowledge that its goal is reached, None: nobody has to. ``activate``: as it begins.
-    ``waits``: for its plan, or for its client, so that `execute_goals` has to look after it. ``report``: of a goal that
-    has no plan. ``progress``: share that is done and seconds left. ``examine``: why
-    it is slow or stuck, beside the reasons of this step, a few times a second.
+    ``name``: name in the status.
+    ``step``: its joint velocity; None if the velocity is in the workspace (laws with a kernel) or there is no motion.
+    ``goal``: id of the goal it works on, '' if there is none.
+    ``subject``: id shown in the status.
+    ``label``: name used in the event `goal_started` if the goal has no ``law``.
+    ``leased``: it ends if its client does not renew the lease in time.
+    ``by_images``: it is controlled by images, so a frame with an impossible stamp stops the arm.
+    ``runs_law``: its set-points depend on the model. It pauses while cameras are relocalized, and ends if the model
+    becomes suspect; no new model is put in use meanwhile.
+    ``measures``: it measures at poses, and ends with the event ``calibration_aborted``.
+    ``acknowledge_s``: time limit [s] for the client's acknowledgement of a reached goal; None if no acknowledgement is
+    needed.
+    ``activate``: called when it starts.
+    ``waits``: whether it waits for its plan or its client, so that `execute_goals` has to examine it.
+    ``report``: of a goal without a plan.
+    ``progress``: completed fraction and remaining seconds.
+    ``examine``: why it is slow or stuck, in addition to the reasons of this step; called a few times a second.
     """
 
     name: str
@@ -158,7 +164,7 @@ def goal_of(source: Source) -> str:
 
 
 def paused(state: CoreState) -> bool:
-    """Whether the active source must wait: in hold, after a stop, and a law while cameras are found again."""
+    """Whether the active source must wait: in hold, after a stop, and for a law while cameras are relocalized."""
     return (
         state.held
         or state.stopped
@@ -167,8 +173,8 @@ def paused(state: CoreState) -> bool:
 
 
 def arrange_motion(context: StepContext) -> None:
-    """Write into the workspace what holds until the active source changes: whether and how it moves the arm, but not
-    its velocity. It does not move while it is paused, and outside ACTIVE, where `execute_goals` ends it.
+    """Write into the workspace what is constant until the active source changes: whether and how it moves the arm, but
+    not its velocity. It does not move while it is paused, nor outside ACTIVE, where `execute_goals` ends it.
     """
     state, derived = context.state, context.derived
     work, source, scale = derived.room.numbers, state.source, context.settings.limits.speed_scale
@@ -210,7 +216,7 @@ def _put_output(output: SourceOutput, context: StepContext) -> None:
 
 @kernel
 def begin_friction(block: Record, room: Record) -> None:
-    """Nothing is known of friction; travel is compared from the joints as they are."""
+    """Reset the friction estimates; travel is compared from the current joint positions."""
     memory, n = block[0], block[0].joints
     memory.friction[:n] = memory.friction_sent[:n] = memory.friction_s[:n] = 0.0
     memory.friction_from[:n] = room[0].q[:n]

@@ -1,8 +1,8 @@
-"""Marker positions and pixels at a given time, predicted by projective kinematics (thesis 8.35) and corrected by what
-the cameras have shown (`core.estimate`); the joints at a time of before.
+"""Marker positions and pixels at a given time, predicted by projective kinematics (thesis 8.35) and corrected by the
+observations of the cameras (`core.estimate`); joint positions at an earlier time.
 
-Cameras speak in raw pixels. Here they become ideal ones, in which everything behind is linear in homogeneous
-coordinates; priors leave in raw pixels again.
+Cameras deliver raw pixels. Here they are converted to ideal ones, for which all later computations are linear in
+homogeneous coordinates; priors are converted back to raw pixels.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, KindArr
 from stereoservo.numerics.compilation import inlined_kernel, kernel
 from stereoservo.numerics.linear import damped_least_squares
 
-MODEL_SIGMA_PX = 0.3  # what a good model may be off by at any pose
+MODEL_SIGMA_PX = 0.3  # error of a good model at any pose
 TIMING_SIGMA_S = 0.003  # uncertainty of a shutter stamp against the joint stamps
 UNKNOWN_NS = 100_000_000
-"""A frame that is so much later than the newest joint sample (drives that are silent) is compared with nothing."""
-SUSPECT_FRAMES = 8  # refused ones in a row, of one camera
-TRUSTED_FRAMES = 30  # agreeing ones in a row, of every camera
+"""A frame that is so much later than the newest joint sample (the drives are silent) is not compared with a prediction
+[ns].
+"""
+SUSPECT_FRAMES = 8  # consecutive rejected frames of one camera
+TRUSTED_FRAMES = 30  # consecutive agreeing frames of every camera
 
 
 class Prediction(msgspec.Struct, frozen=True, eq=False):
@@ -51,10 +53,12 @@ class Prediction(msgspec.Struct, frozen=True, eq=False):
 
 
 class FrameResiduals(msgspec.Struct, frozen=True, eq=False):
-    """One frame against the prediction at its shutter, k rows: the model's markers, then its static points.
+    """Residuals of one frame from the prediction at its shutter time, k rows: the model's markers, then its static
+    points.
 
-    ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) by detector and timing, ``noise`` (k,) [px²] of a
-    coordinate by the detector alone, what was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s] by the joints.
+    ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) from detector and timing, ``noise`` (k,) [px²]:
+    variance of a coordinate from the detector alone, whether it was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s]
+    caused by the joints.
     """
 
     t_shutter_ns: int
@@ -66,7 +70,9 @@ class FrameResiduals(msgspec.Struct, frozen=True, eq=False):
 
 
 def chain_at(arrays: ModelArrays, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``H(q)`` (4, 4) of the markers and the operators at ``q`` (n, 4, 4) (5.18, 5.21), however cameras are mounted."""
+    """``H(q)`` (4, 4) of the markers and the operators at ``q`` (n, 4, 4) (5.18, 5.21), for every mount
+    of the cameras.
+    """
     found: tuple[FloatArray, FloatArray] = chain_forward(
         arrays.generators, arrays.kinds, arrays.zero, np.ascontiguousarray(q), arrays.tip_first
     )
@@ -86,7 +92,7 @@ class Arm(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """The fields of a `Prediction`, to be written into."""
+    """The fields of a `Prediction` as output arrays."""
 
     operators: FloatArray
     points: FloatArray
@@ -101,7 +107,7 @@ def arm_in(arrays: ModelArrays) -> Arm:
 
 @inlined_kernel
 def arm_of(room: Record) -> Arm:
-    """The arm whose model is in the ``room``."""
+    """The arm of the model in the workspace ``room``."""
     work = room[0]
     n, m = work.joints, work.markers
     return Arm(
@@ -129,7 +135,7 @@ def predict_markers(
 
 @kernel
 def predict_into(arm: Arm, q: FloatArray, matrices: FloatArray, found: Predicted) -> None:
-    """`predict_markers` into ``found``. To Python, an array that is returned costs more than one passed."""
+    """`predict_markers` into ``found``. For calls from Python, a returned array costs more time than a passed one."""
     operators, points, pixels, jacobian = predict_markers(arm, q, matrices)
     found.operators[:], found.points[:], found.pixels[:], found.jacobian[:] = (
         operators,
@@ -160,17 +166,19 @@ def markers_at(arrays: ModelArrays, q: FloatArray) -> FloatArray:
 
 
 def joints_at(history: JointHistory, t_ns: int) -> FloatArray | None:
-    """Joint positions (n,) at ``t_ns`` by linear interpolation; None when the history does not reach there."""
+    """Joint positions (n,) at ``t_ns`` by linear interpolation; None if the history does not cover that time."""
     known, q = positions_at(history.t_ns, history.positions, history.count, t_ns)
     return q if known else None
 
 
 @kernel
 def positions_at(stamps: IntArray, positions: FloatArray, count: int, t_ns: int) -> tuple[bool, FloatArray]:
-    """Whether a ring of samples, ``positions`` (k, n) at ``stamps`` (k,), to which ``count`` were ever written, reaches
-    to ``t_ns``, and the positions (n,) then, by linear interpolation.
+    """Joint positions (n,) at ``t_ns`` by linear interpolation in a ring of samples, and whether they are known.
 
-    Past the newest sample it extrapolates by up to the last sample interval; ``UNKNOWN_NS`` past it, nobody knows.
+    ``stamps`` (k,), ``positions`` (k, n): the ring, with ``count`` entries ever written.
+
+    After the newest sample the positions are extrapolated by at most the last sample interval; later than
+    ``UNKNOWN_NS`` after it they are unknown.
     """
     size, n = stamps.size, positions.shape[1]
     filled, newest = min(count, size), count - 1
@@ -183,7 +191,7 @@ def positions_at(stamps: IntArray, positions: FloatArray, count: int, t_ns: int)
         if t_ns < t0:
             continue
         if t1 == t0:
-            t0 -= 1  # one and the same moment: the later sample
+            t0 -= 1  # equal stamps: the later sample
         fraction = min((t_ns - t0) / (t1 - t0), 2.0)
         for j in range(n):
             q[j] = positions[earlier, j] + fraction * (positions[later, j] - positions[earlier, j])
@@ -193,10 +201,11 @@ def positions_at(stamps: IntArray, positions: FloatArray, count: int, t_ns: int)
 
 @kernel
 def velocities_at(stamps: IntArray, positions: FloatArray, count: int, t_ns: int) -> tuple[bool, FloatArray]:
-    """Whether the samples around ``t_ns``, of a ring as in `positions_at`, tell of the motion then, and the joint
-    velocities (n,).
+    """Joint velocities (n,) at ``t_ns`` from the samples around it, of a ring as in `positions_at`, and whether they
+    are known.
 
-    What the arm did since its last sample is known for one interval; of a driver's silence nothing is known.
+    They are known up to one sample interval after the last sample, and unknown during longer gaps of the driver's
+    samples.
     """
     size, n = stamps.size, positions.shape[1]
     newest = count - 1
@@ -216,7 +225,7 @@ def velocities_at(stamps: IntArray, positions: FloatArray, count: int, t_ns: int
 
 @kernel
 def rows_of(ids: IntArray, known: IntArray, rows: IntArray) -> IntArray:
-    """Of each of the ``ids`` (k,): its row among those that are ``known`` (m,), ascending, or -1."""
+    """The row of each of the ``ids`` (k,) among the ``known`` ones (m,), ascending, or -1."""
     found = np.empty(ids.size, np.int64)
     for k in range(ids.size):
         at = np.searchsorted(known, ids[k])
@@ -225,14 +234,14 @@ def rows_of(ids: IntArray, known: IntArray, rows: IntArray) -> IntArray:
 
 
 def used_rows(watching: ModelMonitor, sighting: CameraMonitor) -> FloatArray:
-    """(k,) 1 for what is seen and has not slipped."""
+    """(k,) 1 for rows that are seen and not masked as slipped."""
     used: FloatArray = rows_in_use(sighting.seen, watching.masked)
     return used
 
 
 @kernel
 def rows_in_use(seen: FloatArray, masked: FloatArray) -> FloatArray:
-    """(k,) 1 for what is ``seen`` (k,) and, of the markers, not ``masked`` (m,)."""
+    """(k,) 1 for rows that are ``seen`` (k,) and, if markers, not ``masked`` (m,)."""
     used = seen.copy()
     for i in range(masked.size):
         used[i] *= 1.0 - masked[i]
@@ -241,7 +250,7 @@ def rows_in_use(seen: FloatArray, masked: FloatArray) -> FloatArray:
 
 @kernel
 def round_complete(block: Record) -> bool:
-    """Whether every camera has given a frame that no round has looked at yet."""
+    """Whether every camera has delivered a frame that no round has examined yet."""
     memory, complete = block[0], True
     for c in range(memory.cameras):
         complete = complete and not memory.sightings[c].looked
@@ -252,8 +261,8 @@ def round_complete(block: Record) -> bool:
 def camera_chi2(
     innovation: FloatArray, spread: FloatArray, used: FloatArray, model_px: float
 ) -> tuple[float, float, int, float, int]:
-    """Chi-square of a frame's innovations (k, 2) where ``used`` (k,) > 0, sum of their squares [px²], the row of the
-    largest squared distance (-1: none), this distance, and how many they are.
+    """Chi-square of a frame's innovations (k, 2) with ``used`` (k,) > 0, sum of their squares [px²], the row of the
+    largest squared distance (-1: none), this distance, and their number.
     """
     total, squares, largest = 0.0, 0.0, 0.0
     worst, count = -1, 0
@@ -272,24 +281,26 @@ def camera_chi2(
 
 
 SEEN_SLACK_NS = 50_000_000
-"""Beyond the time that a law may coast, in which a marker still has a weight."""
+"""Time [ns] beyond the coasting time of a law for which a marker keeps its weight."""
 LEAST_SIGMA_PX = 1e-3
 CORRECTION_DAMPING = 1e-4
-"""Relative to the largest diagonal of the normal matrix."""
+"""Relative to the largest diagonal element of the normal matrix."""
 LARGE_CORRECTION = 3e-3
-"""[rad or m], from which on one step is not exact to a tenth of a pixel."""
+"""Correction [rad or m] above which one step is not accurate to a tenth of a pixel."""
 FURTHER_STEPS = 3
 
 
 @kernel
 def present(block: Record, room: Record) -> None:
-    """Into the ``room``, the present at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m) 1/sigma
-    [1/px] of markers seen of late, 0 elsewhere; ``pixels`` (c, m, 2) where the markers are now: prediction plus held
-    innovation. Into the ``block``, the ``correction`` (n,) of the joints that explains the innovations best, so that
-    corrected points stay one rigid body.
+    """Estimate the current markers.
 
-    The correction is one step of Gauss and Newton; more where it is large, as of arms with play, as long as they
-    explain more.
+    Written to the workspace ``room``, at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m)
+    1/sigma [1/px] of recently seen markers, 0 for others; ``pixels`` (c, m, 2), the current markers: prediction plus
+    held innovation. Written to the ``block``: the ``correction`` (n,) of the joints that explains the innovations best,
+    so that the corrected points remain those of a rigid body.
+
+    The correction is one Gauss-Newton step. If it is large (arms with play), further steps follow as long as they
+    reduce the residual.
     """
     memory, work = block[0], room[0]
     n, cameras, markers = memory.joints, memory.cameras, memory.markers
@@ -342,7 +353,7 @@ def present(block: Record, room: Record) -> None:
 
 
 def pixels_now(prediction: Prediction, cameras: list[CameraEstimate]) -> FloatArray:
-    """(c, m, 2) where the markers are now: prediction plus held innovation [px]."""
+    """Current pixels (c, m, 2) of the markers: prediction plus held innovation [px]."""
     found: FloatArray = prediction.pixels + np.array([e.innovation for e in cameras])
     return found
 
@@ -357,8 +368,8 @@ def points_now(
 ) -> FloatArray:
     """Marker points (m, 4) with heights a∞ᵀM = 1: ``predicted`` (8.35) or ``triangulated`` (8.34).
 
-    Predicted points are those of the joints plus correction. A marker that fewer than two cameras see cannot be
-    triangulated: its predicted point stands in.
+    Predicted points are those of the joints plus correction. A marker seen by fewer than two cameras cannot be
+    triangulated: its predicted point is used.
     """
     points = markers_at(arrays, q + correction)
     return triangulated(arrays, pixels, weights, points) if source == "triangulated" else points
@@ -367,7 +378,7 @@ def points_now(
 def triangulated(
     arrays: ModelArrays, pixels: FloatArray, weights: FloatArray, predicted: FloatArray
 ) -> FloatArray:
-    """Marker points (m, 4) of unit height by triangulation; where fewer than two cameras see one, as ``predicted``."""
+    """Marker points (m, 4) of unit height by triangulation; markers seen by fewer than two cameras as ``predicted``."""
     found, ok = triangulate(arrays.matrices, pixels, weights, 3)
     return np.where(ok[:, None], with_unit_height(found, arrays.plane_at_infinity), predicted)
 
@@ -375,14 +386,16 @@ def triangulated(
 def scene_of(
     prediction: Prediction, pixels: FloatArray, arrays: ModelArrays, points: FloatArray, weights: FloatArray
 ) -> Scene:
-    """The present as laws take it: operators, cameras, points (m, 4), pixels (c, m, 2) and their weights (c, m)."""
+    """The current scene as laws take it: operators, cameras, points (m, 4), pixels (c, m, 2) and their
+    weights (c, m).
+    """
     matrices, centres = arrays.matrices, arrays.camera_centres
     return Scene(prediction.operators, arrays.composition, matrices, centres, points, pixels, weights)
 
 
 class Centre(NamedTuple):
-    """The centre of a goal: the affine middle of the markers by its ``weights`` (m,), or, where these are zero, the
-    point ``body`` (4,) of the body in the chain's zero.
+    """The centre of a goal: the affine centroid of the markers by its ``weights`` (m,), or, if these are zero, the
+    point ``body`` (4,) of the body at the chain's zero.
     """
 
     weights: FloatArray
@@ -413,7 +426,7 @@ def centre_into(arm: Arm, q: FloatArray, points: FloatArray, by: Centre, centre:
 
 
 HUBER = 2.5
-"""Mahalanobis distance up to which a sight has its full weight: 4 % of good ones lie beyond."""
+"""Mahalanobis distance up to which an observation has its full weight: 4 % of good ones exceed it."""
 FAR_SIGMA = 30.0
 
 
@@ -421,7 +434,7 @@ FAR_SIGMA = 30.0
 def gate_threshold(sigmas: float) -> float:
     """Squared distance that two Gaussian coordinates exceed as rarely as one exceeds ``sigmas`` standard deviations.
 
-    The quantile of chi-square with two freedoms, ``-2 log(1 - p)``; far out its asymptote.
+    It is the quantile of chi-square with two degrees of freedom, ``-2 log(1 - p)``; for large ``sigmas`` its asymptote.
     """
     if sigmas >= FAR_SIGMA:
         return sigmas * sigmas + 2.0 * math.log(sigmas * math.sqrt(0.5 * math.pi))
@@ -436,7 +449,7 @@ def improbable(freedoms: float) -> float:
 
 @kernel
 def distance2(x: float, y: float, a: float, b: float, c: float) -> float:
-    """``vᵀ S⁻¹ v`` of ``v = (x, y)`` and ``S = [[a, b], [b, c]]``; infinite where S is not positive."""
+    """``vᵀ S⁻¹ v`` of ``v = (x, y)`` and ``S = [[a, b], [b, c]]``; infinite if S is not positive definite."""
     determinant = a * c - b * b
     if not determinant > 0.0:
         return math.inf
@@ -456,7 +469,7 @@ def propagate_covariance(a: float, b: float, d: float, C: FloatArray, out: Float
 def undistort_sights(
     lens: FloatArray, pixels: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Ideal pixels (k, 2) with covariances (k, 2, 2) [px²] of raw ones, and which (k,) the lens can have made."""
+    """Ideal pixels (k, 2) with covariances (k, 2, 2) [px²] of raw ones, and which (k,) the lens can produce."""
     n = pixels.shape[0]
     ideal = np.empty((n, 2))
     spread = np.empty((n, 2, 2))

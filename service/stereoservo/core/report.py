@@ -35,7 +35,9 @@ LEVELS: tuple[Level, ...] = ("info", "slow", "hold", "fault")
 
 
 def finish_step(context: StepContext, limits: SafetyLimits) -> None:
-    """Stage 7, in every step: a motion that has finished ends, and a few times a second a law's run is examined."""
+    """Stage 7, in every step: end a motion that has finished, and a few times a second examine the progress of a law's
+    run.
+    """
     state, output = context.state, context.output
     if output is not None:
         context.derived.room.result[0] = NOT_MEASURED if output.error_px is None else output.error_px
@@ -52,7 +54,9 @@ def finish_step(context: StepContext, limits: SafetyLimits) -> None:
 
 
 def status_of(context: StepContext, limits: SafetyLimits) -> Status:
-    """The status after the step, its fields in their order: an argument by name costs as much as an array."""
+    """The status after the step. The fields are passed by position: a keyword argument costs as much
+    time as an array.
+    """
     state, derived, block = context.state, context.derived, context.state.block
     masked = masked_ids(state)
     diagnosis = shown_diagnosis(state.watching.verdict, masked)
@@ -79,7 +83,7 @@ NO_MOTION = SourceOutput(np.zeros(0))
 
 
 def motion_of(context: StepContext) -> SourceOutput:
-    """What the active source has given in this step, a law's kernel included."""
+    """The active source's output in this step, also if it is a law's kernel."""
     if context.output is not None:
         return context.output
     source = context.state.source
@@ -89,7 +93,7 @@ def motion_of(context: StepContext) -> SourceOutput:
 
 
 def _reasons_before(context: StepContext, limited: SafetyResult) -> list[Reason]:
-    """Why the arm does not do what its source wants, before what a law's run shows over time."""
+    """The reasons why the arm does not execute its source's velocity, without those of a law's progress over time."""
     state = context.state
     found = [*state.fault, *limited.reasons, *motion_of(context).reasons]
     for refused in (state.refused_joints, *state.refused_frames):
@@ -108,7 +112,7 @@ def _reasons_before(context: StepContext, limited: SafetyResult) -> list[Reason]
 
 
 def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
-    """All reasons, beside those ``found`` before: of a law's run those of its last examination."""
+    """All reasons: those ``found`` before, and those of the last examination of a law's run."""
     state = context.state
     if context.derived.room.numbers.runs and isinstance(state.source, LawRun):
         codes = {reason.code for reason in found}
@@ -129,13 +133,13 @@ def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
 
 
 def _latched(reason: Reason, state: CoreState) -> bool:
-    """Whether that is refused which already stands as the reason of a stop."""
+    """Whether the refusal repeats a reason that is already shown for a stop."""
     latched = state.stop_reason if state.stopped else None
     return latched is not None and (reason.code, reason.subject) == (latched.code, latched.subject)
 
 
 def priors_of(context: StepContext) -> tuple[Prior, ...]:
-    """What the detectors are to expect, in steps that send it."""
+    """The detectors' priors, in steps that send them."""
     state, arrays, prediction = context.state, context.derived.arrays, context.prediction
     if prediction is None or arrays is None or state.step % context.derived.prior_every:
         return ()
@@ -147,7 +151,7 @@ def priors_of(context: StepContext) -> tuple[Prior, ...]:
 
 
 def _level(reasons: tuple[Reason, ...]) -> str:
-    """The worst level of the reasons; information is none."""
+    """The worst level of the reasons; information has no level."""
     if not reasons:
         return "ok"
     worst = max([LEVELS.index(reason.level) for reason in reasons])
@@ -155,7 +159,7 @@ def _level(reasons: tuple[Reason, ...]) -> str:
 
 
 def shown_diagnosis(verdict: ModelDiagnosis, masked: tuple[int, ...]) -> ModelDiagnosis:
-    """The verdict as it is shown: a marker that is left out remains one that has slipped."""
+    """The diagnosis as it is shown: a masked marker continues to be reported as slipped."""
     if verdict.kind != "ok" or not masked:
         return verdict
     listed = tuple(str(marker) for marker in masked)
@@ -167,7 +171,7 @@ NO_HEALTH = Health()
 
 
 def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, ...]) -> Health:
-    """What the status says of the model's health: what it said before, where nothing of it has changed."""
+    """The model's health for the status: the previous record if nothing has changed."""
     state, derived = context.state, context.derived
     model = state.model
     if model is None or state.readiness == ModelReadiness.NONE:
@@ -205,20 +209,20 @@ def _health_now(
 
 
 KNOWN_S = 0.002
-"""Standard deviation at which the offset is told."""
+"""Standard deviation [s] at which the offset is reported."""
 WRONG_S = 0.004
-"""Offset that is worth a word: at 100 px/s it moves a marker by 0.4 px."""
+"""Offset [s] that is worth reporting: at 100 px/s it moves a marker by 0.4 px."""
 
 
 def offset_s(timing: CameraTiming) -> tuple[float, float]:
-    """How much later than stated the shutter opens [s], and its standard deviation; (0, inf) before any motion."""
+    """Delay of the shutter relative to its stated time [s], and its standard deviation; (0, inf) before any motion."""
     if timing.square <= 0.0:
         return 0.0, math.inf
     return timing.product / timing.square, 1.0 / math.sqrt(timing.square)
 
 
 def advice(timing: CameraTiming) -> str:
-    """What is to be said of it to people; empty where the stamps are right, or nothing is known yet."""
+    """Advice to the user about the offset; empty if the stamps are correct, or nothing is known yet."""
     late, deviation = offset_s(timing)
     if deviation > KNOWN_S or abs(late) < max(WRONG_S, 4.0 * deviation):
         return ""
@@ -235,10 +239,11 @@ def advice(timing: CameraTiming) -> str:
 def priors(
     arrays: ModelArrays, context: StepContext, prediction: Prediction, moving: list[int], unknown: tuple[str, ...]
 ) -> tuple[Prior, ...]:  # fmt: skip
-    """One prior a camera for the detectors' windows, raw; covariance from model and motion, never fed back.
+    """One prior a camera for the detectors' windows, in raw pixels. The covariance is that of model and motion; it is
+    never fed back.
 
-    What cameras that are ``moving`` saw before is no matter. None for cameras of whose place nothing is known: their
-    detectors look in the whole image.
+    Earlier observations of cameras that are ``moving`` are not used. Cameras whose pose is ``unknown`` have no prior:
+    their detectors search the whole image.
     """
     state, room, now_ns = context.state, context.derived.room, context.now_ns
     shape = prediction.pixels.shape
@@ -254,7 +259,7 @@ def priors(
     for c, (camera, estimate) in enumerate(zip(context.settings.cameras, state.cameras, strict=True)):
         if camera.name in unknown:
             continue
-        # The vision process asks for the stamps that the camera tells.
+        # The vision process expects the stamps that the camera reports.
         shown = arrays.ids, pixels[c], speed[c], covariance[c]
         if beyond >> c & 1:
             within = np.isfinite(pixels[c]).all(axis=-1)
@@ -265,11 +270,11 @@ def priors(
 
 SEEN_LATELY_NS = 1_000_000_000
 LARGEST_WINDOW_PX = 20.0
-"""Deviation beyond which a detector does better to look in the whole image."""
+"""Standard deviation [px] above which a search of the whole image is better."""
 
 
 class Expected(NamedTuple):
-    """What cameras are expected to see: ``pixels`` (c, m, 2), their ``velocities`` (c, m, 2) and ``covariances``
+    """Expected observations of the cameras: ``pixels`` (c, m, 2), their ``velocities`` (c, m, 2) and ``covariances``
     (c, m, 2, 2).
     """
 
@@ -282,11 +287,12 @@ class Expected(NamedTuple):
 def expect_sights(
     block: Record, room: Record, predicted: FloatArray, jacobian: FloatArray, moving: int, expected: Expected
 ) -> int:
-    """Into ``expected``, what all cameras are to see, as their lenses show it: ``predicted`` (c, m, 2) with its
-    ``jacobian`` (c, m, 2, n), plus the innovations of markers seen of late. As bits of a number, the cameras with
-    markers beyond the folds of their lenses; pixels of these are no numbers.
+    """Write the expected observations of all cameras to ``expected``, distorted by their lenses: ``predicted`` (c, m,
+    2) pixels with their ``jacobian`` (c, m, 2, n), plus the innovations of recently seen markers. Returns a bit mask of
+    the cameras with markers outside the invertible range of their lenses (beyond the fold); the pixels of such markers
+    are not finite.
 
-    Cameras whose bits are set in ``moving`` have seen nothing of late.
+    Cameras whose bits are set in ``moving`` have no recent observations.
     """
     memory, work = block[0], room[0]
     n, m, lens_size = memory.joints, memory.markers, work.lens_size
@@ -318,7 +324,7 @@ def expect_sights(
 
 
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
-    """Deviations (c, m) [px] of markers that were not seen of late, by their ``jacobian`` (c, m, 2, n)."""
+    """Standard deviations (c, m) [px] of markers that were not seen recently, from their ``jacobian`` (c, m, 2, n)."""
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
     return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
 
@@ -327,7 +333,9 @@ def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
 def distort_expected(
     lens: FloatArray, pixels: FloatArray, velocities: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Raw pixels (k, 2), velocities (k, 2), covariances (k, 2, 2) of ideal ones, and which (k,) lie within the fold."""
+    """Distort ideal pixels: raw pixels (k, 2), velocities (k, 2), covariances (k, 2, 2), and which (k,) lie within the
+    fold.
+    """
     n = pixels.shape[0]
     raw = np.empty((n, 2))
     speed = np.empty((n, 2))

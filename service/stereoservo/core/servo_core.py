@@ -1,16 +1,19 @@
 """`ServoCore`, the control algorithm of the servo loop: one step maps joint samples, camera observations and requests
-to a joint velocity. Deterministic given its state: no clock, no I/O, no random number.
+to a joint velocity. It is deterministic given its state: no clock, no I/O, no random numbers.
 
-A step observes, moves and commands, by kernels on one flat record:
+A step has five parts. Observation, motion and command run in kernels on one flat record:
 
-1. `observe`: `ingest` checks stamps before anything is used; `estimate` compares frames at their own stamps, then
-   predicts the present; `detect` looks for what must stop the arm; the progress of the active goal is measured.
-2. `decide`, only where something is asked, found, or to be looked after: the stop, then requests, then what the
-   monitors make of what was found, before a goal is advanced or anything moves; then plans, queued goals and leases.
-3. `move`: the active motion source's velocity.
-4. `command`: friction, late drives and the safety stage; nothing changes a command after it.
-5. `finish_step`: what has ended, ends. Status, reasons and detector priors are made of the step when they are asked
-   for.
+1. `observe`: `ingest` checks time stamps before an input is used. `estimate` compares each frame with the prediction at
+   the frame's own stamp, then predicts the current markers. `detect` checks for conditions that must stop the arm. Then
+   the progress of the active goal is measured.
+2. `decide` (Python; only if there are requests, detections, or state that needs attention): the stop is handled first,
+   then requests, then the monitors' findings, before a goal is advanced or anything moves; then plans, queued goals and
+   leases.
+3. `move`: computes the velocity of the active motion source.
+4. `command`: friction compensation, look-ahead for late drives, and the safety stage. Nothing changes a command after
+   it.
+5. `finish_step`: ends motions that have finished. Status, reasons and detector priors are built only when they are
+   requested.
 """
 
 from __future__ import annotations
@@ -65,10 +68,11 @@ from stereoservo.ports.devices import Prior
 
 
 def observe(context: StepContext, *, decides: bool) -> int:
-    """What the stages have found, as bits of a number (`ingest`, `monitor`); the present, where there is a model.
+    """Observe the inputs of a step; returns the detections of `ingest` and `detect` as a bit mask. If there is a model,
+    the context holds the current prediction afterwards.
 
-    The goal's progress is looked at here in steps in which nothing is decided before the motion; where Python
-    ``decides``, or anything is found, the goal may be another one then, and its law looks itself.
+    The goal's progress is measured here only in steps in which nothing is decided before the motion. If Python
+    ``decides`` or anything was detected, the active goal may change, so its law measures the progress itself.
     """
     derived = context.derived
     room, block = derived.room, context.state.block
@@ -90,15 +94,15 @@ def observe(context: StepContext, *, decides: bool) -> int:
 
 PRIOR_RATE_HZ = 125.0
 LOOK_EVERY_S = 0.2
-"""Between two examinations of why a law is slow or stuck."""
+"""Interval between two examinations of why a law is slow or stuck [s]."""
 BY_KERNELS = (ServoGoal, Holding)
 """Motion sources whose steps do not read the inputs."""
 NO_INPUTS = StepInputs(0, 0, None)
 
 
 class NewestStep:
-    """The newest step of a core: what it has come to, of which nothing is made before it is asked for. Its arrays are
-    the core's own, and of the next step after that.
+    """The results of a core's newest step. Outputs are built only when they are requested. The arrays belong to the
+    core and are overwritten by the next step.
     """
 
     def __init__(self, context: StepContext, limits: SafetyLimits) -> None:
@@ -106,13 +110,13 @@ class NewestStep:
 
     @property
     def command(self) -> FloatArray | None:
-        """Joint velocities (n,) to write; None where nothing may be written."""
+        """Joint velocities (n,) to write; None if nothing may be written."""
         state = self._context.state
         return state.block.command if state.lifecycle is Lifecycle.ACTIVE else None
 
     @property
     def moves(self) -> bool:
-        """Whether the arm moves, or may with the next step."""
+        """Whether the arm moves, or may move in the next step."""
         state = self._context.state
         return not isinstance(state.source, Holding) or bool(state.block.command.any())
 
@@ -123,7 +127,7 @@ class NewestStep:
 
     @property
     def driver_request(self) -> str:
-        """What the core asks of the joint driver."""
+        """The core's request to the joint driver."""
         return self._context.state.driver_request
 
     @property
@@ -143,7 +147,7 @@ class NewestStep:
 
     @property
     def priors(self) -> tuple[Prior, ...]:
-        """What the detectors are to expect, in steps that send it."""
+        """The detectors' priors, in steps that send them."""
         return priors_of(self._context)
 
     @property
@@ -153,13 +157,13 @@ class NewestStep:
 
 
 class ServoCore:
-    """The servo loop's algorithm. ``state`` is all that it remembers."""
+    """The servo loop's algorithm. ``state`` is its complete memory."""
 
     def __init__(self, settings: CoreSettings, state: CoreState | None = None) -> None:
         self.settings = settings
         self.state = initial_state(settings) if state is None else state
         block, past = self.state.block, steps_of_delay(settings.rate_hz)
-        if block.numbers.past != past:  # of a state that was written before drives were known to be late
+        if block.numbers.past != past:  # state written before delays were recorded
             block.remember_steps(past)
         model = self.state.model
         fresh_s = features_fresh_s(settings)
@@ -182,7 +186,7 @@ class ServoCore:
         self._context = StepContext(self.state, settings, self._derived, NO_INPUTS)
         self.newest = NewestStep(self._context, self._limits)
         self._arranged: Source | None = None
-        """The source for which the workspace is arranged; None: it may be out of date."""
+        """The source for which the workspace is arranged; None: the workspace may be out of date."""
         self._attends = False
         self._lease_until_ns = 0
 
@@ -195,7 +199,7 @@ class ServoCore:
         work.frame_timeout_s = derived.frame_timeout_s
 
     def step(self, inputs: StepInputs) -> StepOutputs:
-        """One cycle, and all that there is to tell of it."""
+        """Run one cycle and return all of its outputs."""
         self.advance(inputs)
         return self.outputs()
 
@@ -206,7 +210,7 @@ class ServoCore:
         return StepOutputs(command, newest.status, newest.priors, newest.events, newest.driver_request)  # type: ignore[arg-type]
 
     def advance(self, inputs: StepInputs) -> None:
-        """One cycle."""
+        """Run one cycle."""
         context, state = self._context, self.state
         context.begin(inputs)
         state.driver_request = ""
@@ -223,11 +227,11 @@ class ServoCore:
         room = self._derived.room
         command(state.block.record, room.record, self._limits.keep_outs)
         finish_step(context, self._limits)
-        if context.output is not None:  # Python has moved the arm, and may have changed what it likes
+        if context.output is not None:  # Python has moved the arm, and may have changed any state
             self._arranged = None
 
     def _prepare(self, context: StepContext) -> None:
-        """What comes before a step: the driver's lifecycle is followed, and a model that waits is taken."""
+        """Prepare a step: update the driver's lifecycle, and put a pending model in use."""
         state, inputs, work = context.state, context.inputs, self._derived.room.numbers
         if state.source is not self._arranged:
             self._arrange(context)
@@ -243,14 +247,14 @@ class ServoCore:
             self._arrange(context)
 
     def _decide(self, context: StepContext) -> None:
-        """Act on what was asked and found, and advance goals."""
+        """Handle requests and detections, and advance goals."""
         context.ingested = account_inputs(context)
         if any(context.state.mobile):
             moving_camera.step(context)
         monitor(context)
         execute_goals(context)
         self._arrange(context)
-        self._arranged = None  # what is decided may bring something with the next step
+        self._arranged = None  # a decision may change the state for the next step
 
     def _arrange(self, context: StepContext) -> None:
         arrange(context)
@@ -259,11 +263,11 @@ class ServoCore:
 
 
 FAULTY = (Lifecycle.FAULT, Lifecycle.UNCONFIGURED)
-"""In which joints are no measure of cameras."""
+"""Lifecycles in which joint readings must not be used to judge the cameras."""
 
 
 def arrange(context: StepContext) -> None:
-    """Write what stands into the workspace."""
+    """Write the state that holds until the next decision into the workspace."""
     state, settings, derived = context.state, context.settings, context.derived
     room, watching, kind = derived.room, state.watching, MOTION_SOURCES[type(state.source)]
     work, given = room.numbers, room.arrays
@@ -297,8 +301,8 @@ def arrange(context: StepContext) -> None:
 
 
 def attends(context: StepContext) -> bool:
-    """Whether Python has to look after the state in every step: a monitor asks for it, or a goal that is planned,
-    queued, waits, or cannot go on.
+    """Whether Python has to examine the state in every step: a monitor requires it, or a goal is being planned, queued,
+    waiting, or unable to continue.
     """
     state, source = context.state, context.state.source
     return (
@@ -316,7 +320,7 @@ NEVER_NS = sys.maxsize
 
 
 def lease_until_ns(source: Source) -> int:
-    """When the lease of the active source runs out; `NEVER_NS` where it has none."""
+    """Time at which the lease of the active source expires [ns]; `NEVER_NS` if it has none."""
     if not isinstance(source, Leased) or source.lease_s is None:
         return NEVER_NS
     return source.lease_until_ns

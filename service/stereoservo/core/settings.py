@@ -24,12 +24,12 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraDescription, JointDriverDescription, JointKindName
 
 FINEST_ARRIVAL = 5e-4
-"""Nearer than this to its target [rad or m] a joint has arrived, however fine its encoder."""
+"""Smallest distance to its target [rad or m] within which a joint has arrived, however fine its encoder."""
 ARRIVAL_STEPS = 0.75
-"""The same of coarse encoders, in their steps: some reading is always within half a step of a target."""
-SLACK = 1e-3  # of a cell's limits beyond the drive's, for rounding [rad or m]
+"""The same for coarse encoders, in encoder steps: some reading is always within half a step of a target."""
+SLACK = 1e-3  # tolerance of a cell's limits beyond the drive's, for rounding [rad or m]
 LARGEST_RANGE: dict[JointKindName, float] = {"revolute": 0.6, "prismatic": 0.2}
-"""To either side of the base, where the cell file states no range of its own [rad or m]."""
+"""Range to either side of the base if the cell file states none [rad or m]."""
 
 
 class CameraSettings(msgspec.Struct, frozen=True):
@@ -48,7 +48,7 @@ class CameraSettings(msgspec.Struct, frozen=True):
 class LimitSettings(msgspec.Struct, frozen=True, eq=False):
     """Limits in joint order: the tighter of drive and cell. ``keep_outs`` (k, n, 2) joint-space boxes.
 
-    ``command_timeout_s``: without a command for so long the drives come to rest by themselves.
+    ``command_timeout_s``: without a command for so long, the drives stop on their own.
     """
 
     position_min: FloatArray
@@ -67,7 +67,7 @@ class LimitSettings(msgspec.Struct, frozen=True, eq=False):
 class TrialSettings(msgspec.Struct, frozen=True, eq=False):
     """Trial motions in joint order; see `messages.cell_file.CalibrationSection`.
 
-    ``range`` (n,): NaN where the programme itself finds out how far the joint may go.
+    ``range`` (n,): NaN if the programme itself determines how far the joint may move.
     """
 
     base: FloatArray
@@ -80,17 +80,17 @@ class TrialSettings(msgspec.Struct, frozen=True, eq=False):
     min_range: float
     wait_s: float
     together: int = 0
-    """Stops at which all joints stand apart from the base."""
+    """Number of stops at which all joints are offset from the base."""
     spread_joint: int = -1
-    """Joint that visits ``spread_offsets`` (p,) [rad or m] from its base at the stops of others; -1: none."""
+    """Joint that visits ``spread_offsets`` (p,) [rad or m] from its base at the stops of other joints; -1: none."""
     spread_offsets: FloatArray = msgspec.field(default_factory=lambda: np.zeros(1))
 
 
 class ContactSettings(msgspec.Struct, frozen=True, eq=False):
-    """The watch on contact, in joint order; see `messages.cell_file.ContactSection`.
+    """Collision monitoring, in joint order; see `messages.cell_file.ContactSection`.
 
-    ``efforts``, ``following_errors`` (n,): stated thresholds, NaN where they are to be learnt. ``effort_units``: for
-    people.
+    ``efforts``, ``following_errors`` (n,): stated thresholds, NaN if they are to be learnt. ``effort_units``: for
+    messages to people.
     """
 
     enabled: bool
@@ -121,16 +121,16 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
     filter_s: float
     gate_sigma: float
     watch_following: bool = True
-    """Off where commands are computed and never written (dry run)."""
+    """False if commands are computed but never written (dry run)."""
     contact: ContactSettings | None = None
     scene_ids: tuple[int, ...] = ()
-    """Ids that stand still for good: ``[scene] static``."""
+    """Ids that are permanently static: ``[scene] static``."""
     body_moves: bool = False
-    """The body before cameras on the arm moves by itself: ``[scene] moves``."""
+    """For cameras on the arm: the observed body moves on its own: ``[scene] moves``."""
     reanchor: bool = True
-    """Whether a camera that was moved is found anew by itself."""
+    """Whether a camera that was moved is relocalized automatically."""
     resolution: tuple[float, ...] = ()
-    """Steps of the joints' encoders [rad or m], 0: fine; empty: all are."""
+    """Steps of the joints' encoders [rad or m], 0: fine; empty: all are fine."""
 
     @property
     def marker_ids(self) -> tuple[int, ...]:
@@ -139,15 +139,17 @@ class CoreSettings(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def arrival(self) -> FloatArray:
-        """How near (n,) [rad or m] its target a joint has arrived, from its encoder's step; not to be written to."""
+        """Distance (n,) [rad or m] to its target within which a joint has arrived, from its encoder's
+        step; read-only.
+        """
         return _arrival(self.resolution, len(self.joint_names))
 
     def joint_unit(self, joint: int) -> str:
-        """Of a joint's positions."""
+        """Unit of a joint's positions."""
         return "rad" if self.joint_kinds[joint] == "revolute" else "m"
 
     def arrival_origin(self, joint: int) -> str:
-        """A joint's arrival tolerance and where it comes from, for people."""
+        """A joint's arrival tolerance and its origin, as text for people."""
         tolerance = float(self.arrival[joint])
         if tolerance <= FINEST_ARRIVAL:
             return f"tolerance {tolerance:.4g}"
@@ -171,10 +173,10 @@ def core_settings(
     speed_cap: float = 1.0,
     watch_following: bool = True,
 ) -> CoreSettings:
-    """Bring cell file and driver descriptions together.
+    """Settings from cell file and driver descriptions. Raises CellFileError if they do not fit together.
 
-    ``cameras`` in the cell file's order, each with its detector's marker ids. ``speed_cap`` (0, 1] lowers the cell's
-    speed scale (commissioning). Raises CellFileError where they do not fit.
+    ``cameras``: in the cell file's order, each with its detector's marker ids.
+    ``speed_cap`` (0, 1]: lowers the cell's speed scale (commissioning).
     """
     cell = completed(cell, joints)
     names = tuple(joint.name for joint in joints.joints)
@@ -245,9 +247,10 @@ def core_settings(
 
 
 def completed(cell: CellFile, joints: JointDriverDescription) -> CellFile:
-    """The cell file with what it may leave out of a simulated arm: limits, and the base of the trial motions.
+    """The cell file completed by values that may be omitted for a simulated arm: limits, and the base of the trial
+    motions.
 
-    Raises CellFileError where what it does state does not fit.
+    Raises CellFileError if a stated value does not fit.
     """
     if not joints.simulated:
         return cell

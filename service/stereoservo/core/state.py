@@ -1,5 +1,5 @@
-"""The complete state of the control core as one versioned, serialisable struct: joint history, camera estimates,
-active motion source, goal queue and plans, monitors. A copy of it, and the inputs, give the same outputs.
+"""The complete state of the control core as one versioned, serialisable struct: joint history, camera estimates, active
+motion source, goal queue and plans, monitors. A copy of it with the same inputs gives the same outputs.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from stereoservo.planning.path_search import Planning
 from stereoservo.planning.plan import Plan
 
 STATE_VERSION = 13
-LEAST_APART_NS = 2_500_000  # between samples that are kept, but for the newest
+LEAST_APART_NS = 2_500_000  # between samples that are kept, except the newest
 
 
 class JointHistory(msgspec.Struct, eq=False):
-    """Ring of joint samples: stamps [ns] and positions; ``count`` samples were ever written."""
+    """Ring buffer of joint samples: stamps [ns] and positions; ``count`` samples were ever written."""
 
     t_ns: IntArray
     positions: FloatArray
@@ -43,14 +43,16 @@ class JointHistory(msgspec.Struct, eq=False):
 
 
 class Refused(msgspec.Struct, eq=False):
-    """Samples of one source that `ingest` refused: how many ever, and why the newest; None once one passed again."""
+    """Samples of one source rejected by `ingest`: their total number, and the reason for the newest; None once one was
+    accepted again.
+    """
 
     count: int = 0
     reason: Reason | None = None
 
 
 class JointLoadStatistics(msgspec.Struct, eq=False):
-    """What the trial motions ``id`` have shown of the joints' loads so far; see `kinematics.model.JointLoads`."""
+    """Statistics of the joints' loads in the trial motions ``id`` so far; see `kinematics.model.JointLoads`."""
 
     id: str
     velocities: FloatArray
@@ -72,20 +74,20 @@ class AwaitingAcknowledgement(msgspec.Struct, tag="acknowledge"):
 
 
 class Jogging(msgspec.Struct, tag="jog", eq=False):
-    """Joint velocities until the dead man's lease runs out."""
+    """Joint velocities until the lease of the dead man's switch expires."""
 
     velocity: FloatArray
     until_ns: int
 
 
 class Leased(msgspec.Struct, eq=False):
-    """A goal whose client must renew its lease, where it has one."""
+    """A goal whose client must renew its lease, if it has one."""
 
     lease_s: float | None
     lease_until_ns: int
 
     def renew_lease(self, now_ns: int) -> None:
-        """The client spoke."""
+        """Renew the lease after a message of the client."""
         self.lease_until_ns = now_ns + int((self.lease_s or 0.0) * 1e9)
 
 
@@ -98,15 +100,16 @@ class JointMove(Leased, tag="joints", eq=False, kw_only=True):
     started_ns: int
     time_limit_s: float
     start: FloatArray
-    """Where it set out from (n,)."""
+    """Start positions (n,)."""
     acknowledge_s: float | None = None
     settled: int = 0
 
 
 class Stream(msgspec.Struct, eq=False):
-    """A goal that a client moves: its filtered set-points, in the client's time, and what it said last, when.
+    """A goal that a client moves: its filtered set-points, in the client's time, and the client's last message with its
+    time.
 
-    ``set_points`` (c, m, 2): ideal pixels, as they were last said.
+    ``set_points`` (c, m, 2): ideal pixels, as last sent.
     """
 
     track: TargetTrack
@@ -116,11 +119,13 @@ class Stream(msgspec.Struct, eq=False):
 
 
 class LawRun(Leased, eq=False, kw_only=True):
-    """A law at work on a goal. ``used`` (c,) 1 for cameras whose images it may use.
+    """A law that works on a goal.
 
-    Gains [1/s] as in `messages.goals.AdaptiveGain`, ``damping`` as in `control.pd`. ``reasons``: what was found when
-    its progress, which is in the block (`core.block.RunProgress`), was last looked at. ``apart``: why it is held inside
-    its tolerance (see `core.sources.progress`), as of the first ``apart_frames`` frames of all cameras.
+    ``used`` (c,): 1 for cameras whose images it may use.
+    Gains [1/s]: as in `messages.goals.AdaptiveGain`; ``damping``: as in `control.pd`.
+    ``reasons``: results of the last examination of its progress, which is in the block (`core.block.RunProgress`).
+    ``apart``: why the goal is not reached inside its tolerance (see `core.sources.progress`), as of the first
+    ``apart_frames`` frames of all cameras.
     """
 
     goal: Goal
@@ -140,8 +145,8 @@ class LawRun(Leased, eq=False, kw_only=True):
 
 
 class FollowedTarget(msgspec.Struct, eq=False, kw_only=True):
-    """Of a goal that follows a target: the displacement ``reference`` (4, 4) of the target at which it holds. ``told``:
-    the last event of the target.
+    """State of a goal that follows a target: the displacement ``reference`` (4, 4) of the target for which its
+    set-points or features are given. ``told``: the last event of the target.
     """
 
     reference: FloatArray
@@ -149,7 +154,7 @@ class FollowedTarget(msgspec.Struct, eq=False, kw_only=True):
 
 
 class Followed(FollowedTarget, eq=False, kw_only=True):
-    """Of set-points: ``set_points`` (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,) at the reference."""
+    """Set-points at the reference: ``set_points`` (c, m, 2), ``target_points`` (m, 4) and ``centre_target`` (4,)."""
 
     set_points: FloatArray
     target_points: FloatArray
@@ -157,8 +162,8 @@ class Followed(FollowedTarget, eq=False, kw_only=True):
 
 
 class FollowedFeatures(FollowedTarget, eq=False, kw_only=True):
-    """Of incidences: their ``fixed`` features (k, 3, 4) at the reference; ``drift`` (4, 4) [1/s], their twist now
-    relative to what shall lie on them.
+    """Incidences at the reference: their ``fixed`` features (k, 3, 4); ``drift`` (4, 4) [1/s], the current twist of the
+    features relative to the body that shall be incident with them.
     """
 
     fixed: FloatArray
@@ -168,13 +173,15 @@ class FollowedFeatures(FollowedTarget, eq=False, kw_only=True):
 class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
     """A law drives the arm to set-points.
 
-    ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0, and their velocities ``rates`` [px/s].
-    ``target_points`` (m, 4): all markers at the goal, where ``pose_known``; ``target_known`` (m,): those that fixed it;
-    ``faces`` of the body, and the ``choice`` of the one that the law works on. The centre is the affine middle of the
-    markers by ``centre_weights`` (m,), or, where these are zero, the point ``centre_body`` (4,) of the body in the
-    chain's zero; ``centre_target`` (4,) at the goal. ``stream``: where the goal moves, once a client has moved it. Law
-    A planned law follows its ``plan`` for a body that was at ``start_points`` (m, 4), at ``plan_s`` of it.
-    ``goal_joints`` (n,): where a plan ends.
+    ``set_points`` (c, m, 2): ideal pixels with ``wanted`` (c, m) 1 or 0, and their velocities ``rates`` [px/s].
+    ``target_points`` (m, 4): all markers at the goal, if ``pose_known``; ``target_known`` (m,): those that determined
+    it.
+    ``faces``: of the body, and the ``choice`` of the one that the law uses.
+    ``centre_weights`` (m,): the centre is the affine centroid of the markers by these weights, or, if they are zero,
+    the point ``centre_body`` (4,) of the body at the chain's zero; ``centre_target`` (4,): the centre at the goal.
+    ``stream``: of a moving goal, once a client has moved it.
+    ``plan``: path of a planned law, for a body that was at ``start_points`` (m, 4); ``plan_s``: current time on it.
+    ``goal_joints`` (n,): joints at the end of a plan.
     """
 
     law: str
@@ -201,8 +208,9 @@ class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
 class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):
     """Incidences of the body with the scene, and a second task in their null space.
 
-    ``kinds`` (k,), ``markers`` (k, 3), ``fixed`` (k, 3, 4) as in `control.incidence.IncidenceTask`; ``names`` (k,) for
-    people. Second task: ``joints`` (n,) where ``joints_wanted`` (n,) is 1; ``set_points`` (c, m, 2) ideal pixels where
+    ``kinds`` (k,), ``markers`` (k, 3), ``fixed`` (k, 3, 4): as in `control.incidence.IncidenceTask`.
+    ``names`` (k,): for messages to people.
+    Second task: ``joints`` (n,) where ``joints_wanted`` (n,) is 1; ``set_points`` (c, m, 2) ideal pixels where
     ``wanted`` (c, m) is 1.
     """
 
@@ -218,42 +226,43 @@ class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):
 
 
 class PoseMeasurement(Leased, eq=False, kw_only=True):
-    """Goes to configurations and looks from there at rest; see `core.sources.measure_at_pose`."""
+    """Moves to configurations and measures there at rest; see `core.sources.measure_at_pose`."""
 
     id: str
     phase: Literal["move", "settle", "collect", "return", "finish"]
     target: FloatArray
     phase_ns: int
     start: FloatArray
-    """Measured positions when the current move began."""
+    """Measured positions when the current move started."""
     sums: ObservationStatistics
     joint_sum: FloatArray
     joint_frames: int = 0
     lost_ns: int = 0
-    lost_camera: str = ""  # which has seen too few markers since lost_ns; 0: none has
+    lost_camera: str = ""  # a camera with too few visible markers since lost_ns; 0: none
     silent_ns: int = 0
-    """When some camera was last known never to have delivered."""
+    """Last time at which some camera was known never to have delivered."""
 
 
 class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
-    """The calibration programme: joint after joint, stop after stop, then all joints at once (``joint`` is their
+    """The calibration programme: joint after joint, stop after stop, then all joints at once (``joint`` is then their
     number). ``k`` counts steps from the base, and the stops of all joints.
 
     ``last``, ``before`` (p, c, m, 2) [px], NaN where unseen: the markers at the two outermost stops of this side, for
-    each of the p positions of the spread joint (1 without), at the offsets ``last_at``, ``before_at`` from the base.
+    each of the p positions of the spread joint (1 without one), at the offsets ``last_at``, ``before_at`` from the
+    base.
     """
 
     joint: int
     side: int
     k: int
     count: int
-    """Stops planned on this side."""
+    """Number of stops planned on this side."""
     step: float
-    """Between stops of this side [rad or m]; 0 before the probe has shown how far it may go."""
+    """Distance between stops of this side [rad or m]; 0 until the probe has determined the range."""
     reach: FloatArray
-    """How far the joint may go upwards and downwards (2,), where it is planned from visibility."""
+    """Range of the joint upwards and downwards (2,), if it is planned from visibility."""
     turn: int
-    """Position of the spread joint."""
+    """Index of the spread joint's position."""
     seen_turns: int
     base_pixels: FloatArray
     last: FloatArray
@@ -262,19 +271,19 @@ class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
     before_at: float
     lowest: FloatArray
     highest: FloatArray
-    """Range really visited, by joint."""
+    """Range actually visited, by joint."""
     stops: IntArray
-    """Stops recorded, by joint."""
+    """Number of stops recorded, by joint."""
     motion_sigmas: FloatArray
     """Largest motion in the images between base and a stop, in sigmas, by joint."""
     sigma_px: float
-    """Of one marker at a stop, median."""
+    """Median sigma [px] of one marker at a stop."""
     slope_sums: FloatArray
     """Sums (n, c, m, 2) over a joint's stops of its offset from the base times the markers' motion [rad px or m px]."""
     slope_weights: FloatArray
     """Sums (n, c, m) of the squared offsets."""
     way_frames: list[WayFrame] = []
-    """Of the way to the next stop, with the joint samples (n,) at ``way_ns``."""
+    """Frames on the path to the next stop, with the joint samples (n,) at ``way_ns``."""
     way_ns: list[int] = []
     way_joints: list[FloatArray] = []
 
@@ -285,12 +294,12 @@ class CheckMotion(PoseMeasurement, tag="checking", eq=False, kw_only=True):
     targets: FloatArray
     index: int
     seen: int = 0
-    """Stops at which every camera saw enough."""
+    """Number of stops at which every camera saw enough."""
     reset_zeros: bool = False
 
 
 class TeachingState(ObservationStatistics, eq=False):
-    """Averaging of a goal that is being shown."""
+    """Averaging of a goal that is being taught."""
 
     name: str
     request: int
@@ -299,13 +308,14 @@ class TeachingState(ObservationStatistics, eq=False):
 
 
 class GoalResolution(msgspec.Struct, eq=False, kw_only=True):
-    """A target that is being resolved in the model's frame, a part of the work after the other (`core.goals.resolve`).
+    """Resolution of a target in the model's frame, one part of the computation after the other (`core.goals.resolve`).
 
-    From a body at ``start`` (m, 4) with its ``faces``, the arm at ``joints`` (n,), corrected, with its ``operators``
-    (n, 4, 4). ``part``: the next one; ``rounds``: of least squares done. What comes out: ``set_points`` (c, m, 2) ideal
-    pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1: the whole body at the goal, where
-    ``pose_known``, and the ``displacement`` (4, 4) that takes it there; ``targets`` (m, 4) where ``known`` (m,): what
-    fixed it; ``face`` (3,): three of these that span a face.
+    Start: the body at ``start`` (m, 4) with its ``faces``, the arm at ``joints`` (n,), corrected, with its
+    ``operators`` (n, 4, 4). ``part``: the next part; ``rounds``: least-squares iterations done.
+
+    Results: ``set_points`` (c, m, 2) ideal pixels with ``wanted`` (c, m) 1 or 0; ``points`` (m, 4) of height 1:
+    the whole body at the goal, if ``pose_known``, and the ``displacement`` (4, 4) from its start; ``targets`` (m, 4)
+    where ``known`` (m,): the points that determined it; ``face`` (3,): three of these that span a face.
     """
 
     joints: FloatArray
@@ -329,10 +339,11 @@ Purpose = Literal["reply", "enqueue", "queue", "ahead", "again"]
 
 
 class PlanJob(msgspec.Struct, eq=False, kw_only=True):
-    """A goal that is being resolved, then planned, and the ``source`` that it comes to.
+    """A goal that is being resolved, then planned, and the resulting ``source``.
 
-    ``purpose``: to answer ``request``; to queue it, which answers ``request``; the next one of the queue; the one after
-    this, ahead; the active one anew. From ``joints`` (n,) with the body at ``points`` (m, 4).
+    ``purpose``: to answer ``request``; to queue the goal, which answers ``request``; the next goal of the queue; the
+    goal after the active one, ahead of time; or the active one again. Planned from ``joints`` (n,) with the body at
+    ``points`` (m, 4).
     """
 
     request: int
@@ -358,7 +369,7 @@ Source = (
 
 
 class CoreState(msgspec.Struct, eq=False):
-    """All state of the core: the numbers that kernels work on in a ``block``, and the rest."""
+    """The complete state of the core: the numbers that kernels use in a ``block``, and the rest."""
 
     version: int
     block: Block
@@ -375,10 +386,10 @@ class CoreState(msgspec.Struct, eq=False):
     source: Source
     queue: list[Goal]
     queued_until_ns: dict[str, int]
-    """When the leases of queued goals run out, by id."""
+    """Times at which the leases of queued goals expire, by id."""
     planning: PlanJob | None
     waiting: list[Request]
-    """Answered once the goal that is being planned has its answer."""
+    """Requests that are answered after the goal that is being planned."""
     ahead: ServoGoal | None
     """The next goal of the queue, planned from where the active one ends."""
     not_ahead: str
@@ -387,7 +398,7 @@ class CoreState(msgspec.Struct, eq=False):
     held: bool
     stopped: bool
     stop_reason: Reason | None
-    """Why the core stopped the arm; None where somebody did."""
+    """Why the core stopped the arm; None if a person did."""
     fault: list[Reason]
     driver_request: str
     loads: JointLoadStatistics | None
@@ -397,23 +408,23 @@ class CoreState(msgspec.Struct, eq=False):
     pending_reanchored: tuple[str, ...]
     """Of ``pending_model``: see `cycle.ModelUpdate`."""
     mobile: list[MobileCamera | None]
-    """By camera; None for those that stand for good."""
+    """By camera; None for permanently static cameras."""
     adjusted: tuple[str, ...]
-    """Mobile cameras that ``model`` has elsewhere than the model of its epoch that was handed in."""
+    """Mobile cameras whose matrix in ``model`` differs from the model of its epoch as it was handed in."""
     friction_of: str = ""
-    """The goal for which friction is compensated; empty: for none."""
+    """The goal for which friction is compensated; empty: none."""
     target: TargetBody | None = None
-    """What moves by itself and is followed; None before a goal has named it."""
+    """The target body that moves on its own and is followed; None before a goal has named it."""
 
     @property
     def history(self) -> JointHistory:
-        """The joint samples of late: arrays of the block, and how many there are now."""
+        """The recent joint samples: arrays of the block, and their current count."""
         block = self.block
         return JointHistory(block.history_ns, block.history_positions, block.numbers.history_count)
 
 
 def initial_state(settings: CoreSettings) -> CoreState:
-    """The state before the first step: nothing known, nothing allowed."""
+    """The state before the first step: no estimates, and no motion allowed."""
     n = len(settings.joint_names)
     state = CoreState(
         version=STATE_VERSION,
@@ -461,7 +472,7 @@ def initial_state(settings: CoreSettings) -> CoreState:
 
 
 def share_sights(state: CoreState) -> None:
-    """What is known of the cameras, and their newest frames, lie in the block from here on."""
+    """Move the cameras' estimates and their newest frames into the block."""
     block, frames = state.block, state.watching.sightings
     markers, rows = (state.cameras[0].sigma.size, frames[0].seen.size) if frames else (0, 0)
     block.begin_sights(markers, rows)

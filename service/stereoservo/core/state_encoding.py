@@ -1,4 +1,4 @@
-"""The state of the core as bytes, and states that former versions of this program wrote."""
+"""The state of the core as bytes, and the conversion of states written by former versions of this program."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_sights
 
 OLDEST_VERSION = 6
-"""Of states that are read."""
+"""Oldest version of states that can be read."""
 
 
 class StateVersionError(ValueError):
-    """A state of another version of this program; ``version`` is its own."""
+    """A state of another version of this program; ``version`` is the state's version."""
 
     def __init__(self, version: int) -> None:
         super().__init__(
@@ -28,13 +28,13 @@ class StateVersionError(ValueError):
 
 
 class _Versioned(msgspec.Struct):
-    """What every state says of itself, whatever else it holds."""
+    """The version, which every state contains, whatever else it holds."""
 
     version: int
 
 
 KEPT = (Block, CameraEstimate, CameraMonitor, CameraTiming)
-"""What is written out by its ``kept``."""
+"""Types that are written out by their ``kept``."""
 
 
 def _encode_hook(value: object) -> object:
@@ -61,7 +61,7 @@ def encode_state(state: CoreState) -> bytes:
 
 def decode_state(data: bytes) -> CoreState:
     """Inverse of :func:`encode_state`. Raises StateVersionError, and anything on damaged bytes."""
-    # Asked first: a state of another version may hold other fields, too.
+    # Read first: a state of another version may have other fields, too.
     version = msgspec.msgpack.decode(data, type=_Versioned).version
     if not OLDEST_VERSION <= version <= STATE_VERSION:
         raise StateVersionError(version)
@@ -71,15 +71,15 @@ def decode_state(data: bytes) -> CoreState:
     share_sights(state)
     job = state.planning
     if job is not None and job.purpose == "again" and isinstance(state.source, ServoGoal):
-        job.source = state.source  # written twice, it is one
+        job.source = state.source  # written twice, but one object
     return state
 
 
-MOVED_IN_VERSION_7 = ("stop_reason",)  # a state of version 6 holds it elsewhere
+MOVED_IN_VERSION_7 = ("stop_reason",)  # in a state of version 6 it is elsewhere
 
 
 def is_recorded(state: CoreState, data: bytes) -> bool:
-    """Whether ``data`` is this state bit for bit, in the fields that were there when it was written."""
+    """Whether ``data`` is this state bit for bit, in the fields that existed when it was written."""
     held = _as_of_now(msgspec.msgpack.decode(data))
     now, recorded = (msgspec.msgpack.decode(encode_state(s)) for s in (state, decode_state(data)))
     blocks = [[s["block"][name] for name in now["block"] if name in held["block"]] for s in (now, recorded)]
@@ -88,7 +88,7 @@ def is_recorded(state: CoreState, data: bytes) -> bool:
 
 
 def _as_of_now(state: dict[str, Any]) -> dict[str, Any]:
-    """A state with what it holds, in the places of this version."""
+    """A state of a former version with its values in the places of the current version."""
     if state["version"] < 7:
         state["stop_reason"] = None
     return state if state["version"] >= 10 else state | {"block": _block_of(state)}
@@ -107,18 +107,18 @@ BEFORE_VERSION_10 = {
     "following_excess": "contact.following_excess", "contact_low": "contact.low", "contact_high": "contact.high",
     "efforts": "contact.efforts", "following_errors": "contact.following_errors",
 }  # fmt: skip
-"""Where a state of before has what is in the block now; empty: under the same name."""
+"""Places in former states of the values that are now in the block; empty: same name."""
 
 
 KNOWN_BY = {
     "last_positions": "followed", "silent_from": "silence_known", "efforts": "tells_efforts",
     "following_errors": "tells_following",
 }  # fmt: skip
-"""What could be None, and what tells now that it is."""
+"""Values that could be None in former states, and the flags that replace None now."""
 
 
 def _block_of(state: dict[str, Any]) -> dict[str, Any]:
-    """What was no block before, as one; arrays still encoded."""
+    """The block, from the separate values of a former state; arrays still encoded."""
     block: dict[str, Any] = {}
     for name, place in BEFORE_VERSION_10.items():
         *path, last = (place or name).split(".")
@@ -146,7 +146,7 @@ FRICTION_BEFORE_VERSION_12 = {
 
 
 def _with_run(state: dict[str, Any]) -> dict[str, Any]:
-    """A state of before version 12, which had how a law gets on with its goal, and friction beside the block."""
+    """Convert a state before version 12, in which a law's progress and friction were stored beside the block."""
     source, friction = state["source"], state.get("friction")
     block = dict(state["block"])
     if "moved_s" in source:
@@ -167,8 +167,8 @@ def _with_run(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
-    """A state of before, with what it did not hold yet; arrays still encoded. Raises StateVersionError for one in the
-    midst of trial motions, whose course is another one now.
+    """A state of a former version completed by the missing values; arrays still encoded. Raises StateVersionError for a
+    state recorded during trial motions, because their programme has changed.
     """
     state = _with_round_due(state, version)
     if version >= 12:
@@ -191,7 +191,7 @@ def _of_this_version(state: dict[str, Any], version: int) -> dict[str, Any]:
 
 
 def _with_round_due(state: dict[str, Any], version: int) -> dict[str, Any]:
-    """A state of before version 13, which had whether a round of frames is due beside the block."""
+    """Convert a state before version 13, in which the flag ``round_due`` was stored beside the block."""
     if version < 10:
         return state  # it has no block yet
     due = int(state["watching"].get("due", False))

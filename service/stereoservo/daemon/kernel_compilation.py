@@ -615,7 +615,7 @@ def _wait_for_others() -> None:
 
 
 def warm_up_laws(*, own: bool = True) -> None:
-    """Compile, or load from numba's cache, the kernels of all laws, limited rates included; without ``own``: of those
+    """Compile, or load from numba's cache, the kernels of all laws, limited rates included; without ``own`` only those
     of other distributions.
     """
     operators = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
@@ -638,7 +638,7 @@ def warm_up_laws(*, own: bool = True) -> None:
             law.step(scene, task, Options(1.0, 0.004, rotation_rate=1e-3, translation_rate=1e-3))
         except (
             Exception
-        ) as error:  # a third party's law that cannot step: listed with its error, the others go on
+        ) as error:  # a third party's law that cannot step: listed with its error, the others continue
             LAWS.disable(name, f"its step raised {type(error).__name__}: {error}")
 
 

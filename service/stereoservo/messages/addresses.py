@@ -1,5 +1,5 @@
-"""Addresses of devices (URLs of streams, serial ports on a network, endpoints), which show themselves without what they
-keep secret.
+"""Addresses of devices (URLs of streams, serial ports on a network, endpoints), which are displayed without their
+secrets.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 from urllib.parse import SplitResult, quote, unquote, unquote_to_bytes
 
 HIDDEN = "***"
-"""Stands where user, password or token are left out."""
+"""Placeholder for an omitted user, password or token."""
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
 _HOST = re.compile(
     r"(?P<host>\[[0-9A-Fa-f:.]+(?:%[A-Za-z0-9._~%-]+)?\]|(?:[A-Za-z0-9._~!$&'()*+,;=-]|%[0-9A-Fa-f]{2})*)"
@@ -34,14 +34,16 @@ _BEHIND = (
 
 
 class AddressError(ValueError):
-    """A text is no usable URL; tells why and what would be valid, without anything secret."""
+    """A text is no usable URL; the message contains the cause and valid forms, and no secrets."""
 
 
 class Address(str):
-    """An address as it may be shown: ``***`` for user and password, and from the first parameter that names one on.
+    """An address in its displayable form: ``***`` replaces user and password, and everything from the first parameter
+    that names one of them.
 
-    The text of this string, and so all that is printed, formatted, joined, encoded or compared of it, is that shown
-    form. Who connects takes ``unredacted`` or :meth:`parsed`. Any text is taken, also one that is no address.
+    The text of this string, and so everything that is printed, formatted, joined, encoded or compared, is the
+    displayable form. Code that connects uses ``unredacted`` or :meth:`parsed`. Any text is accepted, also one that is
+    no address.
     """
 
     __slots__ = ("_given",)
@@ -59,14 +61,14 @@ class Address(str):
 
     @property
     def unredacted(self) -> str:
-        """The address as it was given, for who connects."""
+        """The address as it was given, for the code that connects."""
         return self._given
 
     def parsed(self) -> SplitResult:
-        """The URL for a client: user and password percent-encoded, so are blanks and letters beyond ASCII of the path.
+        """The URL for a client: user and password are percent-encoded, as are blanks and non-ASCII letters of the path.
 
-        User and password are what stands before the last ``@``, also with a ``#`` in it, and with a ``/`` or ``?``
-        where it cannot be read otherwise. Raises AddressError.
+        User and password are the text before the last ``@``, also with a ``#`` in it, and with a ``/`` or ``?`` if no
+        other interpretation is possible. Raises AddressError.
         """
         scheme, userinfo, rest, problem = _read(self._given)
         if not scheme:
@@ -95,20 +97,22 @@ class Address(str):
         return SplitResult(scheme.lower(), authority, path, query, fragment)
 
     def digest(self) -> str:
-        """Eight hexadecimal digits of what is behind the shown form, user, password and their parameters left out: they
-        tell two streams of one server apart, and nothing of its secrets.
+        """Eight hexadecimal digits of the part that the displayable form omits, except user, password and their
+        parameters: they distinguish two streams of one server and reveal no secrets.
         """
         rest = _read(self._given).rest
         kept = _VALUE.sub(lambda found: "" if _SECRET_KEY.search(unquote(found[1])) else found[0], rest)
         return hashlib.sha256(kept.encode(errors="surrogatepass")).hexdigest()[:8]
 
     def hidden_in(self, text: str) -> str:
-        """``text``, such as a library's error, with this address in its shown form."""
+        """``text``, such as a library's error, with this address replaced by its displayable form."""
         return text.replace(self._given, self) if self._given else text
 
 
 def without_secrets(value: Any) -> Any:
-    """Options of a driver as they may be shown: addresses in their shown form, ``***`` for what is named a password."""
+    """Options of a driver in displayable form: addresses in their displayable form, ``***`` for options named as a
+    password.
+    """
     if isinstance(value, str):
         return str(Address(value))
     if isinstance(value, Mapping):
@@ -129,7 +133,7 @@ class _Reading(NamedTuple):
 
 
 def _read(text: str) -> _Reading:
-    """Scheme, user and password (None: none), and what follows them; ``problem``: why that is not certain."""
+    """Scheme, user and password (None: none), and the text after them; ``problem``: why the result is uncertain."""
     match = _SCHEME.match(text)
     if match is None:
         return _Reading("", None, text, "")
@@ -156,7 +160,7 @@ def _read(text: str) -> _Reading:
 
 
 def _split(rest: str) -> tuple[str, str]:
-    """What stands before the first of ``/?#``, and the rest with it."""
+    """The text before the first of ``/?#``, and the rest including it."""
     end = min((k for k in map(rest.find, "/?#") if k >= 0), default=len(rest))
     return rest[:end], rest[end:]
 
@@ -175,7 +179,7 @@ def _shown(text: str) -> str:
     authority, tail = _split(rest)
     host, colon, _ = authority.partition(":")
     found = _HOST.fullmatch(authority)
-    if found is None and colon:  # a password whose host was forgotten
+    if found is None and colon:  # a password whose host is missing
         return f"{scheme}://{host}:{HIDDEN}"
     if found is not None and ":" in rest.rpartition("@")[0] and not _NO_USER.fullmatch(found["host"]):
         return f"{scheme}://{host}/{HIDDEN}"  # host.name:8080/a@b, or first.last:8080/a and a host
@@ -183,7 +187,7 @@ def _shown(text: str) -> str:
 
 
 def _without_parameters(text: str) -> str:
-    """``text`` up to the first parameter that names a user, password or token: nobody knows where its value ends."""
+    """``text`` up to the first parameter that names a user, password or token: the end of its value is unknown."""
     for match in _KEY.finditer(text):
         if _SECRET_KEY.search(unquote(match[0])):
             return text[: match.start()] + HIDDEN

@@ -21,7 +21,7 @@ SCHEMA = 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 LARGEST = 1e9
 MAX_MARKERS = 256
-"""Markers of a cell, on the arm and static: what a step of the loop does grows with them."""
+"""Largest number of markers of a cell, on the arm and static: the computing time of a step increases with it."""
 MAX_CAMERAS = 8
 MAX_JOINTS = 12
 
@@ -30,7 +30,7 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class CellFileError(Exception):
-    """A cell file cannot be used: names the file, the key, the value and what would have been valid."""
+    """A cell file cannot be used: the message contains the file, the key, the value and valid values."""
 
     def __init__(self, path: Path | str, key: str, message: str) -> None:
         where = f"{path}: {key}: " if key else f"{path}: "
@@ -66,11 +66,11 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[scene]``: ``static``, ids of markers that never move (e.g. a plate on a wall) and that the arm does not
-    carry. ``moves``: the marker body before cameras on the arm moves by itself once the cell is calibrated, on a
-    conveyor for instance.
+    """``[scene]``: ``static``, ids of markers that never move (e.g. a plate on a wall) and that the arm does not carry.
+    ``moves``: for cameras on the arm, the marker body in front of them moves on its own once the cell is calibrated,
+    for instance on a conveyor.
 
-    Calibration triangulates static markers; a camera that is bumped is known, and re-anchored, by them.
+    Calibration triangulates static markers; they are used to detect and relocalize a displaced camera.
     """
 
     static: tuple[Annotated[int, Meta(ge=0)], ...] = ()
@@ -90,12 +90,13 @@ class ServoSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     filter_s: NonNegative = 0.2
     """Time constant of the innovation filter [s]: 0 takes each frame as it is."""
     gate_sigma: Positive = 6.0
-    """Sights farther from their prediction are not used [sigmas]: as improbable in both axes of a pixel together (chi-
-    square of two freedoms) as so many sigmas are in one."""
+    """Observations farther from their prediction are rejected [sigmas]: the probability for both axes of a pixel
+    together (chi-square with two degrees of freedom) equals that of so many sigmas in one axis.
+    """
     reanchor: Literal["auto", "off"] = "auto"
     """Reaction to a camera that was moved: relocalized while the goal waits, or the goal is aborted."""
     priority: Annotated[int, Meta(ge=0, le=98)] = 50
-    """SCHED_FIFO priority of the servo process; 0 leaves the scheduler alone."""
+    """SCHED_FIFO priority of the servo process; 0 does not change the scheduler."""
 
 
 class JointLimit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -118,9 +119,9 @@ class KeepOut(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[safety.contact]``: collision detection by joint efforts and following errors.
 
-    ``effort`` [as the driver reports it] and ``following`` [rad or m]: thresholds by joint, in place of those that the
-    calibration's motions have taught. These are ``factor`` times what was seen there. A stop takes ``samples`` joint
-    samples beyond the threshold, one after the other.
+    ``effort`` [as the driver reports it] and ``following`` [rad or m]: thresholds by joint, in place of those learnt
+    from the calibration's motions. These are ``factor`` times the values observed there. The arm stops after
+    ``samples`` consecutive joint samples beyond the threshold.
     """
 
     effort: dict[str, float] = {}
@@ -131,14 +132,14 @@ class ContactSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[safety]``. A cell whose arm is simulated may leave ``limit`` out: then the machine's limits are the cell's."""
+    """``[safety]``. A cell with a simulated arm may omit ``limit``: then the machine's limits are the cell's."""
 
     limit: tuple[JointLimit, ...] = ()
     keep_out: tuple[KeepOut, ...] = ()
     coast_s: NonNegative = 0.5
-    """How long a law may run on prediction alone when no camera delivers."""
+    """How long a law may run on prediction alone while no camera delivers [s]."""
     joint_timeout_s: Positive = 0.1
-    """Age of the joint sample at which the arm brakes."""
+    """Age of the joint sample at which the arm brakes [s]."""
     position_margin: NonNegative = 0.01
     """Distance kept from every position limit [rad or m]."""
     speed_scale: Annotated[float, Meta(gt=0, le=1)] = 1.0
@@ -146,12 +147,11 @@ class SafetySection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``calibration.spread``: at each stop of the joints before ``joint``, that joint is measured at several
-    positions.
+    """``calibration.spread``: at each stop of the joints before ``joint``, that joint is measured at several positions.
 
-    A flat plate so becomes a body in space: 4 dots at 4 positions are 16 points (thesis fig. 5.16). The positions are
-    ``base ± range``, equally apart; ``range`` [rad or m] defaults to ``calibration.range`` of that joint, or 0.6 rad,
-    0.2 m.
+    A flat plate thus becomes a body in space: 4 dots at 4 positions are 16 points (thesis fig. 5.16). The positions are
+    in ``base ± range``, equally spaced; ``range`` [rad or m] defaults to ``calibration.range`` of that joint, or 0.6
+    rad, 0.2 m.
     """
 
     joint: str
@@ -162,8 +162,8 @@ class SpreadSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[calibration]``: trial motions. Each joint moves alone from ``base`` over ``base ± range``, then all at once.
 
-    A joint without a range goes outwards as far as the markers stay in every view, up to 0.6 rad or 0.2 m. Of a
-    simulated arm the base may be left out.
+    A joint without a range moves outwards as long as the markers remain in every view, up to 0.6 rad or 0.2 m. For a
+    simulated arm the base may be omitted.
     """
 
     base: dict[str, float] = {}
@@ -173,20 +173,22 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     settle_s: NonNegative = 0.15
     speed_scale: Annotated[float, Meta(gt=0, le=1)] = 0.5
     min_markers: Annotated[int, Meta(ge=3)] = 4
-    """Markers that each camera must see at a stop; fewer makes the joint back off."""
+    """Least number of markers that each camera must see at a stop; with fewer the joint moves back."""
     min_range: Positive = 0.05
-    """Smallest motion of a joint [rad or m] that can be used."""
+    """Smallest usable motion of a joint [rad or m]."""
     wait_s: Positive = 2.0
-    """How long to wait at a stop for enough frames before backing off."""
+    """How long to wait at a stop for enough frames before moving back [s]."""
     together: Annotated[int, Meta(ge=0, le=16)] = 16
-    """Stops, after those of single joints, at which all joints stand apart from the base by 0.4 to 0.8 of what each was
-    driven; 0: none."""
+    """Number of stops, after those of single joints, at which all joints are offset from the base by 0.4 to 0.8 of the
+    range in which each was driven; 0: none.
+    """
     spread: SpreadSection | None = None
     known_length: str = ""
     """One length of arm, markers or cameras, as WHAT:OF=METRES (markers:10,11=0.05, baseline:left,right=0.2,
-    prismatic:j1=1, a:j2=0.4, d:j3=0.1): by it the report tells the arm's Denavit-Hartenberg parameters in metres."""
+    prismatic:j1=1, a:j2=0.4, d:j3=0.1): with it the report gives the arm's Denavit-Hartenberg parameters in metres.
+    """
     refine: bool = False
-    """Refine the model on-line by the rest poses that goals leave behind; the calibrated one is kept."""
+    """Refine the model on-line by the rest poses after goals; the calibrated one is kept."""
 
 
 class TlsSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -212,9 +214,9 @@ class ZenohSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class RecordingSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[recording]``: the flight ring, the last minutes of the loop's steps, which is always recorded.
 
-    In at most ``ring_mib`` of the state directory, 0 switches it off, and only while ``reserve_mib`` of its disk stay
-    free. At a fault the ring is kept aside; of ``kept_faults`` faults, so that all takes up to
-    ``(1 + kept_faults) * ring_mib``.
+    It uses at most ``ring_mib`` of the state directory (0 switches it off), and only while ``reserve_mib`` of its disk
+    remain free. At a fault the ring is kept separately, for the last ``kept_faults`` faults, so that the total is at
+    most ``(1 + kept_faults) * ring_mib``.
     """
 
     ring_minutes: Annotated[float, Meta(gt=0, le=1440)] = 10.0
@@ -237,26 +239,28 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scene: SceneSection = SceneSection()
     recording: RecordingSection = RecordingSection()
     emulate: dict[str, Any] = {}
-    """``[emulate.drives]``, ``[emulate.cameras]``: what `stereoservo emulate` puts in the place of the hardware; of
-    the daemon's processes only a simulated camera reads it (``arm_options``).
+    """``[emulate.drives]``, ``[emulate.cameras]``: replacements of the hardware by `stereoservo emulate`; of the
+    daemon's processes only a simulated camera reads it (``arm_options``).
     """
 
     @property
     def arm_options(self) -> dict[str, Any]:
-        """Options that say which arm is simulated, if one is: of the emulated drives, else of the joint driver."""
+        """Options that describe the simulated arm, if there is one: those of the emulated drives, else of the joint
+        driver.
+        """
         drives = self.emulate.get("drives")
         return drives if isinstance(drives, dict) else self.joints.options
 
 
 def load_cell_file(path: Path) -> CellFile:
-    """Read and check a cell file. Raises CellFileError with file, key, value and what would have been valid."""
+    """Read and check a cell file. Raises CellFileError with file, key, value and valid values."""
     try:
         text = path.read_bytes()
     except OSError as error:
         raise CellFileError(path, "", f"cannot be read: {error.strerror}") from error
     try:
         tree = tomllib.loads(text.decode())
-    except ValueError as error:  # of TOML, UTF-8, or numbers of thousands of digits
+    except ValueError as error:  # of TOML, UTF-8, or numbers with thousands of digits
         raise CellFileError(path, "", f"is not TOML: {error}") from error
     except RecursionError as error:
         raise CellFileError(path, "", "is nested too deeply; a cell file has three levels") from error
@@ -305,7 +309,9 @@ def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
 
 
 def _check_known_length(text: str, cameras: list[str], path: Path | str) -> None:
-    """Check a known length, as far as a cell file tells; which markers and joints there are, the model knows."""
+    """Check a known length, as far as a cell file allows; the existing markers and joints are known only
+    to the model.
+    """
     try:
         known = known_length_of(text)
     except ValueError as error:
@@ -335,7 +341,7 @@ def _check_numbers(value: Any, key: str, path: Path | str) -> None:
 
 
 def check_limits(cell: CellFile, path: Path | str) -> None:
-    """Check the joints' limits, and what is stated by joint against them. Raises CellFileError."""
+    """Check the joints' limits, and the values stated by joint against them. Raises CellFileError."""
     seen: list[str] = []
     for limit in cell.safety.limit:
         if limit.joint in seen:
@@ -369,7 +375,7 @@ def check_limits(cell: CellFile, path: Path | str) -> None:
     for key, values in sections:
         for joint, value in values.items():
             if not seen and not cell.safety.limit:
-                continue  # checked once the driver has told its joints' limits
+                continue  # checked once the driver has reported its joints' limits
             if joint not in seen:
                 raise CellFileError(
                     path,
@@ -443,7 +449,7 @@ def check_joints(cell: CellFile, joint_names: tuple[str, ...], path: Path | str 
 
 
 def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
-    """The valid keys or values, where msgspec's text lacks them."""
+    """The valid keys or values, if msgspec's text lacks them."""
     path = ".".join(part.split("[")[0] for part in key.split("."))
     if "unknown field" in text:
         section = _SECTIONS.get(path)
@@ -466,7 +472,7 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
 
 
 def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:
-    """Valid values of a key that takes one of a few words."""
+    """Valid values of a key with a fixed set of values."""
     if section is None:
         return []
     info = msgspec.inspect.type_info(section)

@@ -13,9 +13,12 @@ Status = Literal["holds", "drifting", "recalibrate"]
 
 
 class FoundCause(msgspec.Struct, frozen=True):
-    """A detected change. ``ratio``: twice the log of its likelihood ratio, chi-square with ``freedoms`` where
-    nothing changed. ``effect_px``: rms change of the pixels. ``value``, ``deviation``: drift of a joint's zero
-    [rad or m]; of a camera or body the rotation angle [rad].
+    """A detected change.
+
+    ``ratio``: twice the log of its likelihood ratio, chi-square with ``freedoms`` degrees of freedom if nothing
+    changed.
+    ``effect_px``: rms change of the pixels.
+    ``value``, ``deviation``: drift of a joint's zero [rad or m]; of a camera or body the rotation angle [rad].
     """
 
     kind: Literal["camera", "cameras", "body", "marker", "joint", "unexplained"]
@@ -29,8 +32,8 @@ class FoundCause(msgspec.Struct, frozen=True):
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """Estimate of one cause by itself, significant or not, for the trend: parameters (q,), the upper triangle of
-    their information (q (q + 1) / 2,), and the rms change of the pixels that they make [px].
+    """Estimate of one cause alone, significant or not, for the trend: parameters (q,), the upper triangle of their
+    information (q (q + 1) / 2,), and the rms change of the pixels that they cause [px].
     """
 
     kind: CauseKind
@@ -43,9 +46,9 @@ class Drift(msgspec.Struct, frozen=True):
 class CheckReport(msgspec.Struct, frozen=True):
     """Result of a model check.
 
-    Residuals rms in expected sigmas: in all, ``sigmas``, and by joint, camera and marker (joint: over the stops that
-    it was away from the base). ``chi2`` is expected to be ``measurements``; ``explained_chi2``:
-    what the ``causes`` leave of it. ``limit_px``: change of the pixels that the cell can live with.
+    Residuals rms in expected sigmas: in total, ``sigmas``, and by joint, camera and marker (joint: over the stops at
+    which it was away from the base). ``chi2`` is expected to equal ``measurements``; ``explained_chi2``:
+    the remainder after the ``causes``. ``limit_px``: tolerated change of the pixels.
     """
 
     status: Status
@@ -69,8 +72,8 @@ class CheckReport(msgspec.Struct, frozen=True):
 
 
 class JointReset(msgspec.Struct, frozen=True):
-    """A joint whose zero was moved: its encoder was off by ``drift``, known to ``deviation``; the model's zero before
-    and after [rad or m].
+    """A joint whose zero was reset: its encoder was off by ``drift``, with standard deviation ``deviation``; the
+    model's zero before and after [rad or m].
     """
 
     joint: str
@@ -82,8 +85,8 @@ class JointReset(msgspec.Struct, frozen=True):
 
 
 class ZeroReset(msgspec.Struct, frozen=True):
-    """Zeros of joints moved in a new model: ``epoch``, from model ``from_epoch``. Residuals of the check rms in
-    expected sigmas before and after. ``model``: the new file.
+    """Joint zeros reset in a new model: ``epoch``, from model ``from_epoch``. Residuals of the check rms in expected
+    sigmas before and after. ``model``: the new file.
     """
 
     epoch: int

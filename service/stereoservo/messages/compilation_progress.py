@@ -1,5 +1,5 @@
-"""How far the processes of a cell that starts have got with compiling kernels: a small file of each in its runtime
-directory, which `status`, `run` and who starts a daemon read.
+"""Progress of the processes of a starting cell in compiling kernels: a small file of each process in its runtime
+directory, read by `status`, `run` and any program that starts a daemon.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ MAX_BYTES = 1 << 12
 
 
 class CompilationProgress(msgspec.Struct, frozen=True):
-    """Of the process ``part`` (``first``: what is needed before the cell is up; ``rest``: beside it; ``servo``) of the
-    daemon ``daemon`` (its process id): the number of kernels that are compiled or loaded, of about ``total``; 0 where
-    that is not known.
+    """Progress of the process ``part`` (``first``: kernels needed before the cell is up; ``rest``: compiled in
+    parallel; ``servo``) of the daemon ``daemon`` (its process id): the number of kernels that are compiled or loaded,
+    of about ``total``; 0 if unknown.
     """
 
     part: str
@@ -44,8 +44,8 @@ def progress_path(runtime: Path, part: str) -> Path:
 
 
 def read_progress(runtime: Path, daemon: int = 0) -> tuple[CompilationProgress, ...]:
-    """What the files in a runtime directory tell, of the daemon with this process id where one is given; what is not
-    there, or cannot be read, is left out.
+    """The progress records in a runtime directory, only those of the daemon with this process id if it is given;
+    missing and unreadable files are skipped.
     """
     found = []
     for path in sorted(runtime.glob(PATTERN)):
@@ -60,7 +60,7 @@ def read_progress(runtime: Path, daemon: int = 0) -> tuple[CompilationProgress, 
 
 
 class PatientWait:
-    """A time limit [s] that counts from the last news: what compiles, however slowly, is waited for."""
+    """A time limit [s] that restarts with every change, so that slow compilation does not time out."""
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
@@ -68,7 +68,7 @@ class PatientWait:
         self._until_s = time.monotonic() + limit_s
 
     def is_over(self, news: object) -> bool:
-        """Whether ``news`` (anything comparable) has been the same for longer than the limit."""
+        """Whether ``news`` (any comparable value) has not changed for longer than the limit."""
         now_s = time.monotonic()
         if news != self._news:
             self._news, self._until_s = news, now_s + self._limit_s

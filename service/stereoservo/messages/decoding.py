@@ -21,20 +21,20 @@ class DamagedError(Exception):
 
 @contextmanager
 def decoding(refusal: Callable[[str], Exception], passed: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Boundary around a decoder: any exception inside is raised as ``refusal(cause)``, with the cause in words.
+    """Boundary around a decoder: any exception inside is raised as ``refusal(cause)``, with the cause as text.
 
     DamagedError and the types ``passed``, which a decoder raises on purpose, are raised as they are.
     """
     try:
         yield
-    except Exception as error:  # a decoder may raise anything: its errors have no class in common
+    except Exception as error:  # a decoder may raise anything: its errors have no common class
         if isinstance(error, (DamagedError, *passed)):
             raise
         raise refusal(cause_of(error)) from error
 
 
 def cause_of(error: BaseException) -> str:
-    """Cause of an exception of a decoder, in words."""
+    """Cause of an exception of a decoder, as text."""
     if isinstance(error, DamagedError):
         return error.cause
     if isinstance(error, OSError) and error.strerror:
@@ -53,7 +53,7 @@ def cause_of(error: BaseException) -> str:
 class RecordBoundary:
     """Boundary around the handling of single records of ``source``, a context manager to be used for each of them.
 
-    A record whose handling raises is left out and counted (``refused``). ``log`` is called with the first, tenth,
+    A record whose handling raises is skipped and counted (``refused``). ``log`` is called with the first, tenth,
     hundredth … of them.
     """
 
@@ -66,7 +66,7 @@ class RecordBoundary:
 
     @property
     def note(self) -> str:
-        """Text on the records that were left out; empty where there are none."""
+        """Text on the skipped records; empty if there are none."""
         if self.refused == 0:
             return ""
         return f"{self._source}: {self.refused} records left out; the last one: {self._cause}"
@@ -83,7 +83,7 @@ class RecordBoundary:
         return True
 
     def refuse(self, error: Exception) -> None:
-        """Count a record whose handling raised ``error``, and log it where it is its turn."""
+        """Count a record whose handling raised ``error``, and log it if its number is one that is logged."""
         self.refused += 1
         self._cause = cause_of(error)[:500]
         if self._log is not None and self.refused == self._logged:

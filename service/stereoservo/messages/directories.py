@@ -17,7 +17,7 @@ CELL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 
 
 class DirectoryError(Exception):
-    """A directory or path cannot be used; the message has its path, the cause and what to set."""
+    """A directory or path cannot be used; the message contains its path, the cause and the setting to change."""
 
 
 class CellDirectories(NamedTuple):
@@ -74,7 +74,7 @@ class CellDirectories(NamedTuple):
 
     @property
     def state_lock(self) -> Path:
-        """Lock file that the supervisor holds, too: one daemon writes models, taught goals and records."""
+        """Lock file that the supervisor holds, too: only one daemon writes models, taught goals and records."""
         return self.state / "daemon.lock"
 
     @property
@@ -124,7 +124,7 @@ class CellDirectories(NamedTuple):
 
     @property
     def plant_orders_slot(self) -> Path:
-        """Newest orders to the simulated drives."""
+        """Newest commands to the simulated drives."""
         return self.runtime / "plant-orders.slot"
 
     def heartbeat_slot(self, process: str) -> Path:
@@ -144,7 +144,7 @@ class CellDirectories(NamedTuple):
         return self.runtime / f"preview-{camera}.slot"
 
     def preview_wanted_slot(self, camera: str) -> Path:
-        """Until when preview pictures of ``camera`` are wanted."""
+        """Time until which preview pictures of ``camera`` are requested."""
         return self.runtime / f"preview-wanted-{camera}.slot"
 
 
@@ -164,13 +164,13 @@ def state_root() -> Path:
     if given := os.environ.get(STATE_VARIABLE):
         return Path(given).absolute()
     given = os.environ.get("XDG_STATE_HOME", "")
-    # A relative path is to be ignored, says the specification of these directories.
+    # The specification of these directories requires that a relative path is ignored.
     base = Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
     return base / "stereoservo"
 
 
 def cell_directories(cell: str) -> CellDirectories:
-    """The directories of ``cell``; creates nothing. Raises DirectoryError for a name that cannot be one."""
+    """The directories of ``cell``; creates nothing. Raises DirectoryError for an invalid name."""
     if not CELL_NAME.fullmatch(cell):
         raise DirectoryError(f"cell name {cell!r}: letters, digits, '_' and '-' are valid, up to 64")
     return CellDirectories(cell, runtime_root() / cell, state_root() / cell)
@@ -183,7 +183,7 @@ def directories_of(cell: str) -> CellDirectories:
     """
     if not cell.endswith(".toml"):
         return cell_directories(cell)
-    import tomllib  # a stop by the cell's name does not wait for it
+    import tomllib  # imported here, so that a stop by the cell's name need not wait for it
 
     try:
         name = tomllib.loads(Path(cell).read_text(encoding="utf-8"))["cell"]["name"]
@@ -228,7 +228,7 @@ def _private(path: Path, variable: str) -> None:
 
 
 def check_socket_path(path: Path) -> None:
-    """Raise DirectoryError where the kernel could not bind ``path``."""
+    """Raise DirectoryError if the kernel could not bind ``path``."""
     length = len(os.fsencode(path))
     if length > SOCKET_PATH_MAX:
         raise DirectoryError(

@@ -25,7 +25,7 @@ from stereoservo.messages.run_record import how_it_ended, read_run
 
 MAX_INFO_BYTES = 1 << 16
 TELL_EVERY_S = 10.0
-"""How often who starts a daemon is told how many kernels it has compiled."""
+"""Interval [s] at which the number of compiled kernels is reported to the program that starts a daemon."""
 
 
 class DaemonInfo(msgspec.Struct, frozen=True):
@@ -41,7 +41,7 @@ class DaemonInfo(msgspec.Struct, frozen=True):
 
 
 class NotRunningError(Exception):
-    """No daemon runs for a cell; lists those that do. ``more``: what is known of the one that ran."""
+    """No daemon runs for a cell; the message lists the running ones. ``more``: what is known of the one that ran."""
 
     def __init__(self, cell: str, running: tuple[str, ...], more: str = "") -> None:
         super().__init__(
@@ -53,7 +53,7 @@ class NotRunningError(Exception):
 
 
 class DaemonError(Exception):
-    """A daemon that was started did not come up; carries its exit code and its output."""
+    """A started daemon did not come up; contains its exit code and its output."""
 
     def __init__(self, message: str, code: int | None, output: str) -> None:
         super().__init__(message)
@@ -62,7 +62,7 @@ class DaemonError(Exception):
 
 
 def daemon_info(directories: CellDirectories) -> DaemonInfo | None:
-    """Description of the running daemon; None where none runs, it is not ready yet, or its file cannot be read."""
+    """Description of the running daemon; None if none runs, it is not ready yet, or its file cannot be read."""
     with suppress(DamagedError), decoding(partial(DamagedError, directories.daemon)):
         if holder(directories.daemon_lock) is not None:
             return msgspec.json.decode(read_bounded(directories.daemon, MAX_INFO_BYTES), type=DaemonInfo)
@@ -87,7 +87,7 @@ def find_daemon(cell: str) -> DaemonInfo:
     """The daemon of ``cell``, a name or the path of a cell file. Raises NotRunningError, CellFileError."""
     name = cell
     if cell.endswith(".toml"):
-        from stereoservo.messages.cell_file import load_cell_file  # not for a client that gives a name
+        from stereoservo.messages.cell_file import load_cell_file  # not needed by a client that gives a name
 
         name = load_cell_file(Path(cell)).cell.name
     directories = cell_directories(name)
@@ -98,8 +98,8 @@ def find_daemon(cell: str) -> DaemonInfo:
 
 
 def last_words(directories: CellDirectories) -> str:
-    """Sentence on a daemon that is not there, with a space behind it: it takes no requests yet, or how its last run
-    ended; empty where there was none.
+    """Sentence, followed by a space, on a daemon that is not reachable: it does not accept requests yet, or how its
+    last run ended; empty if there was none.
     """
     pid = holder(directories.daemon_lock)
     if pid is not None:
@@ -117,7 +117,7 @@ def last_words(directories: CellDirectories) -> str:
 class DaemonProcess:
     """``stereoservo run`` as a child process; a context manager that ends it.
 
-    ``log``: file that takes its stderr (default: inherited).
+    ``log``: file that receives its stderr (default: inherited).
     """
 
     def __init__(
@@ -148,8 +148,8 @@ class DaemonProcess:
         timeout_s: float = 600.0,
         tell: Callable[[str], None] = lambda text: None,
     ) -> DaemonInfo:
-        """Wait until it accepts requests, as long as it compiles kernels: ``timeout_s`` counts from the last one.
-        ``tell`` gets a line where it has compiled more, each `TELL_EVERY_S`. Raises DaemonError with its output.
+        """Wait until it accepts requests: ``timeout_s`` counts from the last compiled kernel.
+        ``tell`` receives a line if more kernels were compiled, each `TELL_EVERY_S`. Raises DaemonError with its output.
         """
         wait, due_s = PatientWait(timeout_s), time.monotonic() + TELL_EVERY_S
         known: tuple[CompilationProgress, ...] = ()
@@ -179,11 +179,11 @@ class DaemonProcess:
         return tuple(one for folder in folders for one in read_progress(folder, self.process.pid))
 
     def output(self) -> str:
-        """Its log so far, where it logs into a file."""
+        """Its log so far, if it logs into a file."""
         return self._log.read_text(errors="replace").strip() if self._log is not None else ""
 
     def stop(self, how: signal.Signals = signal.SIGTERM, timeout_s: float = 20.0) -> int:
-        """Terminate it in good order; returns its exit code. Idempotent."""
+        """Terminate it regularly; returns its exit code. Idempotent."""
         if self.process.poll() is None:
             self.process.send_signal(how)
         try:

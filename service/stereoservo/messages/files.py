@@ -33,7 +33,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 
 def set_aside(path: Path) -> str:
-    """Rename a damaged file to ``NAME.damaged-<n>``; returns what was done, in words. Nothing is ever deleted."""
+    """Rename a damaged file to ``NAME.damaged-<n>``; returns a text on what was done. Nothing is ever deleted."""
     for n in range(1, MOST_SET_ASIDE):
         aside = path.with_name(f"{path.name}.damaged-{n}")
         if os.path.lexists(aside):
@@ -55,7 +55,7 @@ def with_checksum(document: bytes) -> bytes:
 def verify_checksum(data: bytes) -> None:
     """Compare the content of a JSON file with its ``crc32``. Raises ValueError.
 
-    Files without one, and those that another program has laid out anew, are not compared.
+    Files without one, and those reformatted by another program, are not compared.
     """
     match = _CHECKSUM.search(data, max(0, len(data) - 200))
     if match is None:
@@ -69,7 +69,7 @@ def verify_checksum(data: bytes) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise OSError where `write_atomically` cannot write a file: no such folder, or the path is not a file."""
+    """Raise OSError if `write_atomically` cannot write a file: the folder does not exist, or the path is not a file."""
     if not path.parent.is_dir():
         code = errno.ENOTDIR if path.parent.exists() else errno.ENOENT
         raise OSError(code, f"{os.strerror(code)}: a folder that exists is needed", str(path.parent))
@@ -86,9 +86,9 @@ def check_writable(path: Path) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` such that a reader, or a crash, leaves either the old file or the new one complete.
+    """Write ``data`` atomically: a reader finds either the old file or the new one complete, also after a crash.
 
-    Raises OSError, for a path that holds anything but a regular file, too: replacing a device would destroy it.
+    Raises OSError, also for a path that is not a regular file: replacing a device would destroy it.
     """
     check_writable(path)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)

@@ -1,7 +1,7 @@
-"""Goals and commands that a client may send, as strict structs used on the wire and inside the core.
+"""Goals and commands that a client may send, as strict structs used in messages and inside the core.
 
-Numbers are SI ([m], [rad], [s]) and pixels. Every struct refuses unknown fields. Non-finite numbers are refused by
-:func:`stereoservo.messages.wire.decode`, since JSON cannot carry them.
+Numbers are SI ([m], [rad], [s]) and pixels. Every struct rejects unknown fields. Non-finite numbers are rejected by
+:func:`stereoservo.messages.wire.decode`, since JSON cannot represent them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 GoalId = Annotated[str, Meta(pattern=r"^[0-9a-fA-F]{8}[0-9a-fA-F-]{0,28}$")]
 Positive = Annotated[float, Meta(gt=0)]
 Duration = Annotated[float, Meta(gt=0, le=86_400)]
-"""[s], a day at most."""
+"""Duration [s], at most a day."""
 Gain = Annotated[float, Meta(ge=1e-4, le=50)]
 Damping = Annotated[float, Meta(ge=0, lt=1)]
 Pixels = Annotated[float, Meta(ge=1e-4, le=1000)]
@@ -24,9 +24,9 @@ Fraction = Annotated[float, Meta(ge=1e-4, le=1)]
 
 LAW_TITLE = "LawName"
 LawName = Annotated[str, Meta(min_length=1, max_length=64, title=LAW_TITLE)]
-"""Of a law that is installed where the daemon runs: `CellInfo.laws` and the served schemas list them."""
+"""Name of a law that is installed where the daemon runs: `CellInfo.laws` and the served schemas list them."""
 DEFAULT_LAW = "cartesian3"
-"""Of cells that name none."""
+"""Law of cells that name none."""
 PointSource = Literal["triangulated", "predicted"]
 JacobianName = Literal["current", "desired", "mean", "fixed-depth"]
 ProfileName = Literal["linear", "exponential", "translation-first", "rotation-first", "planar-first"]
@@ -39,16 +39,18 @@ Pixel = tuple[float, float]
 class FeatureTarget(
     msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True
 ):
-    """Set-points: for each camera, marker id -> (u, v), raw pixels. ``model_epoch``: None, or refuse another model."""
+    """Set-points: for each camera, marker id -> (u, v), raw pixels. ``model_epoch``: the goal is refused with another
+    model; None: any model.
+    """
 
     set_points: dict[str, dict[int, Pixel]]
     model_epoch: Epoch | None = None
 
 
 class PointTarget(msgspec.Struct, frozen=True, tag="points", tag_field="kind", forbid_unknown_fields=True):
-    """Marker id -> homogeneous point in the model's projective frame; three or more, not on one line.
+    """Marker id -> homogeneous point in the model's projective frame; three or more, not collinear.
 
-    ``model_epoch``: of the model in whose frame they are.
+    ``model_epoch``: of the model in whose frame they are stated.
     """
 
     points: dict[int, Homogeneous]
@@ -58,11 +60,11 @@ class PointTarget(msgspec.Struct, frozen=True, tag="points", tag_field="kind", f
 class DisplacementTarget(
     msgspec.Struct, frozen=True, tag="displacement", tag_field="kind", forbid_unknown_fields=True
 ):
-    """A displacement of the marker body from its present pose: 4x4, row-major, projective, current -> goal.
+    """A displacement of the marker body from its current pose: 4x4, row-major, projective, current -> goal.
 
     Either in the frame of the model of ``model_epoch``, or in the projective basis of five markers ``basis`` of the
-    body, no four of them in a plane: in the coordinates in which these are e1 … e4 and (1, 1, 1, 1) now, so that no
-    calibration is in it.
+    body, no four of them coplanar: in the coordinates in which their current positions are e1 … e4 and (1, 1, 1, 1), so
+    that it does not depend on a calibration.
     """
 
     matrix: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
@@ -73,13 +75,16 @@ class DisplacementTarget(
 class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", forbid_unknown_fields=True):
     """A taught goal, by its name.
 
-    ``relative_to``: where it holds. None: the pixels as they were taught, with the same model. ``"workpiece"``:
-    relative to the ``common`` markers on the workpiece, which may have moved since. ``"cameras"``: the
-    ``common`` markers stood still, and the cameras have moved or were exchanged. ``common``: five ids or more, seen
-    when it was taught and now; empty: all that are both. ``lines``: edges of the workpiece instead of markers, or
-    beside them (then only those in ``common`` that are named), each by two ids whose pixels lie on it in every image;
-    the two need not be the same places in two images, nor then and now. ``planes``: faces of it, each by ids whose
-    points lie on it, one or more seen when it was taught and three or more, perhaps others, now.
+    ``relative_to``: the reference of the goal. None: the pixels as they were taught, with the same model.
+    ``"workpiece"``:
+    relative to the ``common`` markers on the workpiece, which may have moved since. ``"cameras"``: the ``common``
+    markers are static, and the cameras have moved or were exchanged.
+    ``common``: five ids or more, seen in teaching and now; empty: all that were seen both times.
+    ``lines``: edges of the workpiece instead of markers, or in addition to them (then only the markers named in
+    ``common``), each by two ids whose pixels are on the edge in every image;
+    the two points may differ between images, and between teaching and now.
+    ``planes``: faces of the workpiece, each by ids whose points are on it, one or more seen in teaching and three or
+    more, possibly others, now.
     """
 
     name: Name
@@ -92,7 +97,7 @@ class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", 
 
 
 class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", forbid_unknown_fields=True):
-    """Joint positions by joint name [rad or m]; joints left out stay where they are."""
+    """Joint positions by joint name [rad or m]; joints that are omitted do not move."""
 
     positions: dict[str, float]
 
@@ -100,9 +105,11 @@ class JointTarget(msgspec.Struct, frozen=True, tag="joints", tag_field="kind", f
 class Feature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A point, line or plane: the span of one, two or three points, specified in exactly one way.
 
-    ``markers``: of the moving body, as they move. ``points``: homogeneous, in the frame of the goal's ``model_epoch``.
-    ``pixels``: for each of two or more cameras the points' raw pixels, where they are. ``segments``: of a line, for
-    each of two or more cameras two raw pixels of its image, which need not be the same places in two images.
+    ``markers``: of the moving body; the feature moves with them.
+    ``points``: homogeneous, in the frame of the goal's ``model_epoch``.
+    ``pixels``: for each of two or more cameras the raw pixels of the points.
+    ``segments``: of a line, for each of two or more cameras two raw pixels of its image; the two points may differ
+    between images.
     """
 
     markers: Annotated[tuple[MarkerId, ...], Meta(max_length=3)] = ()
@@ -127,8 +134,7 @@ class IncidenceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class IncidenceTarget(
     msgspec.Struct, frozen=True, tag="incidence", tag_field="kind", forbid_unknown_fields=True
 ):
-    """Incidence constraints; the remaining degrees of freedom stay free, or serve ``secondary`` in their null
-    space.
+    """Incidence constraints; the remaining degrees of freedom are free, or serve ``secondary`` in their null space.
 
     ``secondary``: joint positions, or set-points, approached as far as the incidences allow.
     """
@@ -145,8 +151,8 @@ StreamedTarget = FeatureTarget | PointTarget
 class Centre(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Point of the body that moves on a straight line, specified in exactly one way.
 
-    ``markers``: their affine middle. ``point``: homogeneous, where it is now in the frame of the model of
-    ``model_epoch``, moving with the body.
+    ``markers``: their affine centroid. ``point``: homogeneous, its current position in the frame of the model of
+    ``model_epoch``; it moves with the body.
     """
 
     markers: tuple[MarkerId, ...] = ()
@@ -158,7 +164,7 @@ class AdaptiveGain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Adaptive gain ``λ(e) = (near − far) exp(−slope·e / (near − far)) + far``: ``near`` at no error, ``far`` at a
     large one [1/s].
 
-    ``slope`` [1/s per 100 px]: how fast it falls from ``near``.
+    ``slope`` [1/s per 100 px]: how fast it decreases from ``near``.
     """
 
     near: Gain
@@ -169,22 +175,26 @@ class AdaptiveGain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A goal as a client states it; for fields that are None the cell's default applies.
 
-    ``lease_s``: the goal is aborted when no renewal arrives for so long (None: no lease). ``tolerance_px``: largest
-    pixel distance over visible markers and cameras, held ``hold_frames`` frames. ``speed_scale`` may only lower.
-    ``cameras``: whose images the law may use (None: all). ``profile``: of laws that follow a plan; ``posture``
-    likewise: joint positions by name [rad or m] near which the plan ends, where the arm reaches the goal by several
-    postures; joints left out are near to where they are now.
+    ``lease_s``: the goal is aborted if no renewal arrives for so long (None: no lease).
+    ``tolerance_px``: largest pixel distance over visible markers and cameras, held for ``hold_frames`` frames.
+    ``speed_scale``: may only lower the speed.
+    ``cameras``: whose images the law may use (None: all).
+    ``profile``: for laws that follow a plan.
+    ``posture``: for laws that follow a plan: joint positions by name [rad or m] near which the plan ends, if the arm
+    reaches the goal in several postures; omitted joints end near their current positions.
 
-    ``damping`` κ: share of the joints' measured velocity, less what a moving target or a plan asks for, that is taken
+    ``damping`` κ: fraction of the joints' measured velocity, less that of a moving target or a plan, that is subtracted
     from the law's (thesis 9.3, `control.pd`). An error then decays at ``gain / (1 + damping)``.
 
-    ``blend_px``: hand over to the next queued goal as soon as the error is below it, without stopping; without one it
-    is reached as usual. ``acknowledge_s``: reached, the arm holds there and the queue waits until a client
-    acknowledges (a gripper has closed), at most so long; then, and where it is not reached, the queue is cancelled.
+    ``blend_px``: start the next queued goal as soon as the error is below it, without stopping; without a next goal it
+    is reached as usual.
+    ``acknowledge_s``: when the goal is reached, the arm holds there and the queue waits until a client acknowledges (a
+    gripper has closed), at most so long; after that time, and if the goal is not reached, the queue is cancelled.
 
-    ``follow_markers``: of a target that moves by itself, which the goal goes with. Cameras on the arm: of the body that
-    they see; else of another body, five or more. ``follow_seen``: for each camera, where these markers are (raw pixels)
-    when the target stands where the goal's set-points hold; none: where they are when it begins.
+    ``follow_markers``: of a target that moves on its own and is followed by the goal. With cameras on the arm: markers
+    of the body that they see; else of another body, five or more.
+    ``follow_seen``: for each camera, the raw pixels of these markers at the target's pose for which the goal's
+    set-points are stated; none: their pixels when the goal starts.
     """
 
     id: GoalId
@@ -214,7 +224,7 @@ class Goal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Approach(msgspec.Struct, frozen=True):
     """Closest approach of the planned path to a limit: clearance ``room`` [``unit``] at path parameter ``share``.
 
-    ``subject``: the joint, keep-out or camera; ``marker``: the one that comes near, where one does.
+    ``subject``: the joint, keep-out or camera; ``marker``: the marker that comes near, if there is one.
     """
 
     code: str
@@ -230,7 +240,7 @@ class Approach(msgspec.Struct, frozen=True):
 class PlanReport(msgspec.Struct, frozen=True):
     """The plan of a goal: its duration ``seconds``, its path, and the closest approach to every limit.
 
-    ``shares`` [0, 1] and ``joints`` by name at these; ``pixels``: camera -> marker -> raw pixels there.
+    ``shares`` [0, 1] and ``joints`` by name at these path parameters; ``pixels``: camera -> marker -> raw pixels there.
     """
 
     law: str
@@ -257,8 +267,8 @@ class RenewGoal(msgspec.Struct, frozen=True, tag="renew", tag_field="command", f
 class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command", forbid_unknown_fields=True):
     """Move the set-points of the active goal: a moving target, streamed at 30 to 200 Hz. It also renews the lease.
 
-    ``stamp_s``: the client's time of this set-point; from two of them the target's velocity is fed forward. None: the
-    time of arrival is used.
+    ``stamp_s``: the client's time of this set-point; the target's velocity is computed from two stamps and fed forward.
+    None: the time of arrival is used.
     """
 
     id: GoalId
@@ -281,7 +291,7 @@ class CancelGoal(msgspec.Struct, frozen=True, tag="cancel", tag_field="command",
 
 
 class Stop(msgspec.Struct, frozen=True):
-    """Payload of ``command/stop``: who stops the arm, for people. Any other payload stops it as well."""
+    """Payload of ``command/stop``: who stops the arm, as text. Any other payload stops it as well."""
 
     operator: Annotated[str, Meta(pattern="^[A-Za-z0-9_. -]{1,64}$")]
 
@@ -303,7 +313,7 @@ class Disable(msgspec.Struct, frozen=True, tag="disable", tag_field="command", f
 
 
 class Reset(msgspec.Struct, frozen=True, tag="reset", tag_field="command", forbid_unknown_fields=True):
-    """FAULT -> INACTIVE, where the cause has gone."""
+    """FAULT -> INACTIVE, if the cause has gone."""
 
 
 class Jog(msgspec.Struct, frozen=True, tag="jog", tag_field="command", forbid_unknown_fields=True):
@@ -314,9 +324,10 @@ class Jog(msgspec.Struct, frozen=True, tag="jog", tag_field="command", forbid_un
 
 
 class AuxiliarySpec(msgspec.Struct, frozen=True):
-    """An auxiliary joint (a gripper) or a digital output, as its driver declares it: outside the model and the laws.
+    """An auxiliary joint (a gripper) or a digital output, as its driver declares it: not part of the model and the
+    laws.
 
-    ``kind``: ``revolute`` [rad], ``prismatic`` [m], or ``digital``, 0 or 1. ``low``, ``high``: what may be ordered;
+    ``kind``: ``revolute`` [rad], ``prismatic`` [m], or ``digital``, 0 or 1. ``low``, ``high``: permitted range;
     ``velocity``: at which the driver moves the joint.
     """
 
@@ -330,7 +341,7 @@ class AuxiliarySpec(msgspec.Struct, frozen=True):
 class OrderAuxiliary(
     msgspec.Struct, frozen=True, tag="auxiliary", tag_field="command", forbid_unknown_fields=True
 ):
-    """Order positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name."""
+    """Command positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name."""
 
     values: dict[str, float]
 
@@ -348,10 +359,10 @@ class Calibrate(
 ):
     """Run the trial motions of the cell file and fit a model.
 
-    ``check``: run the short check motion instead, and report whether the model still holds. ``lease_s``: the motion
-    ends when no renewal arrives for so long (None: no lease); the fit that follows it needs no client.
-    ``reset_zeros``, with ``check``: where the zeros of joints have drifted, and nothing else, make a model with
-    moved zeros.
+    ``check``: run the short check motion instead, and report whether the model is still valid.
+    ``lease_s``: the motion ends if no renewal arrives for so long (None: no lease); the subsequent fit needs no client.
+    ``reset_zeros``, with ``check``: if the zeros of joints have drifted, and nothing else has changed, make a model
+    with corrected zeros.
     """
 
     id: GoalId
@@ -363,8 +374,8 @@ class Calibrate(
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbid_unknown_fields=True):
     """Store the current observations, averaged over ``frames`` frames a camera, as a goal named ``name``.
 
-    ``tool``: the markers by which the goal is meant, features of the tool rather than the hand's own; three or more.
-    The gateway keeps them; to the core they mean nothing.
+    ``tool``: the markers that define the goal, features of the tool rather than of the hand; three or more.
+    They are stored by the gateway and not used by the core.
     """
 
     name: Name
@@ -375,9 +386,9 @@ class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbi
 class ReanchorRefused(
     msgspec.Struct, frozen=True, tag="reanchor_refused", tag_field="command", forbid_unknown_fields=True
 ):
-    """Reply of the fit to the event ``reanchor`` where it cannot relocalize the cameras; they stay suspended.
+    """Reply of the fit to the event ``reanchor`` if it cannot relocalize the cameras; they remain suspended.
 
-    From the process that fits; no client may send it.
+    Sent by the process that fits; no client may send it.
     """
 
     message: str
@@ -389,9 +400,9 @@ class ReanchorRefused(
 class ExtendLeases(
     msgspec.Struct, frozen=True, tag="extend_leases", tag_field="command", forbid_unknown_fields=True
 ):
-    """All leases, and what waits to be acknowledged, end by ``seconds`` later: nobody could hear the clients so long.
+    """Extend all leases and acknowledgement times by ``seconds``, during which clients could not be heard.
 
-    From the servo process; no client may send it, and it is not answered.
+    Sent by the servo process; no client may send it, and it is not answered.
     """
 
     seconds: float

@@ -29,11 +29,11 @@ VERBS = (
 
 
 class InvalidKeyError(ValueError):
-    """A name or key outside of the key space; the text has the valid form."""
+    """A name or key outside of the key space; the message contains the valid form."""
 
 
 def check_name(kind: str, name: str) -> str:
-    """``name`` itself where it is valid in a key. Raises InvalidKeyError."""
+    """``name``, if it is valid in a key. Raises InvalidKeyError."""
     if not NAME.fullmatch(name):
         raise InvalidKeyError(
             f"{kind} {name!r}: letters, digits, '_' and '-' are valid, up to 64, a letter or digit first"
@@ -61,7 +61,7 @@ class KeySpace:
         return f"{self.prefix}/features/{check_name('camera', camera)}"
 
     def preview(self, camera: str) -> str:
-        """The key on which pictures of ``camera`` are published while somebody subscribes."""
+        """The key on which pictures of ``camera`` are published while there is a subscriber."""
         return f"{self.prefix}/preview/{check_name('camera', camera)}"
 
     def goal(self, operator: str) -> str:
@@ -100,7 +100,7 @@ class KeySpace:
         return verb, check_name("operator", operator)
 
     def is_command(self, key: str) -> bool:
-        """Whether ``key`` is that of a command, by whomever."""
+        """Whether ``key`` is that of a command of any operator."""
         try:
             self.command_of(key)
         except InvalidKeyError:

@@ -1,4 +1,4 @@
-"""One length of arm, markers or cameras that somebody has measured: it sets the scale of a metric model."""
+"""A measured length of arm, markers or cameras: it determines the scale of a metric model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORMS = (
 
 
 class KnownLength(msgspec.Struct, frozen=True):
-    """The known length that fixes the scale of a metric model: ``metres`` of a quantity named by ``what`` and
+    """The known length that determines the scale of a metric model: ``metres`` of a quantity named by ``what`` and
     ``of``.
 
     ``a`` or ``d`` of a joint's row after Denavit and Hartenberg, ``prismatic`` (one unit of that joint), ``markers``
@@ -28,7 +28,7 @@ class KnownLength(msgspec.Struct, frozen=True):
 
 
 def known_length_of(text: str) -> KnownLength:
-    """The known length that ``text`` states as ``WHAT:OF=METRES``. Raises ValueError with what is valid."""
+    """The known length stated by ``text`` as ``WHAT:OF=METRES``. Raises ValueError with the valid forms."""
     what, _, rest = text.partition(":")
     of, _, number = rest.rpartition("=")
     names = of.split(",")

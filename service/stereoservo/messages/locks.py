@@ -1,5 +1,5 @@
 """Locks, which the kernel releases when the holder dies, and the process that holds one: files (``flock``) for a cell's
-daemon, and for a hardware channel a file and a name that holds on the whole host.
+daemon, and for a hardware channel a file and a name that is unique on the whole host.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class AlreadyRunningError(Exception):
 class FileLock:
     """An exclusive lock on ``path``, held until :meth:`release` or death. Raises AlreadyRunningError.
 
-    A disk that is full or read-only does not take the number of its holder, which others then are not told.
+    On a full or read-only disk the holder's process id cannot be written, so others cannot read it.
     """
 
     def __init__(self, path: Path, what: str) -> None:
@@ -77,7 +77,7 @@ class FileLock:
 
 
 def _opened(path: Path) -> int:
-    """A lock file, which is made where it can be; a read-only one that is there is as good."""
+    """Open a lock file, creating it if possible; an existing read-only one is sufficient."""
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:
@@ -87,11 +87,11 @@ def _opened(path: Path) -> int:
 
 
 class ChannelLock(FileLock):
-    """An exclusive lock on the hardware channel of `hardware_lock_path`, whoever asks for it: beside the file ``path``
-    it takes the file's name among the abstract unix sockets, which all users of this host have in common, whatever
+    """An exclusive lock on the hardware channel of `hardware_lock_path`, for all users: in addition to the file
+    ``path`` it takes the file's name among the abstract unix sockets, which all users of this host share, whatever
     their runtime directories are. Raises AlreadyRunningError.
 
-    Containers: the name holds within one network namespace, the file where the runtime directory is shared.
+    Containers: the name is unique within one network namespace; the file works if the runtime directory is shared.
     """
 
     def __init__(self, path: Path, what: str) -> None:
@@ -100,7 +100,7 @@ class ChannelLock(FileLock):
         address = _abstract_address(path.name)
         try:
             self._name.bind(address)
-            self._name.listen(1)  # only of one who listens can the kernel tell others who it is
+            self._name.listen(1)  # the kernel reports the process of a socket to others only if it listens
         except OSError as error:
             self._name.close()
             self.release()
@@ -121,7 +121,7 @@ def _abstract_address(name: str) -> bytes:
 
 
 def _listener(address: bytes) -> int:
-    """The process that listens at an abstract address; 0 where it is gone or not of this host's process table."""
+    """The process that listens at an abstract address; 0 if it has ended or is not in this host's process table."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         try:
@@ -133,7 +133,7 @@ def _listener(address: bytes) -> int:
 
 
 def holder(path: Path) -> int | None:
-    """The process that holds the lock ``path`` (0: unknown), or None where nobody does."""
+    """The process that holds the lock ``path`` (0: unknown), or None if nobody does."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -149,9 +149,9 @@ def holder(path: Path) -> int | None:
 
 
 def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> Path | None:
-    """The lock file of the hardware channel that ``options`` name, None where they name none (a
-    simulation, or an episode of a data set, which any number of cameras read). A device has one, whichever of its links
-    it is called by.
+    """The lock file of the hardware channel that ``options`` name, None if they name none (a simulation, or an episode
+    of a data set, which any number of cameras may read). A device has one file, whichever of its links is used to name
+    it.
     """
     episode = options.get("episode") is not None
     for key in CHANNEL_OPTIONS:
@@ -162,20 +162,20 @@ def hardware_lock_path(root: Path, driver: str, options: Mapping[str, Any]) -> P
             if isinstance(value, str) and value.startswith("/dev/"):
                 value = os.path.realpath(value)
             elif isinstance(value, str) and (shown := Address(value)) != value:
-                value = f"{shown}-{shown.digest()}"  # the name is shown to others, and told
+                value = f"{shown}-{shown.digest()}"  # the name is visible to others, also in messages
             safe = re.sub(r"[^A-Za-z0-9]+", "-", f"{driver}-{value}").strip("-")
             return root / f"channel-{safe}.lock"
     return None
 
 
 def _read_pid(fd: int) -> int:
-    """The holder, by its number in the lock file; 0 where there is none, or a full disk has kept an older one."""
+    """The holder, by its number in the lock file; 0 if there is none, or if a full disk has left an older one."""
     text = os.pread(fd, 32, 0).decode("ascii", "replace").strip()
     return int(text) if text.isdigit() and _may_hold(int(text), fd) else 0
 
 
 def _may_hold(pid: int, fd: int) -> bool:
-    """Whether the kernel does not name other processes as those that lock the file."""
+    """Whether this process may be the holder: the kernel names no other process as holder of the lock."""
     inode = f":{os.fstat(fd).st_ino}"
     try:
         lines = [line.split() for line in Path("/proc/locks").read_text(encoding="ascii").splitlines()]

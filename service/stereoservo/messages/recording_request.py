@@ -1,7 +1,7 @@
 """Request to the vision processes to record their images, passed by a file, and their reports of what was recorded.
 
-The order is a small file in the cell's runtime directory, replaced as a whole and looked at a few times a second: a
-vision process that starts late, or again, finds it there.
+The request is a small file in the cell's runtime directory, replaced as a whole and read a few times a second, so that
+a vision process that starts late, or again, finds it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ class ImageRecordingRequest(msgspec.Struct, frozen=True):
 
 
 class RecordedImages(msgspec.Struct, frozen=True):
-    """Report of one camera's recording. ``left_out``: delivered frames that are not in it; ``why`` it ended."""
+    """Report of one camera's recording. ``left_out``: number of delivered frames that are not in it;
+    ``why`` it ended.
+    """
 
     camera: str
     file: str
@@ -60,7 +62,7 @@ def write_request(path: Path, order: ImageRecordingRequest) -> None:
 
 
 def read_request(path: Path) -> ImageRecordingRequest | None:
-    """The current request; None where there is none. Raises DamagedError."""
+    """The current request; None if there is none. Raises DamagedError."""
     with decoding(partial(DamagedError, path)):
         try:
             data = read_bounded(path, MAX_REQUEST_BYTES)

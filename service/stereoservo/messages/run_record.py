@@ -17,12 +17,13 @@ _T = TypeVar("_T")
 
 
 class RunRecord(msgspec.Struct, frozen=True):
-    """A run of a cell's daemon, written as it begins, as it is ``up``, and as it ends; times [s since 1970].
+    """A run of a cell's daemon, written at its start, when it is ``up``, and at its end; times [s since 1970].
 
-    ``pid`` of the supervisor; ``machine``: the start of the computer that it ran in. ``cause`` of its end: empty while
-    it runs, and for good where nobody was left to write it. ``in_order``: somebody asked for the end. ``previous``: how
-    the last run before it that was up ended, empty where that was in order. ``remedy``: what to do, where the cause
-    does not say so.
+    ``pid``: of the supervisor; ``machine``: identifies the boot of the computer that it ran in.
+    ``cause``: of its end: empty while it runs, and permanently if no process was left to write it.
+    ``in_order``: the end was requested.
+    ``previous``: how the last run before it that was up ended, empty if that was requested.
+    ``remedy``: what to do, if the cause does not state it.
     """
 
     boot: str
@@ -46,15 +47,15 @@ class OpenGoal(msgspec.Struct, frozen=True):
 
 
 class OpenGoals(msgspec.Struct, frozen=True):
-    """All of them."""
+    """All goals that have not ended."""
 
     goals: tuple[OpenGoal, ...] = ()
 
 
 def begin_run(directories: CellDirectories, boot: str, pid: int) -> None:
-    """Record that a run begins. Raises OSError."""
+    """Record that a run starts. Raises OSError."""
     before = read_run(directories)
-    if before is None or not before.up:  # a start that failed tells nothing of the goals of the run before it
+    if before is None or not before.up:  # a failed start has no information about earlier goals
         previous = "" if before is None else before.previous
     else:
         previous = "" if before.in_order else how_it_ended(before)
@@ -63,7 +64,7 @@ def begin_run(directories: CellDirectories, boot: str, pid: int) -> None:
 
 
 def run_is_up(directories: CellDirectories) -> None:
-    """Record that the daemon takes requests. Raises OSError."""
+    """Record that the daemon accepts requests. Raises OSError."""
     run = read_run(directories)
     if run is not None:
         _replace(directories.run_record, msgspec.json.encode(msgspec.structs.replace(run, up=True)))
@@ -78,12 +79,12 @@ def end_run(directories: CellDirectories, cause: str, remedy: str = "", *, in_or
 
 
 def read_run(directories: CellDirectories) -> RunRecord | None:
-    """The newest run, None where none was recorded."""
+    """The newest run, None if none was recorded."""
     return _read(directories.run_record, RunRecord)
 
 
 def how_it_ended(run: RunRecord) -> str:
-    """Cause of the end of a run that has ended, also where nobody could write it."""
+    """Cause of the end of a run that has ended, also if no process could write it."""
     if run.cause:
         return run.cause
     if run.machine != machine_start():
@@ -106,14 +107,14 @@ def write_goals(directories: CellDirectories, goals: tuple[OpenGoal, ...]) -> No
 
 
 def machine_start() -> str:
-    """Name of this start of the computer; empty where the kernel gives none."""
+    """Identifier of this boot of the computer; empty if the kernel provides none."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""
 
 
 def _read(path: Path, kind: type[_T]) -> _T | None:
-    """A record; None where there is none, or a damaged one, which nothing depends on."""
+    """A record; None if there is none, or a damaged one, because nothing depends on it."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError):
@@ -121,7 +122,7 @@ def _read(path: Path, kind: type[_T]) -> _T | None:
 
 
 def _replace(path: Path, data: bytes) -> None:
-    """Replace a file as a whole: a process that is killed meanwhile leaves the old one or the new one."""
+    """Replace a file as a whole: if the process is killed meanwhile, either the old or the new one remains."""
     temporary = path.with_suffix(".new")
     temporary.write_bytes(data)
     temporary.replace(path)

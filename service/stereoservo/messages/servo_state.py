@@ -1,5 +1,5 @@
-"""State of the servo process without the numerical libraries: its record in shared memory, as any process may read it,
-and the message of it that clients get.
+"""State of the servo process without the numerical libraries: its record in shared memory, readable by any process, and
+the state message for clients.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from stereoservo.messages.status import CoreStatus, Halt, Health, RefinementStat
 from stereoservo.messages.wire import LoopInfo, StateMessage
 
 STATE_LAYOUT = "ServoState.1"
-"""Of the records of `daemon.ipc_messages.ServoState` in their slot."""
+"""Layout of the records of `daemon.ipc_messages.ServoState` in their slot."""
 MAX_PLAN_BYTES = 1 << 24
 STALE_S = 0.6
-"""A source that delivers nothing for so long, and a camera for ``STALE_PERIODS`` of its periods, too, is gone: what is
-known from it is unknown from then on."""
+"""Time [s] without a sample after which a source counts as lost, for a camera also ``STALE_PERIODS`` of its periods:
+its values are then unknown.
+"""
 STALE_PERIODS = 3.0
 NO_CAMERA = "no camera delivers frames: whether the model still holds is unknown"
 COMMISSIONING_SPEED = 0.05
-"""Share of the cell's speed that `run --commissioning` leaves."""
+"""Fraction of the cell's speed that `run --commissioning` allows."""
 
 
 class Numbers:
-    """An array of numbers out of a record, without numpy."""
+    """An array of numbers from a record, without numpy."""
 
     def __init__(self, values: tuple[float, ...]) -> None:
         self.values = values
@@ -55,7 +56,7 @@ class LoopStatistics(msgspec.Struct, frozen=True):
 
 
 class StateRecord(msgspec.Struct):
-    """What of a `daemon.ipc_messages.ServoState` clients are told."""
+    """The part of a `daemon.ipc_messages.ServoState` that clients receive."""
 
     status: CoreStatus[Numbers]
     loop: LoopStatistics
@@ -86,7 +87,7 @@ class _Camera(msgspec.Struct):
 
 
 class RunRecord(msgspec.Struct):
-    """What of a `daemon.ipc_messages.RunPlan` goes into the state's message."""
+    """The part of a `daemon.ipc_messages.RunPlan` that is used in the state message."""
 
     cell: _Cell
     boot: str
@@ -96,7 +97,7 @@ class RunRecord(msgspec.Struct):
 
 
 def _numbers(kind: type, value: Any) -> Numbers:
-    """msgspec ``dec_hook``. Raises ValueError, TypeError for what is no array of 64-bit floats."""
+    """msgspec ``dec_hook``. Raises ValueError or TypeError for values that are no array of 64-bit floats."""
     name, _, data = value
     if name != "<f8" or len(data) % 8:
         raise ValueError(f"an array of {name!r:.40}; 64-bit floats are needed")
@@ -137,7 +138,7 @@ def state_message(
 ) -> StateMessage:
     """The state in the clients' format, with the ages of its sources at ``now_ns``.
 
-    Numbers that are not finite, and what has lost its source, are left out. ``run``: a `RunRecord` or the run plan
+    Numbers that are not finite, and values whose source is lost, are left out. ``run``: a `RunRecord` or the run plan
     itself; ``state``: a `StateRecord` or the servo process's own `ServoState`.
     """
     status, loop = state.status, state.loop
@@ -197,22 +198,22 @@ def state_message(
 
 
 def _age_s(t_ns: int, now_ns: int) -> float | None:
-    """Age [s] of what has the stamp ``t_ns``, to the millisecond; None for 0: there is nothing yet."""
+    """Age [s] of the stamp ``t_ns``, to the millisecond; None for 0: no data yet."""
     return round((now_ns - t_ns) * 1e-9, 3) if t_ns else None
 
 
 def _fresh(age_s: float | None, rate_hz: float = math.inf) -> bool:
-    """Whether a source that delivers at ``rate_hz`` is there."""
+    """Whether a source that delivers at ``rate_hz`` is alive."""
     return age_s is not None and age_s <= silence_limit_s(rate_hz)
 
 
 def silence_limit_s(rate_hz: float) -> float:
-    """Age [s] from which on a source that delivers at ``rate_hz`` is gone."""
+    """Age [s] above which a source that delivers at ``rate_hz`` counts as lost."""
     return max(STALE_S, STALE_PERIODS / rate_hz)
 
 
 def _health(health: Health, fresh: set[str]) -> Health:
-    """The health of the model as the ``fresh`` cameras show it; a verdict that is not ``ok`` stays."""
+    """The health of the model by the ``fresh`` cameras; a diagnosis that is not ``ok`` is kept."""
     cameras = {name: camera for name, camera in health.cameras.items() if name in fresh}
     if not fresh and health.verdict == "ok":
         return msgspec.structs.replace(health, verdict="unknown", text=NO_CAMERA, cameras=cameras)

@@ -12,7 +12,7 @@ import msgspec
 from stereoservo.messages.reasons import Reason
 
 Values = TypeVar("Values")
-"""Type of an array: of numpy where the core works, of numbers alone where numpy is not loaded."""
+"""Type of an array: of numpy in the core, of plain numbers if numpy is not loaded."""
 
 
 class Lifecycle(StrEnum):
@@ -37,8 +37,8 @@ class CameraHealth(msgspec.Struct, frozen=True):
     """Agreement of one camera's newest frame with the model.
 
     Chi-square per degree of freedom, rms innovation [px], the ``worst`` marker (-1: none) and its innovation.
-    ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``. ``timing``: as text, where the stamps are
-    seen to be wrong.
+    ``place`` of a mobile camera: ``stands``, ``moving``, ``lost``. ``timing``: as text, if the stamps are found to be
+    wrong.
     """
 
     chi2: float = 0.0
@@ -53,9 +53,12 @@ class Health(msgspec.Struct, frozen=True):
     """Health of the model, by the model monitor.
 
     ``verdict``: ``ok``, ``camera_moved``, ``cameras_moved_together``, ``cameras_or_arm``, ``marker_slipped``,
-    ``joint_zero``, ``unclear``, or ``unknown`` without a model; ``subjects`` names the cameras, the marker or the
-    joint; ``size`` in ``unit`` with its standard ``deviation``; ``text``: with what to do. ``masked``: markers that are
-    not used. ``reanchoring``: what is being done for cameras that have moved, in a word.
+    ``joint_zero``, ``unclear``, or ``unknown`` without a model.
+    ``subjects``: names the cameras, the marker or the joint.
+    ``size``: in ``unit`` with its standard ``deviation``.
+    ``text``: description with a remedy.
+    ``masked``: markers that are not used.
+    ``reanchoring``: phase of the relocalization of moved cameras, in a word.
     """
 
     verdict: str = "unknown"
@@ -70,7 +73,7 @@ class Health(msgspec.Struct, frozen=True):
 
 
 class StatusHead(msgspec.Struct, frozen=True):
-    """What the core is doing and why, as every process and every client reads it, after ``step`` at ``t_ns``
+    """Activity of the core and its reasons, as every process and every client reads it, after ``step`` at ``t_ns``
     (monotonic).
     """
 
@@ -92,48 +95,50 @@ class CoreStatus(StatusHead, Generic[Values], frozen=True, eq=False):
     positions: Values
     velocities: Values
     command_raw: Values
-    """Before the safety stage."""
+    """Velocity before the safety stage."""
     command: Values
     error_px: float | None
     task_error: Values
-    """Of the components of the law, `control.law.Law.components`; empty where it has none."""
+    """Errors of the law's components, `control.law.Law.components`; empty if it has none."""
     innovation_px: dict[str, float]
     visible: dict[str, int]
     progress: float | None = None
-    """Share [0, 1] of the goal's way that is done."""
+    """Completed fraction [0, 1] of the goal's path."""
     seconds_left: float | None = None
     efforts: Values | None = None
-    """As the driver tells them."""
+    """As the driver reports them."""
     following_errors: Values | None = None
     effort_limits: Values | None = None
-    """How far an effort may go from its moving mean, infinite where nobody knows; None: no watch at all."""
+    """Largest permitted deviation of an effort from its moving mean, infinite if unknown; None: collisions are not
+    monitored.
+    """
     following_limits: Values | None = None
-    """Likewise of the following errors, from zero."""
+    """The same for following errors, from zero."""
     health: Health = Health()
 
 
 class Halt(msgspec.Struct, frozen=True):
-    """Who stopped or held the arm, in words ("stopped by ann"), and when [s since 1970]."""
+    """Who stopped or held the arm, as text ("stopped by ann"), and when [s since 1970]."""
 
     words: str
     t_wall: float
 
 
 class RefinementState(msgspec.Struct, frozen=True):
-    """How far on-line refinement of the model in use is."""
+    """Progress of the on-line refinement of the model in use."""
 
     poses: int
-    """Different rest poses that are collected."""
+    """Number of different rest poses collected."""
     due: int | None
     """Number of poses at which a model is estimated next; None: not before the next calibration or start."""
     doing: str = "collecting"
     """``collecting``, ``refining``, or ``waiting``: for the arm to rest without a goal, to use a refined model."""
     refined_from: int = 0
-    """Epoch of the calibrated model that the one in use was refined from; 0: it is a calibrated one."""
+    """Epoch of the calibrated model that the one in use was refined from; 0: the model in use is a calibrated one."""
 
     @property
     def text(self) -> str:
-        """How far it is, and how a refined model is undone, in words."""
+        """Progress, and how a refined model is undone, as text."""
         words = f"{self.poses} rest poses"
         if self.doing == "refining":
             words += ", a model is being estimated from them"

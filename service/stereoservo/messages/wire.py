@@ -66,13 +66,13 @@ COMMANDS: dict[str, type[Command]] = {
     "update": UpdateGoal,
     "acknowledge": AcknowledgeGoal,
 }
-"""What the payload of ``command/<verb>/<operator>`` decodes into; the ``command`` tag may be left out."""
+"""Types of the payloads of ``command/<verb>/<operator>``; the ``command`` tag may be omitted."""
 
 
 class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", forbid_unknown_fields=True):
     """Start or stop a flight recording. Handled by the gateway, not forwarded to the core.
 
-    ``images``: with what the cameras deliver, in the directory ``NAME.images`` beside the recording ``NAME.mcap``.
+    ``images``: also record the cameras' frames, in the directory ``NAME.images`` beside the recording ``NAME.mcap``.
     """
 
     on: bool = True
@@ -84,9 +84,10 @@ class Synthesise(
 ):
     """Make the goal ``name`` from CAD drawings. Handled by the gateway, not forwarded to the core.
 
-    ``workpiece``, ``tool``: marker -> (x, y, z) in the coordinates of either's drawing, one unit of length for both.
-    ``pose`` 4x4, row-major: from the tool's drawing to the workpiece's, in the position of alignment. The workpiece's
-    markers are to be seen now.
+    ``workpiece``, ``tool``: marker -> (x, y, z) in the coordinates of the respective drawing, with one unit of length
+    for both.
+    ``pose``: 4x4, row-major: from the tool's drawing to the workpiece's, in the aligned position. The workpiece's
+    markers must be visible now.
     """
 
     name: Name
@@ -96,11 +97,11 @@ class Synthesise(
 
 
 class Restore(msgspec.Struct, frozen=True, tag="restore", tag_field="command", forbid_unknown_fields=True):
-    """Bring the calibrated model back that the one in use was refined from on-line. Handled by the gateway."""
+    """Restore the calibrated model from which the one in use was refined on-line. Handled by the gateway."""
 
 
 class MessageError(ValueError):
-    """An invalid message: names the place in it, the value and what would have been valid."""
+    """An invalid message: the text contains the place in it, the value and valid values."""
 
 
 class JointInfo(msgspec.Struct, frozen=True):
@@ -136,7 +137,7 @@ class ModelInfo(msgspec.Struct, frozen=True):
 
 
 class TaughtInfo(msgspec.Struct, frozen=True):
-    """A taught goal and the model it was taught with. ``standing``: markers beside body and ``tool``."""
+    """A taught goal and the model it was taught with. ``standing``: markers besides body and ``tool``."""
 
     name: str
     model_epoch: int
@@ -164,7 +165,7 @@ class CellInfo(msgspec.Struct, frozen=True):
     commissioning: bool = False
     recording: str = ""
     auxiliary: tuple[AuxiliarySpec, ...] = ()
-    """Auxiliary joints and digital outputs, which `command/auxiliary` orders."""
+    """Auxiliary joints and digital outputs, which are commanded by `command/auxiliary`."""
 
 
 class LoopInfo(msgspec.Struct, frozen=True):
@@ -182,9 +183,9 @@ class LoopInfo(msgspec.Struct, frozen=True):
 class StateMessage(StatusHead, frozen=True):
     """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970].
 
-    What has lost its source is left out: of joints ``joints``, ``velocities``, ``efforts``, ``following_errors`` and
-    ``auxiliary``; of a camera its entry in ``visible``, ``innovation_px`` and ``health.cameras``. Without any camera
-    ``error_px`` is None and an ``ok`` verdict on the model becomes ``unknown``.
+    Values whose source is lost are left out: of joints ``joints``, ``velocities``, ``efforts``, ``following_errors``
+    and ``auxiliary``; of a camera its entry in ``visible``, ``innovation_px`` and ``health.cameras``. Without any
+    camera ``error_px`` is None and an ``ok`` diagnosis of the model becomes ``unknown``.
     """
 
     cell: str
@@ -204,32 +205,32 @@ class StateMessage(StatusHead, frozen=True):
     differences: tuple[str, ...] = ()
     last_event: int = 0
     notes: tuple[str, ...] = ()
-    """Remarks for the cell's keeper, on damaged files and full disks for instance."""
+    """Remarks for the administrator of the cell, for instance on damaged files and full disks."""
     progress: float | None = None
-    """Path parameter of the active goal, 0 to 1, where it is known."""
+    """Path parameter of the active goal, 0 to 1, if it is known."""
     seconds_left: float | None = None
     efforts: dict[str, float] = msgspec.field(default_factory=dict)
-    """As the drives report them [N m or N, or shares of the rated torque]; empty where they do not."""
+    """As the drives report them [N m or N, or fractions of the rated torque]; empty if they report none."""
     following_errors: dict[str, float] = msgspec.field(default_factory=dict)
     """Set less actual position [rad or m]."""
     effort_limits: dict[str, float] = msgspec.field(default_factory=dict)
-    """How far efforts may go from their moving mean before the arm stops for a contact; absent where unknown."""
+    """Largest deviation of efforts from their moving mean before the arm stops for a collision; absent if unknown."""
     following_limits: dict[str, float] = msgspec.field(default_factory=dict)
-    """How large following errors may become before the arm stops for a contact."""
+    """Largest following errors before the arm stops for a collision."""
     health: Health = Health()
-    """Whether the images agree with the model, by camera; what explains it where they do not, and what is done."""
+    """Agreement of the images with the model, by camera; if they disagree, the explanation and the reaction."""
     auxiliary: dict[str, float] = msgspec.field(default_factory=dict)
-    """Auxiliary joints [rad or m] and digital outputs (0 or 1), as the driver tells them."""
+    """Auxiliary joints [rad or m] and digital outputs (0 or 1), as the driver reports them."""
     refused_messages: int = 0
-    """Messages that the gateway could not take since its start: not JSON, of a wrong shape, on a wrong key."""
+    """Messages that the gateway has rejected since its start: not JSON, of a wrong shape, on a wrong key."""
     refinement: RefinementState | None = None
-    """With `[calibration] refine`; None: nothing is refined on-line."""
+    """With `[calibration] refine`; None: there is no on-line refinement."""
     joints_age_s: float | None = None
     """Age of the newest joint sample [s]; None: there was none yet."""
     camera_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)
-    """Of each camera, time [s] since the shutter of its newest frame; None: there was none yet."""
+    """For each camera, time [s] since the shutter of its newest frame; None: there was none yet."""
     halt: Halt | None = None
-    """While the arm is stopped or held at somebody's request: whose."""
+    """Who requested that the arm is stopped or held, while it is."""
 
 
 class FeaturesMessage(msgspec.Struct, frozen=True):
@@ -246,9 +247,9 @@ class FeaturesMessage(msgspec.Struct, frozen=True):
 
 
 class PreviewInfo(msgspec.Struct, frozen=True):
-    """Attachment of a picture on ``preview/<camera>``, whose payload is a JPEG of one frame, smaller perhaps.
+    """Attachment of a picture on ``preview/<camera>``, whose payload is a JPEG of one frame, possibly reduced in size.
 
-    ``width``, ``height``: of the frame [px], in which all pixels of the other messages are.
+    ``width``, ``height``: of the frame [px]; all pixels of the other messages refer to it.
     """
 
     camera: str
@@ -260,10 +261,13 @@ class PreviewInfo(msgspec.Struct, frozen=True):
 
 
 class CalibrationResult(msgspec.Struct, frozen=True):
-    """Result of a calibration. ``covariance_ok``: the residuals are what the measurement noise explains
-    (chi-square). ``verdict``: what it is good for, in plain words, with ``grade`` good, usable or not.
-    ``seconds``: what the fit took. ``report`` (a page), ``figures`` (for programs), ``trials``: files on the daemon's
-    host; the report is there once the event ``calibration_report`` was sent.
+    """Result of a calibration.
+
+    ``covariance_ok``: the residuals are explained by the measurement noise (chi-square).
+    ``verdict``: what the model can be used for, in plain words, with ``grade`` good, usable or not.
+    ``seconds``: duration of the fit.
+    ``report`` (a page), ``figures`` (for programs), ``trials``: files on the daemon's host; the report exists once the
+    event ``calibration_report`` was sent.
     """
 
     rms_px: float
@@ -288,7 +292,7 @@ class CalibrationResult(msgspec.Struct, frozen=True):
 
 
 class EventMessage(msgspec.Struct, frozen=True):
-    """Something that happened, numbered per ``boot`` without gaps. ``id``: the goal that it concerns."""
+    """An event, numbered per ``boot`` without gaps. ``id``: the goal that it concerns."""
 
     seq: int
     boot: str
@@ -323,9 +327,9 @@ class EventList(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """Answer to a goal or command. Refused: ``reasons`` of the core, or ``problems`` of the message itself.
+    """Answer to a goal or command. If it is refused: ``reasons`` of the core, or ``problems`` of the message itself.
 
-    ``plan``: what a goal would do, or will, where it was planned.
+    ``plan``: the expected course of a goal, if it was planned.
     """
 
     accepted: bool
@@ -339,8 +343,8 @@ class Reply(msgspec.Struct, frozen=True):
 
 
 class RunningGoal(msgspec.Struct, frozen=True):
-    """A goal that was accepted and has not ended, of this ``operator``: taught ones as the set-points that they were
-    resolved to, moved ones (``update``) as they were sent. ``plan``: as the reply to it had it.
+    """A goal that was accepted and has not ended, of this ``operator``: taught ones as the resolved set-points, moved
+    ones (``update``) as they were sent. ``plan``: as in its reply.
     """
 
     goal: Goal
@@ -375,7 +379,7 @@ SCHEMAS: dict[str, Any] = {
 def schema(name: str, laws: Sequence[str]) -> bytes:
     """The JSON Schema of a message as JSON, in which a law is one of ``laws``.
 
-    Raises MessageError with the names there are.
+    Raises MessageError with the existing names.
     """
     kind = SCHEMAS.get(name)
     if kind is None:
@@ -386,7 +390,7 @@ def schema(name: str, laws: Sequence[str]) -> bytes:
 
 
 def _list_laws(tree: Any, laws: list[str]) -> None:
-    """Insert ``laws`` as the valid values, in place, wherever a schema holds the name of a law."""
+    """Insert ``laws`` as the valid values, in place, wherever a schema contains the name of a law."""
     if isinstance(tree, dict):
         if tree.get("title") == LAW_TITLE:
             tree["enum"] = laws
@@ -420,9 +424,10 @@ def require_finite(tree: Any, where: str = "") -> None:
 
 
 def decode(data: bytes, kind: type[_T]) -> _T:
-    """Decode a message. Strictness is the struct's: commands and goals refuse unknown fields, the others do not.
+    """Decode a message. The struct determines the strictness: commands and goals reject unknown fields, the others do
+    not.
 
-    Raises MessageError, whatever the bytes: too large, not JSON, a number that is not finite, a field that does not
+    Raises MessageError for any invalid bytes: too large, not JSON, a number that is not finite, a field that does not
     fit.
     """
     if len(data) > MAX_PAYLOAD_BYTES:
@@ -433,14 +438,14 @@ def decode(data: bytes, kind: type[_T]) -> _T:
 
 
 def read(data: bytes, kind: type[_T]) -> _T:
-    """Decode a message of the daemon, without a size limit. Raises MessageError like :func:`decode`, whatever the
+    """Decode a message of the daemon, without a size limit. Raises MessageError like :func:`decode`, for any invalid
     bytes.
     """
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
         raise MessageError(_misfit(str(error), data, kind)) from error
-    except Exception as error:  # the decoder's errors have no class in common
+    except Exception as error:  # the decoder's errors have no common class
         raise MessageError(_undecodable(error, data)) from error
 
 
@@ -456,7 +461,7 @@ def _undecodable(error: Exception, data: bytes) -> str:
 
 
 def _misfit(error: str, data: bytes, kind: Any) -> str:
-    """Validation error with its place, the given value, and the valid words."""
+    """Validation error with its place, the given value, and the valid values."""
     text, _, where = error.partition(" - at `")
     if where.startswith("key` in `"):
         return f"a key of {where.removeprefix('key` in `$.').rstrip('`')}: {text}"
@@ -469,7 +474,7 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
         return f"{place}: {text}" if place else text
     at = f"{place}: " if place else ""
     parts = place.replace("[", ".[").split(".") if place else []
-    if "field `" in text:  # an unknown one, or one that is missing
+    if "field `" in text:  # an unknown one, or a missing one
         known = _keys(_type_at(kind, value, parts), _value_at(value, parts), text.split("`")[1])
         return at + text + (f"; {known}" if known else "")
     given = _value_at(value, parts)
@@ -484,7 +489,7 @@ _described = functools.cache(inspect.type_info)
 
 
 def _members(found: Any) -> list[Any]:
-    """The types of which a value of type ``found`` is one."""
+    """The member types of a type ``found``, which may be a union."""
     if isinstance(found, inspect.Metadata):
         return _members(found.type)
     if isinstance(found, inspect.UnionType):
@@ -497,7 +502,7 @@ def _structs(found: Any) -> list[inspect.StructType]:
 
 
 def _struct_of(found: Any, value: Any) -> inspect.StructType | None:
-    """The struct of type ``found`` that ``value`` is meant to be, by its tag where there are several."""
+    """The struct of type ``found`` for ``value``, by its tag if there are several."""
     structs = _structs(found)
     if len(structs) == 1:
         return structs[0]
@@ -506,7 +511,7 @@ def _struct_of(found: Any, value: Any) -> inspect.StructType | None:
 
 
 def _value_at(value: Any, parts: Sequence[str]) -> Any:
-    """What stands at a place of a decoded message; None where that is not known."""
+    """The value at a place of a decoded message; None if that is unknown."""
     for part in parts:
         if isinstance(value, list) and part.startswith("[") and part[1:-1].isdigit():
             value = value[int(part[1:-1])]
@@ -516,8 +521,8 @@ def _value_at(value: Any, parts: Sequence[str]) -> Any:
 
 
 def _type_at(kind: Any, value: Any, parts: Sequence[str]) -> Any:
-    """The type of what is to stand at a place of a message of ``kind``, for which ``value`` was given; of a tag, the
-    type of its object. None where nobody can say.
+    """The type expected at a place of a message of ``kind``, for which ``value`` was given; for a tag, the type of its
+    object. None if it cannot be determined.
     """
     found: Any = _described(kind)
     for k, part in enumerate(parts):
@@ -537,7 +542,7 @@ def _type_at(kind: Any, value: Any, parts: Sequence[str]) -> Any:
 
 
 def _keys(found: Any, value: Any, missing: str) -> str:
-    """The keys that an object of type ``found`` has, or the words for its tag where that is ``missing``."""
+    """The keys of an object of type ``found``, or the valid values of its tag if that is ``missing``."""
     struct = _struct_of(found, value)
     if struct is None:
         words = _words(found, missing)
@@ -546,7 +551,7 @@ def _keys(found: Any, value: Any, missing: str) -> str:
 
 
 def _words(found: Any, name: str) -> tuple[str, ...]:
-    """The words that are valid for the key ``name`` of type ``found``; empty where it is not one of a few."""
+    """The valid values of the key ``name`` of type ``found``; empty if its values are not a fixed set."""
     tags = tuple(str(struct.tag) for struct in _structs(found) if struct.tag_field == name)
     return tags or tuple(
         str(word)
@@ -558,7 +563,7 @@ def _words(found: Any, name: str) -> tuple[str, ...]:
 
 
 def _require_bounded(tree: Any) -> None:
-    """Raises MessageError for an integer that does not fit 64 bits: no later stage could carry it."""
+    """Raises MessageError for an integer that does not fit 64 bits: no later stage could represent it."""
     if isinstance(tree, int):
         if not -(1 << 63) <= tree < 1 << 63:
             raise MessageError(f"integer {tree} is out of range; -2^63 to 2^63 - 1 are valid")
@@ -571,7 +576,7 @@ def _require_bounded(tree: Any) -> None:
 
 
 def decode_command(verb: str, data: bytes) -> Command:
-    """The payload of ``command/<verb>``; an empty one stands for ``{}``. Raises MessageError."""
+    """The payload of ``command/<verb>``; an empty one means ``{}``. Raises MessageError."""
     kind: Any = COMMANDS[verb]
     command: Command = decode(data or b"{}", kind)
     return command

@@ -1,5 +1,5 @@
-"""Lossless compression of what a recording holds: step records by what differs from the one before of the same form,
-checkpoints by what differs from the checkpoint before.
+"""Lossless compression of a recording: step records by their differences from the previous record of the same form,
+checkpoints by their differences from the previous checkpoint.
 """
 
 from __future__ import annotations
@@ -13,22 +13,24 @@ from stereoservo.numerics.arrays import IntArray
 from stereoservo.recording.step_layout import form_of
 
 LARGEST = 64 << 20
-"""Bytes of a block or checkpoint, at most: a stated size beyond it is damage, and is not allocated."""
+"""Largest size of a block or checkpoint [bytes]: a larger stated size is damage, and is not allocated."""
 MOST_KEPT = 8 * LARGEST
-"""Bytes of rows that are kept from one block to the next, at most."""
+"""Largest size of rows that are kept from one block to the next [bytes]."""
 LEVEL = 9
 COUNT = struct.Struct("<II")
-"""Of a block: records, and forms of them."""
+"""Head of a block: number of records, and number of their forms."""
 ZERO, REPEATED = 64, 65
-"""Of a column: it is zero; it is the column before. Else its numbers follow, less so many trailing zeros (0 to 63)."""
+"""Kinds of a column: zero, or equal to the previous column. Otherwise the kind is the number of trailing zeros removed
+(0 to 63), and its numbers follow.
+"""
 
 
 class StepBlocks:
     """Compresses and restores blocks of step records (`step_layout`).
 
-    Records of a form (`step_layout.form_of`) are rows of 64-bit numbers; of these the differences from row to row are
-    kept, byte by byte of all of them. The first row is compared with the last one of its form since `begin`, which is
-    called where reading may begin: at a checkpoint.
+    Records of a form (`step_layout.form_of`) are rows of 64-bit numbers. Their differences from row to row are stored,
+    grouped by byte. The first row is compared with the last one of its form since `begin`, which is called at each
+    point where reading may start: a checkpoint.
     """
 
     def __init__(self) -> None:
@@ -37,7 +39,7 @@ class StepBlocks:
         self._last: dict[tuple[int, int], IntArray] = {}
 
     def begin(self) -> None:
-        """Forget the records before."""
+        """Discard the previous records."""
         self._last = {}
 
     def compress(self, records: list[bytes]) -> bytes:
@@ -60,7 +62,7 @@ class StepBlocks:
         return self._compressor.compress(b"".join(parts))
 
     def _columns(self, rows: IntArray, form: tuple[int, int]) -> list[bytes]:
-        """What differs from row to row: kinds of columns, then the bytes of those that are stored."""
+        """Encode the differences from row to row: kinds of columns, then the bytes of those that are stored."""
         count, width = rows.shape
         before = self._last.get(form, np.zeros(width, np.int64))
         self._last[form] = rows[-1]
@@ -71,11 +73,11 @@ class StepBlocks:
         kinds[bits == 0] = ZERO
         stored = kinds < ZERO
         numbers = difference[stored] >> kinds[stored, None].astype(np.int64)
-        folded = ((numbers << 1) ^ (numbers >> 63)).astype("<i8")  # both signs by their size
+        folded = ((numbers << 1) ^ (numbers >> 63)).astype("<i8")  # signed to unsigned by magnitude
         return [kinds.tobytes(), folded.view(np.uint8).reshape(-1, count, 8).transpose(2, 0, 1).tobytes()]
 
     def restore(self, block: bytes) -> list[bytes]:
-        """The records of a block, in their order. Raises anything on damaged bytes, before more than a few times
+        """The records of a block, in their order. Raises any exception on damaged bytes, before more than a few times
         ``LARGEST`` bytes are allocated, or more than ``MOST_KEPT`` are kept for the next block.
         """
         data = _decompressed(self._decompressor, block)
@@ -104,7 +106,7 @@ class StepBlocks:
         return records
 
     def _rows(self, data: bytes, at: int, count: int, form: tuple[int, int]) -> tuple[IntArray, int]:
-        """Inverse of `_columns`, and where the rest begins."""
+        """Inverse of `_columns`, and the position after the columns."""
         width = -(-form[0] // 8)
         kinds = np.frombuffer(data, np.uint8, width, at)
         at += width
@@ -120,7 +122,7 @@ class StepBlocks:
         used = kinds != ZERO
         difference[used] = numbers[
             (np.cumsum(stored) - 1)[used]
-        ]  # one that is repeated is the newest stored one
+        ]  # a repeated one equals the newest stored one
         before = self._last.get(form, np.zeros(width, np.int64))
         rows: IntArray = np.cumsum(np.vstack([before[None], difference.T]), axis=0)[1:]
         self._last[form] = rows[-1]
@@ -128,19 +130,19 @@ class StepBlocks:
 
 
 class Checkpoints:
-    """Compresses and restores checkpoints, each with the one before as its dictionary: at rest little differs."""
+    """Compresses and restores checkpoints, each with the previous one as its dictionary: at rest few bytes differ."""
 
     def __init__(self) -> None:
         self._before = b""
 
     def compress(self, data: bytes) -> bytes:
-        """A checkpoint that follows those before."""
+        """A checkpoint that follows the previous ones."""
         compressor = zstandard.ZstdCompressor(level=LEVEL, dict_data=self._dictionary())
         self._before = data
         return compressor.compress(data)
 
     def restore(self, data: bytes) -> bytes:
-        """Inverse of `compress`, in the same order. Raises anything on damaged bytes."""
+        """Inverse of `compress`, in the same order. Raises any exception on damaged bytes."""
         self._before = _decompressed(zstandard.ZstdDecompressor(dict_data=self._dictionary()), data)
         return self._before
 

@@ -18,11 +18,13 @@ from stereoservo.recording.step_records import Fingerprint, RecordedCheckpoint, 
 
 FORMAT = "stereoservo-flight-2"
 FORMATS = ("stereoservo-flight-1", FORMAT)
-"""That are read; in the first one each step is a message of its own, in msgpack, in chunks of LZ4."""
+"""Formats that can be read; in the first one each step is a message of its own, in msgpack, in chunks of LZ4."""
 CHUNK_BYTES = 256 * 1024
-"""At most in a chunk, before compression; what is not in a whole chunk yet is lost where the process is killed."""
+"""Largest size of a chunk [bytes], before compression; data that are not in a complete chunk are lost if the process is
+killed.
+"""
 CHUNK_S = 0.4
-"""Of the loop's time in a chunk, at most."""
+"""Longest time of the loop in a chunk [s]."""
 
 
 TOPICS = {"header": "msgpack", "steps": "step-blocks", "state": "zstd-msgpack", "gap": "msgpack"}
@@ -30,7 +32,7 @@ TOPICS = {"header": "msgpack", "steps": "step-blocks", "state": "zstd-msgpack", 
 
 
 class _OutputFile:
-    """File that takes each block as a whole or not at all, so that it ends with a whole record on a full disk."""
+    """File that writes each block completely or not at all, so that it ends with a complete record on a full disk."""
 
     def __init__(self, path: Path, durable: bool) -> None:
         self._path = path
@@ -39,7 +41,7 @@ class _OutputFile:
         self.size = 0
 
     def write(self, data: bytes) -> int:
-        """Append ``data``. Raises OSError, and the file is as before then."""
+        """Append ``data``. Raises OSError; the file is then unchanged."""
         rest = memoryview(data)
         try:
             while rest:
@@ -57,13 +59,13 @@ class _OutputFile:
         return self.size
 
     def discard(self) -> None:
-        """Close and remove a file that has not begun."""
+        """Close and remove a file in which nothing was recorded."""
         self._file.close()
         with suppress(OSError):
             self._path.unlink()
 
     def close(self) -> None:
-        """Close, with what is durable on the disk. Idempotent. Raises OSError."""
+        """Close; a durable file is written to the disk first. Idempotent. Raises OSError."""
         if self._file.closed:
             return
         try:
@@ -74,14 +76,15 @@ class _OutputFile:
 
 
 class FlightRecorder:
-    """Writes one recording. Steps and checkpoints come as bytes, already encoded by the servo process (`step_layout`).
+    """Writes one recording. Steps and checkpoints are passed as bytes, already encoded by the servo process
+    (`step_layout`).
 
-    The file grows chunk by chunk, so that a crash loses the last ``CHUNK_S`` at most; ``close`` adds the index, and,
-    where it is ``durable``, waits until the disk has it all. A file that cannot be written any more ends with its last
-    whole chunk: ``failure`` has the cause then, ``steps`` counts those in the file, ``dropped`` those that came later
-    and are not.
+    The file grows chunk by chunk, so that a crash loses at most the last ``CHUNK_S``; ``close`` adds the index, and, if
+    it is ``durable``, waits until the disk has stored everything. If writing fails, the file ends with its last
+    complete chunk: ``failure`` then contains the cause, ``steps`` counts those in the file, ``dropped`` the later ones,
+    which are not.
 
-    Raises OSError where the file cannot be begun.
+    Raises OSError if the file cannot be created.
     """
 
     def __init__(
@@ -99,7 +102,7 @@ class FlightRecorder:
         self._block_bytes = 0
         self._block_ns = 0
         self._blocks, self._checkpoints = StepBlocks(), Checkpoints()
-        # A message is a chunk: what is in it is compressed already, by what it is.
+        # A message is a chunk: its content is compressed already, by a method for its kind.
         self._writer = Writer(
             self._stream, chunk_size=1, compression=CompressionType.NONE, enable_data_crcs=True,
             index_types=IndexType.CHUNK,
@@ -122,11 +125,11 @@ class FlightRecorder:
 
     @property
     def size(self) -> int:
-        """Bytes in the file so far; the last chunk is not in it yet."""
+        """Bytes in the file so far, without the last chunk."""
         return self._stream.tell()
 
     def write(self, message: RecordedStep | RecordedCheckpoint) -> None:
-        """Append what the servo loop sent, with the gap before it."""
+        """Append a message of the servo loop, with the gap before it."""
         if message.lost:
             self.gap(message.lost, message.t_ns)
         if isinstance(message, RecordedCheckpoint):
@@ -149,7 +152,7 @@ class FlightRecorder:
             self._flush()
 
     def checkpoint(self, step: int, state: bytes, t_ns: int) -> None:
-        """Append the state as it was before step ``step``."""
+        """Append the state before step ``step``."""
         self._flush()
         self._blocks.begin()
         self._add("state", self._checkpoints.compress(msgspec.msgpack.encode((step, state))), t_ns)
@@ -160,7 +163,7 @@ class FlightRecorder:
         self._add("gap", msgspec.msgpack.encode(lost), t_ns)
 
     def _flush(self) -> None:
-        """Write the steps of the block at hand."""
+        """Write the steps of the current block."""
         if self._block:
             block, self._block, self._block_bytes = self._block, [], 0
             self._add("steps", self._blocks.compress(block), self._block_ns)
@@ -184,7 +187,7 @@ class FlightRecorder:
         self._pending = len(self._block)
 
     def _fail(self, error: OSError, size: int) -> None:
-        """End the recording; the chunk at hand is in the file where it has grown beyond ``size``."""
+        """End the recording; the current chunk is in the file if the file has grown beyond ``size``."""
         if self._stream.size > size:
             self._pending = 0
         self.failure = error.strerror or str(error)
@@ -209,7 +212,7 @@ class FlightRecorder:
             self._fail(error, size)
 
     def abandon(self) -> None:
-        """Leave the file as it is: of a disk that takes no more."""
+        """Leave the file as it is: the disk accepts no more data."""
         with suppress(OSError):
             self._stream.close()
 

@@ -1,5 +1,5 @@
-"""What a cell does as messages with Foxglove's well-known schemas: joints, commands, status, log, markers in the
-pictures, and, where the model is metric, arm, cameras and markers in space.
+"""Activity of a cell as messages with Foxglove's well-known schemas: joints, commands, status, log, markers in the
+pictures, and, if the model is metric, arm, cameras and markers in space.
 
 Times are nanoseconds of the wall clock. The functions take plain arrays and names, so that a recording and a live cell
 have the same channels.
@@ -58,7 +58,7 @@ WARNINGS = {"warning", "stopped", "health", "held", "goal_cancelled", "goal_pree
 
 
 class CellStatus(msgspec.Struct, frozen=True):
-    """What the loop judges, for plots: errors [px], share of the way, codes of the reasons."""
+    """Quantities judged by the loop, for plots: errors [px], completed fraction of the path, codes of the reasons."""
 
     lifecycle: str
     source: str
@@ -75,7 +75,7 @@ class CellStatus(msgspec.Struct, frozen=True):
 
 
 def cell_status(status: Status | StateMessage) -> CellStatus:
-    """What of a step's status, or of a live cell's state, is plotted."""
+    """The plotted values of a step's status, or of a live cell's state."""
     return CellStatus(
         lifecycle=status.lifecycle,
         source=status.source,
@@ -93,14 +93,14 @@ def cell_status(status: Status | StateMessage) -> CellStatus:
 
 
 class Published(NamedTuple):
-    """A message on its way to a file or viewer: ``content`` is one of foxglove's messages, or a `CellStatus`."""
+    """A message for a file or viewer: ``content`` is one of foxglove's messages, or a `CellStatus`."""
 
     topic: str
     t_ns: int
     content: Any
 
     def encode(self) -> bytes:
-        """The bytes of the message, as the schema of its channel says."""
+        """The bytes of the message, according to the schema of its channel."""
         if isinstance(self.content, CellStatus):
             return msgspec.json.encode(self.content)
         return bytes(self.content.encode())
@@ -142,7 +142,7 @@ def joints(
     velocities: Sequence[float] | FloatArray | None = None,
     efforts: Sequence[float] | FloatArray | None = None,
 ) -> Published:
-    """Joints [rad, rad/s, N m; or m, m/s, N] by name, what is known of them."""
+    """Joints [rad, rad/s, N m; or m, m/s, N] by name, with the known values."""
 
     def value(array: Sequence[float] | FloatArray | None, j: int) -> float | None:
         return None if array is None else float(array[j])
@@ -164,7 +164,7 @@ def log(t_ns: int, kind: str, message: str, origin: str) -> Published:
 
 
 def reasons(t_ns: int, found: Sequence[Reason]) -> Published:
-    """Why the arm does not do more, as a line of a log."""
+    """The reasons that limit the arm's motion, as a line of a log."""
     text = "; ".join(f"{reason.code} {reason.subject}: {reason.hint}" for reason in found) or "none"
     level = LogLevel.Warning if found else LogLevel.Info
     return Published("/reasons", t_ns, Log(timestamp=stamp(t_ns), level=level, message=text, name="reasons"))
@@ -203,7 +203,7 @@ def markers_seen(
 class MetricScene:
     """Arm, cameras and markers of a ``model`` in space, in the Euclidean frame of its first camera.
 
-    The unit of length is the distance between the first two cameras (the first camera's focal length where there is
+    The unit of length is the distance between the first two cameras (the first camera's focal length if there is only
     one camera), because a model from pictures alone has no other. Raises ValueError for a model that is not metric.
     """
 
@@ -296,7 +296,7 @@ def _sphere(v: FloatArray, size: float) -> SpherePrimitive:
 
 
 def _camera(centre: FloatArray, rotation: FloatArray) -> LinePrimitive:
-    """A pyramid from a camera's centre towards what it sees."""
+    """A pyramid from a camera's centre in its viewing direction."""
     corners = [
         centre + 0.1 * np.array([x, y, 1.5]) @ rotation for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))
     ]
@@ -321,7 +321,7 @@ def _entity(t_ns: int, name: str, **primitives: Any) -> SceneEntity:
 
 
 def set_points_of(target: Any, camera: str) -> FloatArray | None:
-    """Set-points (k, 2) [px] of a goal's target in a camera, where they are stated as pixels."""
+    """Set-points (k, 2) [px] of a goal's target in a camera, if they are stated as pixels."""
     stated: Mapping[str, Mapping[int, tuple[float, float]]] = getattr(target, "set_points", {})
     found = stated.get(camera)
     return None if not found else np.array(list(found.values()), dtype=np.float64)

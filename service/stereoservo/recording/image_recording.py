@@ -1,4 +1,4 @@
-"""Recording of one camera's frames into a video file by a thread, on request; frames that it cannot keep up with are
+"""Recording of one camera's frames into a video file by a thread, on request; frames that it cannot process in time are
 left out and counted.
 """
 
@@ -23,7 +23,7 @@ REQUEST_EVERY_NS = 250_000_000
 WAITING_FRAMES = 64
 WAITING_BYTES = 64 << 20
 CLOSING_S = 3.0
-"""Queued frames must be written by then when the process ends; its supervisor kills it after 4 s."""
+"""Time [s] within which queued frames must be written when the process ends; its supervisor kills it after 4 s."""
 NICENESS = 10
 ENDING = ("limit", "disk", "exists", "codec", "closed")
 """Errors of a writer after which nothing more can be recorded; others leave out one frame."""
@@ -40,7 +40,7 @@ class _Recording:
     waiting: deque[tuple[Frame, int]] = field(default_factory=deque)
     waiting_bytes: int = 0
     skipped: int = 0
-    """Left out since the last frame that was queued."""
+    """Number of frames left out since the last one that was queued."""
     ending: bool = False
     frames: int = 0
     left_out: int = 0
@@ -54,7 +54,7 @@ class _Recording:
 class ImageRecorder:
     """Records one camera while a recording is requested. ``report(kind, message, images)`` is called with each result.
 
-    Never raises on what the disk or the camera does: a recording that cannot continue ends and is reported.
+    Never raises on errors of the disk or the camera: a recording that cannot continue ends and is reported.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ImageRecorder:
         recording = self._recording
         if (
             recording is None or recording.ending
-        ):  # what came later would keep a slow disk or computer from its end
+        ):  # later frames would prevent a slow disk or computer from finishing
             return
         for frame in delivered:
             if not isinstance(frame, Frame):
@@ -188,7 +188,7 @@ class ImageRecorder:
             _finish(recording, writer, missing)
 
     def _open(self, file: Path, first: Frame) -> ImageWriter:
-        """Begin the files with the size of the first picture. Raises ImageFileError, OSError."""
+        """Create the files with the size of the first picture. Raises ImageFileError, OSError."""
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         height, width = first.image.shape
         return ImageWriter(

@@ -18,7 +18,7 @@ from stereoservo.recording.replay import RecordingError, recorded_messages
 from stereoservo.recording.step_layout import StepRecord, decode_step
 
 SPEED_OVER_NS = 50_000_000
-"""Joint speeds are differences over so long: encoders resolve no shorter ones."""
+"""Interval [ns] over which joint speeds are computed as differences: encoders do not resolve shorter ones."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,10 @@ def _calibrates(record: StepRecord) -> bool:
 
 
 def rest_intervals(motion: RecordedMotion, settle_s: float) -> list[RestInterval]:
-    """Intervals at rest in order; only those after the last calibration's start, where there was one.
+    """Intervals at rest in order; only those after the last calibration's start, if there was one.
 
-    An interval begins where zero velocity is commanded and needs ``settle_s`` to settle, as in the calibration motion.
-    It ends where a joint moves all the same (by hand, for example); the remainder needs ``settle_s`` again.
+    An interval starts where zero velocity is commanded and needs ``settle_s`` to settle, as in the calibration motion.
+    It ends if a joint moves nevertheless (by hand, for example); the remainder needs ``settle_s`` again.
     """
     now, moving = motion.now_ns, _moving(motion)
     still = motion.asked & (now >= motion.calibration_ns)

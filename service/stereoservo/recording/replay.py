@@ -33,16 +33,15 @@ from stereoservo.recording.step_layout import StepRecord, decode_step, outputs_c
 from stereoservo.recording.step_records import Fingerprint, comparable, fingerprint
 
 LARGEST_RECORD = LARGEST
-"""More than a recorder puts into one record: a stated size beyond it is damage, and is not allocated."""
+"""Largest record that a recorder writes [bytes]: a larger stated size is damage, and is not allocated."""
 LZ4_STATES_SIZE = 0x08
-"""Flag of an LZ4 frame: its header has the size of the content."""
+"""Flag of an LZ4 frame: its header contains the size of the content."""
 
 
 class RecordingError(DamagedError):
-    """A recording cannot be read: names the file, how far it is good, and the cause.
+    """A recording cannot be read: the message contains the file, how far it is valid, and the cause.
 
-    ``cut``: the file ends inside a record, as after a crash. ``result``: the replay of what comes before, where that
-    has steps.
+    ``cut``: the file ends inside a record, as after a crash. ``result``: the replay of the valid part, if it has steps.
     """
 
     def __init__(self, path: Path, steps: int, cause: str, *, cut: bool = False) -> None:
@@ -56,7 +55,7 @@ class RecordingError(DamagedError):
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """``identical`` is None where the fingerprints differ in what was run; ``max_relative_error`` counts then.
+    """``identical`` is None if the fingerprints of the programs differ; then ``max_relative_error`` is relevant.
     ``last_step``: number of the last step that was compared.
     """
 
@@ -71,7 +70,7 @@ class ReplayResult:
 
 
 class _Replay:
-    """A recording's messages through a fresh core, one after the other, and what came of it so far."""
+    """Replays a recording's messages through a new core, one after the other, and collects the results."""
 
     def __init__(self) -> None:
         self._core: ServoCore | None = None
@@ -84,7 +83,9 @@ class _Replay:
         self.last_step = -1
 
     def take(self, topic: str, data: bytes) -> tuple[StepInputs, StepOutputs] | None:
-        """The next message; returns inputs and outputs of a step. Raises what its decoding and the core raise."""
+        """Process the next message; returns inputs and outputs of a step. Raises the exceptions of its decoding and of
+        the core.
+        """
         if topic == "header":
             self._take_header(data)
         elif topic == "gap":
@@ -123,7 +124,7 @@ class _Replay:
         return record.inputs, outputs
 
     def result(self, path: Path) -> ReplayResult:
-        """What came of the whole recording. Raises RecordingError where that was nothing."""
+        """The result of the whole recording. Raises RecordingError if it has none."""
         if self.settings is None or self.recorded is None:
             raise RecordingError(path, self.steps, "holds no header; is it a flight recording?")
         if self.steps == 0:
@@ -147,18 +148,18 @@ def replay(
     observe: Callable[[StepInputs, StepOutputs], None] | None = None,
     header: Callable[[CoreSettings], None] | None = None,
 ) -> ReplayResult:
-    """Run a recording through a fresh core. Raises RecordingError on a damaged, cut or foreign file, with the result of
-    what comes before that.
+    """Run a recording through a new core. Raises RecordingError on a damaged, cut or foreign file, with the result of
+    the valid part before.
 
-    ``header`` is given the core's settings, ``observe`` every step's inputs and outputs: reports and debuggers read a
-    recording through them.
+    ``header`` is called with the core's settings, ``observe`` with every step's inputs and outputs, for reports and
+    debuggers.
     """
     run = _Replay()
     try:
         for topic, data in recorded_messages(path):
             try:
                 stepped = run.take(topic, data)
-            except Exception as error:  # a decoder, or the core at inputs that no core has seen
+            except Exception as error:  # from a decoder, or the core with inputs that no core has processed
                 raise RecordingError(path, run.steps, _cause(error, topic, run.recorded)) from error
             if topic == "header" and header is not None and run.settings is not None:
                 header(run.settings)
@@ -223,13 +224,13 @@ def _compare(record: StepRecord, outputs: StepOutputs) -> tuple[bool, float]:
 
 
 class _Contents:
-    """Steps and checkpoints out of a file's messages, as they were before they were compressed."""
+    """The steps and checkpoints in a file's messages, decompressed."""
 
     def __init__(self) -> None:
         self._blocks, self._checkpoints = StepBlocks(), Checkpoints()
 
     def of(self, topic: str, data: bytes) -> list[tuple[str, bytes]]:
-        """Topic and content of what a message holds. Raises anything on damaged bytes."""
+        """Topic and content of the parts of a message. Raises any exception on damaged bytes."""
         if topic == "steps":
             return [("step", step) for step in self._blocks.restore(data)]
         if topic == "state":
@@ -239,7 +240,7 @@ class _Contents:
 
 
 class _BoundedFile:
-    """A recording's bytes, of which no more are read than there are. ``cut``: more were asked for."""
+    """A recording's file, read up to its end only. ``cut``: more bytes were requested than it has."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -257,7 +258,7 @@ class _BoundedFile:
 
 
 def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Topic and payload in file order. Raises RecordingError naming how far the file is good."""
+    """Topic and payload in file order. Raises RecordingError that states how far the file is valid."""
     steps = messages = 0
     stated: int | None = None
     topics: dict[int, str] = {}
@@ -288,17 +289,17 @@ def recorded_messages(path: Path) -> Iterator[tuple[str, bytes]]:
                     yield topic, data
             elif isinstance(record, Statistics):
                 stated = record.message_count
-        if stated != messages:  # a reader skips records of kinds that it does not know: a damaged kind is one
+        if stated != messages:  # a reader skips unknown kinds of records, and a damaged kind is one
             raise ValueError(f"it states {stated} messages and {messages} were read")
 
 
 @dataclass(frozen=True)
 class RecordedSpan:
-    """What is known of a recording before it is replayed: times [ns] of its first and last step, by its own clock, and
-    the models of its first state, by epoch.
+    """Facts about a recording before its replay: times [ns] of its first and last step, by its own clock, and the
+    models of its first state, by epoch.
 
-    ``shift_ns``: wall clock less that clock, which counts from a computer's start: the last step is taken for the time
-    when the file was last changed.
+    ``shift_ns``: wall clock minus that clock, which counts from a computer's start: the time of the last change of the
+    file is taken as the time of the last step.
     """
 
     first_ns: int
@@ -317,7 +318,7 @@ def recorded_span(source: Path) -> RecordedSpan:
             begun = True
             try:
                 state = decode_state(msgspec.msgpack.decode(data)[1])
-            except Exception:  # whatever is wrong with it, the replay says it
+            except Exception:  # any error is reported by the replay
                 continue
             models = {m.epoch: m for m in (state.model, state.pending_model) if m is not None}
         elif topic == "step":
@@ -327,7 +328,7 @@ def recorded_span(source: Path) -> RecordedSpan:
 
 
 def whole_messages(source: Path) -> Iterator[tuple[str, bytes]]:
-    """The recording's messages, without those that another export has added; up to where it is cut, if it is."""
+    """The recording's messages, without those added by another export; up to where it is cut, if it is."""
     try:
         for topic, data in recorded_messages(source):
             if topic in ("header", "step", "checkpoint", "gap"):
@@ -338,7 +339,7 @@ def whole_messages(source: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def _records(source: _BoundedFile) -> Iterator[McapRecord]:
-    """All records in file order, those of chunks after the chunk's checksum. Raises anything."""
+    """All records in file order, those of chunks after the chunk's checksum. Raises any exception."""
     reader = StreamReader(
         source,
         emit_chunks=True,
@@ -354,7 +355,7 @@ def _records(source: _BoundedFile) -> Iterator[McapRecord]:
 
 
 def _check_sizes(chunk: Chunk) -> None:
-    """Raises ValueError for a chunk whose compressed data state another size than the chunk: it is what would be
+    """Raises ValueError for a chunk whose compressed data state another size than the chunk, because that size would be
     allocated.
     """
     size = chunk.uncompressed_size

@@ -1,8 +1,8 @@
-"""Flight ring: the servo loop's last minutes in segments on disk, each of which replays by itself; bounded in time, in
-bytes and by the free space of the disk; kept aside at a fault.
+"""Flight ring: the servo loop's last minutes in segments on disk, each of which can be replayed alone; bounded in time,
+in bytes and by the free space of the disk; kept separately at a fault.
 
-A segment is an ordinary recording that begins with a checkpoint of the state. The oldest ones are dropped whole. What a
-gateway that was killed has left stays, and its successor goes on in a new segment.
+A segment is an ordinary recording that starts with a checkpoint of the state. The oldest ones are deleted completely.
+Segments of a gateway that was killed remain, and its successor continues in a new segment.
 """
 
 from __future__ import annotations
@@ -23,21 +23,23 @@ from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep,
 
 SEGMENT_S = 60.0
 SEGMENTS = 16
-"""A segment has at most this part of the ring's bytes."""
+"""Largest size of a segment, as the ring's size divided by this number."""
 AFTER_FAULT_S = 5.0
-"""What is kept of a fault goes on for so long after it."""
+"""Time [s] after a fault that is kept with it."""
 WAITING_BYTES = 16 << 20
 CLOSING_S = 3.0
 GATHERING_S = 0.04
-"""Between two batches that are written: a thread that is woken for each message costs more than it writes."""
+"""Interval [s] between two batches that are written: waking a thread for each message costs more time
+than writing it.
+"""
 
 Report = Callable[[str, str], None]
-"""Is told the kind of an event, ``ring_kept`` or ``warning``, and its message."""
+"""Called with the kind of an event, ``ring_kept`` or ``warning``, and its message."""
 
 
 class RingLimits(NamedTuple):
-    """``seconds`` and ``bytes`` of the ring; ``reserve_bytes`` of the disk stay free; ``kept``: faults whose ring is
-    kept aside, each of at most ``bytes``.
+    """``seconds`` and ``bytes`` of the ring; ``reserve_bytes`` of the disk remain free; ``kept``: number of faults
+    whose ring is kept separately, each of at most ``bytes``.
     """
 
     seconds: float
@@ -49,8 +51,9 @@ class RingLimits(NamedTuple):
 class FlightRing:
     """The ring in a ``directory``: segments in ``ring/``, those of faults in ``kept/``.
 
-    Never raises on what the disk does: it is reported once, and tried again with later checkpoints; ``trouble`` has it
-    until a segment grows again. ``wall``: seconds of the wall clock; ``free``: bytes left on the disk of a path.
+    Never raises on errors of the disk: an error is reported once, and writing is tried again at later checkpoints;
+    ``trouble`` contains it until a segment grows again. ``wall``: seconds of the wall clock; ``free``: bytes left on
+    the disk of a path.
     """
 
     def __init__(
@@ -88,7 +91,7 @@ class FlightRing:
             self._abandon(f"{error.strerror or error}")
 
     def keep(self, t_ns: int) -> None:
-        """Keep the ring aside, with what follows the fault at ``t_ns``."""
+        """Keep the ring separately, with the steps after the fault at ``t_ns``."""
         if self._keep_ns is None:
             self._keep_ns = t_ns + int(AFTER_FAULT_S * 1e9)
 
@@ -102,7 +105,7 @@ class FlightRing:
             self._abandon(f"{error.strerror or error}")
 
     def _checkpoint(self, message: RecordedCheckpoint) -> None:
-        """Begin a segment where one is due, and there is room for it; write the checkpoint."""
+        """Start a segment if one is due and the disk has space for it; write the checkpoint."""
         if self._keep_ns is not None and message.t_ns >= self._keep_ns:
             self._end()
             self._move_aside()
@@ -112,7 +115,7 @@ class FlightRing:
             return
         if self._segment is None:
             self._begin(message.t_ns)
-            message = msgspec.structs.replace(message, lost=0)  # a segment begins where a gap has ended
+            message = msgspec.structs.replace(message, lost=0)  # a segment starts where a gap has ended
         self._write(message)
 
     def _write(self, message: RecordedStep | RecordedCheckpoint) -> None:
@@ -140,7 +143,7 @@ class FlightRing:
                 raise OSError(segment.failure)
 
     def _abandon(self, trouble: str) -> None:
-        """Report why nothing is written, once, and leave the segment as it is."""
+        """Report once why nothing is written, and leave the segment as it is."""
         if self._segment is not None:
             self._segment.abandon()
         self._segment = None
@@ -159,7 +162,7 @@ class FlightRing:
         return True
 
     def _prune(self) -> None:
-        """Drop the oldest segments until the rest, and one to come, keep the limits."""
+        """Delete the oldest segments until the others, and a new one, are within the limits."""
         found = sorted((path, path.stat()) for path in self.segments.glob("*.mcap"))
         total = sum(stat.st_size for _, stat in found) + self._limits.bytes // SEGMENTS
         oldest = self._wall() - self._limits.seconds
@@ -170,7 +173,7 @@ class FlightRing:
             total -= stat.st_size
 
     def _move_aside(self) -> None:
-        """Keep all segments in a directory of their own; drop the oldest of these."""
+        """Move all segments to a directory of their own; delete the oldest of these directories."""
         self._keep_ns = None
         found = sorted(self.segments.glob("*.mcap"))
         if not found or self._limits.kept == 0:
@@ -186,9 +189,10 @@ class FlightRing:
 
 
 class RingThread:
-    """A `FlightRing` written by a thread: a disk that hangs costs the ring steps, and the gateway nothing.
+    """A `FlightRing` written by a thread: a disk that hangs causes a loss of steps in the ring, but does not block the
+    gateway.
 
-    ``said``: what it has to report, kind and message, for the gateway to take.
+    ``said``: its reports, kind and message, for the gateway.
     """
 
     def __init__(self, directory: Path, limits: RingLimits) -> None:
@@ -204,11 +208,11 @@ class RingThread:
 
     @property
     def trouble(self) -> str:
-        """Why nothing is written; empty where it is."""
+        """Why nothing is written; empty if writing works."""
         return self._ring.trouble
 
     def take(self, message: StepMessage) -> None:
-        """Queue a message; after one that found the queue full, none before the next checkpoint."""
+        """Queue a message; if the queue was full, no message is queued before the next checkpoint."""
         size = _size(message)
         with self._changed:
             full = self._bytes + size > WAITING_BYTES
@@ -221,7 +225,7 @@ class RingThread:
             self._put(message)
 
     def keep(self, t_ns: int) -> None:
-        """Keep the ring aside, with what follows the fault at ``t_ns``."""
+        """Keep the ring separately, with the steps after the fault at ``t_ns``."""
         with self._changed:
             self._put(t_ns)
 
@@ -232,7 +236,7 @@ class RingThread:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write what waits and end the segment, within ``CLOSING_S``. Idempotent."""
+        """Write the queued messages and end the segment, within ``CLOSING_S``. Idempotent."""
         self._ending.set()
         with self._changed:
             self._changed.notify()
@@ -250,7 +254,7 @@ class RingThread:
         self._ring.close()
 
     def _batch(self) -> list[StepMessage | int]:
-        """What waits, all of it, once there is something; empty at the end."""
+        """All queued messages, once there are some; empty at the end."""
         self._ending.wait(GATHERING_S)
         with self._changed:
             while not self._waiting and not self._ending.is_set():
@@ -263,7 +267,7 @@ class RingThread:
 
 
 def _size(message: StepMessage) -> int:
-    """Bytes of what a message carries."""
+    """Number of bytes in a message."""
     if isinstance(message, RecordedStep):
         return len(message.data)
     return len(message.state) if isinstance(message, RecordedCheckpoint) else 0

@@ -1,10 +1,10 @@
-"""Layout of a step record: what the loop writes of each step, as bytes of fixed places for all that is usual, so that
-nothing is encoded and records of a kind can be compared word by word.
+"""Layout of a step record: the bytes that the loop writes for each step, with fixed places for all usual data, so that
+no encoder is needed and records of a kind can be compared word by word.
 
 A record is a multiple of 8 bytes, little-endian: the head (``HEAD``); the velocity before and after the safety stage;
 of joints stamps, positions, velocities, efforts, following errors; of each observation a head, the camera's name, ids,
-pixels, covariances. What is rare (requests, a model, a fault of the driver, what it sent in place of a command, samples
-of other types) follows in msgpack.
+pixels, covariances. Rare data (requests, a model, a fault of the driver, velocities that it sent in place of a command,
+samples of other types) follow in msgpack.
 """
 
 from __future__ import annotations
@@ -30,15 +30,17 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
 
 LAYOUT = 3
-"""First byte of a record. Records of layout 2 hold the same with another checksum; msgpack's records of before begin
-with another byte."""
+"""Layout number, the first byte of a record. Records of layout 2 have the same content with another checksum; older
+records in msgpack start with another byte.
+"""
 HEAD = struct.Struct("<BBBBIqqqqIHH")
 """Layout, flags, joints of a velocity, observations, CRC of the outputs; step, now, period, parameter epoch; bytes of
-the rest, joints of a sample, a mark of the cameras whose observations follow."""
+the rest, joints of a sample, a mark of the cameras whose observations follow.
+"""
 SAMPLE = struct.Struct("<qq")
-"""Sequence number, and time less that of the step."""
+"""Sequence number, and time minus that of the step."""
 SIGHT = struct.Struct("<IIqqq")
-"""Bytes of the camera's name, markers; sequence number, times of shutter and receipt less that of the step."""
+"""Bytes of the camera's name, markers; sequence number, times of shutter and receipt minus that of the step."""
 STOP, CONFIGURED, ACTIVE, COMPILING, COMMAND, JOINTS, EFFORTS, FOLLOWING = (1 << k for k in range(8))
 LARGEST_COUNT = 255
 _NONE = b"\0"
@@ -73,9 +75,9 @@ _arrays, _numbers, _words = attrgetter(*_ARRAYS), attrgetter(*_NUMBERS), attrget
 
 
 def result_crc(result: StepResult) -> int:
-    """CRC-32 of what a step has come to, bit for bit: velocities before and after the safety stage and of the joints,
-    the goal's error, events, what the driver is asked for. What else there is in outputs follows from the state, which
-    checkpoints hold; whether there is a command, from the record's flags.
+    """CRC-32 of the result of a step, bit for bit: velocities before and after the safety stage and of the joints, the
+    goal's error, events, the request to the driver. All other outputs follow from the state, which checkpoints contain;
+    the existence of a command follows from the record's flags.
     """
     crc = zlib.crc32(result.values)  # type: ignore[arg-type]
     events, request = result.events, result.driver_request
@@ -83,8 +85,8 @@ def result_crc(result: StepResult) -> int:
 
 
 def outputs_crc(outputs: StepOutputs, layout: int = LAYOUT) -> int:
-    """CRC-32 of a step's outputs, as a record of this ``layout`` has it (1: of their encoding in msgpack; 2: of all
-    outputs but time and number; 3: `result_crc`).
+    """CRC-32 of a step's outputs as in a record of this ``layout`` (1: of their encoding in msgpack; 2: of all outputs
+    except time and number; 3: `result_crc`).
     """
     if layout == 1:
         return zlib.crc32(encode(outputs))
@@ -92,7 +94,7 @@ def outputs_crc(outputs: StepOutputs, layout: int = LAYOUT) -> int:
 
 
 def _all_outputs_crc(outputs: StepOutputs) -> int:
-    """CRC-32 of all outputs of a step but their time and number, bit for bit."""
+    """CRC-32 of all outputs of a step except their time and number, bit for bit."""
     status = outputs.status
     numbers = [*_numbers(status), *status.innovation_px.values()]
     numbers = [NOT_MEASURED if value is None else value for value in numbers]
@@ -144,7 +146,7 @@ def _joined(parts: list[Any]) -> bytes:
 
 
 def _add_sample(parts: list[Any], joints: JointState, now_ns: int) -> int:
-    """Add a sample whose arrays are what the layout takes; returns the number of joints, 0 where they are not."""
+    """Add a sample if the layout supports its arrays; returns the number of joints, 0 if it does not."""
     positions, velocities = joints.positions, joints.velocities
     efforts, following = joints.efforts, joints.following_errors
     shape = positions.shape
@@ -154,7 +156,7 @@ def _add_sample(parts: list[Any], joints: JointState, now_ns: int) -> int:
         return 0
     try:
         added: list[Any] = [_sample(joints.seq, joints.t_ns - now_ns), positions, velocities]
-    except struct.error:  # a stamp beyond all bounds
+    except struct.error:  # a stamp out of range
         return 0
     if efforts is not None:
         if efforts.shape != shape or efforts.dtype != _FLOAT:
@@ -169,7 +171,7 @@ def _add_sample(parts: list[Any], joints: JointState, now_ns: int) -> int:
 
 
 def _add_sights(parts: list[Any], seen: tuple[CameraObservation, ...], now_ns: int) -> bool:
-    """Add observations whose arrays are what the layout takes; False where they are not, and nothing is added."""
+    """Add observations if the layout supports their arrays; otherwise adds nothing and returns False."""
     added: list[Any] = []
     for observation in seen:
         ids, pixels, covariances = observation.ids, observation.pixels, observation.covariances
@@ -185,7 +187,7 @@ def _add_sights(parts: list[Any], seen: tuple[CameraObservation, ...], now_ns: i
         times = observation.t_shutter_ns - now_ns, observation.t_received_ns - now_ns
         try:
             added.append(_sight(len(name), k, observation.seq, *times))
-        except struct.error:  # a stamp beyond all bounds
+        except struct.error:  # a stamp out of range
             return False
         added += (_padded(name), ids, pixels, covariances)
     if len(seen) > LARGEST_COUNT:
@@ -199,7 +201,7 @@ def _padded(data: bytes) -> bytes:
 
 
 def _rest(inputs: StepInputs, *, joints: bool, observations: bool) -> bytes:
-    """What the fixed places do not hold, with its length before it."""
+    """The data without a fixed place, preceded by their length."""
     bare = msgspec.structs.replace(
         inputs,
         joints=inputs.joints if joints else None,
@@ -210,7 +212,7 @@ def _rest(inputs: StepInputs, *, joints: bool, observations: bool) -> bytes:
 
 
 class _Reader:
-    """Takes parts of a record, one after the other. Raises ValueError where there are not so many bytes."""
+    """Reads the parts of a record, one after the other. Raises ValueError if too few bytes are left."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -235,12 +237,12 @@ class _Reader:
 
 
 def form_of(record: bytes) -> int:
-    """A number that records which hold the same in the same places have in common, beside their length."""
+    """A number that is equal for records of the same length with the same content in the same places."""
     return zlib.crc32(record[1:4] + record[HEAD.size - 2 : HEAD.size])
 
 
 def decode_step(data: bytes) -> StepRecord:
-    """A record of this layout or the one before. Raises msgspec.MsgspecError, ValueError."""
+    """A record of this layout or the previous one. Raises msgspec.MsgspecError, ValueError."""
     if data[:1] not in (b"\2", bytes((LAYOUT,))):
         return _old_decoder.decode(data)
     reader = _Reader(data)

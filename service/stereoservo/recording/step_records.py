@@ -33,7 +33,7 @@ class Fingerprint(msgspec.Struct, frozen=True):
     processor: str
     libc: str
     laws: dict[str, str] = {}
-    """Version and source hash of every law that was installed; empty in recordings made before it was kept."""
+    """Version and source hash of every installed law; empty in recordings made before it was stored."""
 
 
 @cache
@@ -53,7 +53,7 @@ def fingerprint() -> Fingerprint:
 def comparable(recorded: Fingerprint, present: Fingerprint, used: Container[str]) -> bool:
     """Whether a replay must give the same bits, for a recording in which the laws ``used`` ran.
 
-    Laws that did not run do not matter, nor those of a recording that holds none.
+    Laws that did not run are not compared, nor are those of a recording that states none.
     """
     bare = msgspec.structs.replace(present, laws=recorded.laws)
     laws = recorded.laws.items()
@@ -74,7 +74,7 @@ def _processor() -> str:
 
 CHECKPOINT_EVERY_S = 5.0
 TRY_AGAIN_S = 0.1
-"""After a checkpoint that found no room: one encodes the whole state."""
+"""Interval [s] after a checkpoint that the recorder could not take: encoding one takes time for the whole state."""
 
 
 class RecordingStart(msgspec.Struct, frozen=True, tag="start", array_like=True, eq=False):
@@ -108,13 +108,13 @@ class StepSink(Protocol):
     """Protocol of one connected recorder."""
 
     def send(self, message: StepMessage) -> bool:
-        """Hand a message over; False where the recorder cannot take it now."""
+        """Pass a message on; returns False if the recorder cannot take it now."""
         ...
 
 
 class StepStream:
-    """Sends each step, and a checkpoint at the start, every ``CHECKPOINT_EVERY_S`` and after a gap; one that the
-    recorder could not take is made anew after ``TRY_AGAIN_S``, and no step is sent after a gap before it.
+    """Sends each step, and a checkpoint at the start, every ``CHECKPOINT_EVERY_S`` and after a gap. A checkpoint that
+    the recorder could not take is made again after ``TRY_AGAIN_S``, and after a gap no step is sent before it.
 
     ``dropped`` counts the steps that a recorder could not take.
     """
@@ -131,7 +131,7 @@ class StepStream:
         self.dropped = 0
 
     def before(self, sink: StepSink | None, core: ServoCore, now_ns: int) -> None:
-        """Begin the stream where ``sink`` is a new recorder; send a checkpoint of ``core`` when one is due."""
+        """Start the stream if ``sink`` is a new recorder; send a checkpoint of ``core`` when one is due."""
         if sink is not self._connected:
             self._connected = sink
             self._sink = sink if sink is not None and sink.send(self._start) else None

@@ -26,16 +26,16 @@ def cartesian2_kernel(room: Record) -> None:
 
 
 def cartesian2(scene: Scene, task: Task, options: Options) -> LawStep:
-    """``q̇ = [q̂_t q̂_s] Λ e``, ``e = (τ, θ_s)`` the motion still to be made (8.55).
+    """``q̇ = [q̂_t q̂_s] Λ e``, ``e = (τ, θ_s)`` the remaining motion (8.55).
 
-    The rotation takes the short way round, or the long one where only that keeps the face in sight; where neither
-    does, the hinge of the law in three components goes first, and the status says WAITS.
+    The rotation takes the shorter direction, or the longer one if only that keeps the face visible. If neither does,
+    the hinge of the law in three components is made first, and the status is WAITS.
     """
     return velocity_step(scene, task, options, 2)
 
 
 def cartesian2_reasons(step: LawStep) -> tuple[Reason, ...]:
-    """Components that the arm cannot make, or that wait; empty when all move."""
+    """Reasons for components that the arm cannot make, or that wait; empty if all move."""
     return cartesian_reasons(COMPONENTS, UNITS, step.error, step.allowed, step.status)
 
 

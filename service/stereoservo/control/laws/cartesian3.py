@@ -1,18 +1,18 @@
 """Control law ``cartesian3``: Cartesian servoing in three components (thesis 8.42), translation of the centre, hinge
 that aligns the plane of a marker face, turn of the face in its plane. Also the step that ``cartesian2`` shares.
 
-The centre goes on a straight line while the face is turned about it. `cartesian2` shares what is here; it makes hinge
-and turn one rotation (8.55). A component that would turn the face out of a camera's view waits for the other
-(`way_in_sight`); a velocity that is held for a while makes exactly the motion that was meant
+The centre moves on a straight line while the face is rotated about it. `cartesian2` uses the same functions; it
+combines hinge and turn into one rotation (8.55). A component that would turn the face out of a camera's view waits for
+the other (`way_in_sight`); a velocity that is held for a time makes exactly the intended motion
 (`control.step_correction`).
 
-The face's visibility during the motion (thesis 7.4.2): it is turned by ``t`` about an axis through the centre while the
-centre goes the share ``s`` of its straight line. A camera at ``O`` sees it while ``f(s, t) = a(t)ᵀ(O − s Δ) > 0``,
-``a(t) = exp(−tĤᵀ)a``: affine in ``s``, a sinusoid in ``t``. So at every ``t`` the shares in sight are one interval, and
-a way on which neither goes back exists where the largest lower bound so far never exceeds the upper one. From it: how
-far the translation may go before the turn has caught up, how far the turn may go before the translation has, and in
-which of its two senses the turn has a way at all: one rotation leads the face's normal along a small circle, and its
-short arc may pass behind the horizon where the long one does not.
+The face's visibility during the motion (thesis 7.4.2): it is rotated by ``t`` about an axis through the centre while
+the centre moves the fraction ``s`` of its straight line. A camera at ``O`` sees it while ``f(s, t) = a(t)ᵀ(O − s Δ) >
+0``, ``a(t) = exp(−tĤᵀ)a``: affine in ``s``, a sinusoid in ``t``. So at every ``t`` the visible fractions are one
+interval, and a path with monotonic ``s`` and ``t`` exists if the largest lower bound so far never exceeds the upper
+one. This determines how far the translation may go before the rotation has caught up, how far the rotation may go
+before the translation has, and in which of its two directions the rotation is possible at all: the shorter rotation may
+violate visibility; the longer one is then taken.
 """
 
 from __future__ import annotations
@@ -59,19 +59,19 @@ from stereoservo.planning.three_point_decomposition import DONE, MOVES, NO_FACE,
 # -- visibility of the face ------------------------------------------------------------------------------------------
 
 SAMPLES = 32
-"""Angles at which a turn is looked at; they lie closer the less of it is left."""
+"""Number of angles at which a rotation is checked; their spacing decreases with the remaining angle."""
 MARGIN_OF_END = 0.1
 MARGIN_OF_NOW = 0.5
-"""A camera is kept on the face's front by the smaller of these shares of ``f`` at the end and now."""
+"""A camera must stay on the face's front by a margin, the smaller of these fractions of ``f`` at the end and now."""
 APPROACH = 4.0
-"""A component slows where its bound is nearer than this part of what it has to make: 1/4."""
+"""Inverse of the fraction of the remaining motion at which a component slows down before its bound: 1/4."""
 
 
 @kernel
 def _way(
     F: FloatArray, G: FloatArray, margins: FloatArray, cameras: int, angle: float, margin: float
 ) -> tuple[float, float, bool]:
-    """Share of the translation, turn, and whether the way is clear."""
+    """Allowed fraction of the translation, allowed rotation, and whether the path is clear."""
     size = abs(angle)
     share, turn, reached = 1.0, size, 0.0
     clear, going = True, True
@@ -105,9 +105,11 @@ def _way(
 def way_in_sight(
     face: FloatArray, H: FloatArray, displacement: FloatArray, eyes: FloatArray, side: float, angle: float
 ) -> tuple[float, float, float, bool]:
-    """Angle, share of the translation and turn that keep a face (4,) in view, and whether a path in view exists.
+    """Angle, fraction of the translation and rotation that keep a face (4,) in view, and whether a path in view exists.
 
-    ``eyes`` (c, 4): camera centres of height 1; ``side``: 1 or -1, of the face, which is seen."""
+    ``eyes`` (c, 4): camera centres of height 1.
+    ``side``: 1 or -1, the side of the face that is seen.
+    """
     rows = np.empty((3, 4))
     for i in range(4):
         rows[0, i] = face[i]
@@ -155,19 +157,23 @@ def way_in_sight(
 COMPONENTS, UNITS = (TRANSLATION, HINGE, PLANAR), ("", "rad", "rad")
 ROTATION = "rotation of the body about its centre"
 LONGEST_STEP = 1.0
-"""[rad or m] Of a joint while a velocity is held: near a singularity a small motion of the body takes more."""
+"""Largest joint motion [rad or m] while a velocity is held: near a singularity a small motion of the body requires
+more.
+"""
 STEP_OF_BOUND = 0.9
-"""Of the way to a visibility bound, how much one step may make."""
+"""Largest fraction of the distance to a visibility bound in one step."""
 NO_MATRIX, NO_VALUES = np.zeros((0, 0)), np.zeros(0)
 BLOCKED = 1e-3
-"""Share of what is left below which a component that waits stands."""
+"""Fraction of the remaining motion below which a waiting component stops."""
 
 
 @kernel
 def _one_rotation(
     freedoms: Freedoms, parts: Components, screw: FloatArray, V: FloatArray
 ) -> tuple[float, int]:
-    """Angle and status of hinge and planar turn as one rotation (8.50 to 8.52); its screw and generator ``V``."""
+    """Angle and status of hinge and planar turn as one rotation (8.50 to 8.52); writes its screw and
+    generator ``V``.
+    """
     motions, basis = freedoms
     n, rank = basis.shape
     generators, amount, status = parts.generators, parts.amount, parts.status
@@ -231,8 +237,8 @@ class Pace(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """The ``share`` of the translation and the ``turn`` of the rotation that visibility allows; whether the hinge comes
-    first, in place of one rotation, and the ``whole`` of this rotation.
+    """Limits by visibility: the ``share`` of the translation and the ``turn`` of the rotation; whether the hinge is
+    made first, in place of one rotation, and the ``whole`` angle of this rotation.
     """
 
     share: float
@@ -252,12 +258,14 @@ def cartesian_step(
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Joint velocity (n,), task error (k,), allowed (k,) and status (k,) of both laws in one call.
 
-    The components are translation, hinge and turn (8.42), or, ``single``, translation and one rotation (8.55).
+    The components are translation, hinge and turn (8.42), or, if ``single``, translation and one rotation (8.55). A
+    component that the arm cannot make, or that visibility holds back, does not stop the others.
 
-    ``operators`` (n, 4, 4) at the current configuration (5.21), ``camera_centres`` (c, 4) of height ``a∞ᵀM = 1``. Task
-    error: τ in lengths of the frame's coordinates, angles [rad], all >= 0; allowed: what of it visibility lets the
-    components plan for; status: `ComponentStatus`. A component that the arm cannot make, or that visibility holds
-    back, does not hold up the others.
+    ``operators`` (n, 4, 4): at the current configuration (5.21); ``camera_centres`` (c, 4): of height ``a∞ᵀM = 1``.
+
+    Task error: τ in lengths of the frame's coordinates, angles [rad], all >= 0; allowed: the part of it that visibility
+    allows;
+    status: `ComponentStatus`.
     """
     points, targets, centre, centre_target = task
     n, dt_s = operators.shape[0], pace.dt_s
@@ -304,7 +312,7 @@ def cartesian_step(
 
 @kernel
 def _shortened(step: FloatArray) -> float:
-    """Share of a joint step (n,) that takes no joint farther than `LONGEST_STEP`."""
+    """Fraction of a joint step (n,) that moves no joint farther than `LONGEST_STEP`."""
     most = 0.0
     for j in range(step.shape[0]):
         most = max(most, abs(step[j]))
@@ -315,9 +323,10 @@ def _shortened(step: FloatArray) -> float:
 def _exact_into(
     arm: PresentArm, task: FaceTask, parts: Components, steps: FloatArray, dt_s: float, velocity: FloatArray
 ) -> None:
-    """The joint ``velocity`` (n,) of the components' ``steps`` (k,), corrected for the time that it is held.
+    """Compute the joint ``velocity`` (n,) of the components' ``steps`` (k,), corrected for the time for which it is
+    held.
 
-    A step that would take a joint too far is shortened as a whole: no correction holds for it.
+    A step that would move a joint too far is shortened as a whole: no correction is valid for it.
     """
     operators, composition = arm
     points, centre = task.points, task.centre
@@ -374,7 +383,7 @@ class Rates(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """What a step makes: joint ``velocity`` (n,), task error and allowed in ``components`` (2, k), status ``shown``
+    """Result of a step: joint ``velocity`` (n,), task error and allowed part in ``components`` (2, k), status ``shown``
     (k,).
     """
 
@@ -388,9 +397,9 @@ def _normalised_step_into(
     arm: PresentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped
 ) -> None:
     """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
-    the task error are those of the frame that the arguments are in.
+    the task error are in the frame of the arguments.
 
-    Into ``stepped``; ``eyes`` (c, 4): camera centres.
+    ``stepped``: receives the result; ``eyes`` (c, 4): camera centres.
     """
     operators, composition = arm
     marker_points, target_points, corners, centre, centre_target = task
@@ -428,7 +437,7 @@ def _normalised_step_into(
 
 
 class FacePlanes(NamedTuple):
-    """The plane of a face, (4,), ``now`` and ``then``, at the goal."""
+    """The plane (4,) of a face now and at the goal, ``then``."""
 
     now: FloatArray
     then: FloatArray
@@ -443,7 +452,7 @@ def _kept_in_view(
     single: bool,
     parts: Components,
 ) -> Sight:
-    """How far the components may go with the face in view; the rotation, in its sense, goes into ``parts``."""
+    """Limits of the components that keep the face in view; writes the rotation, with its direction, to ``parts``."""
     face, target_face = planes
     centre, centre_target = task.centre, task.centre_target
     n, cameras = freedoms.basis.shape[0], camera_centres.shape[0]
@@ -494,7 +503,9 @@ def _kept_in_view(
 def _paced(
     parts: Components, sight: Sight, pace: Pace, errors: FloatArray, allowed: FloatArray, shown: IntArray
 ) -> FloatArray:
-    """What each component makes in this step (k,), or its rate where ``dt_s`` is 0; errors, allowed and status."""
+    """Motion of each component in this step (k,), or its rate if ``dt_s`` is 0; writes errors, allowed parts and
+    status.
+    """
     screws, amount, status = parts.screws, parts.amount, parts.status
     share, turn, dt_s = sight.share, sight.turn, pace.dt_s
     count, n = errors.shape[0], screws.shape[1]
@@ -542,7 +553,7 @@ def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields,
 
 @kernel
 def fill_step(room: Record, count: int) -> None:
-    """The step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
+    """Compute the step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
     work = room[0]
     n, m, c = work.joints, work.markers, work.eye_count
     arm = PresentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
@@ -582,7 +593,7 @@ def cartesian_reasons(
     allowed: FloatArray,
     status: IntArray,
 ) -> tuple[Reason, ...]:
-    """What a step has to tell: components that the arm cannot make, or that wait. Empty when all move."""
+    """Reasons for components that the arm cannot make, or that wait. Empty if all move."""
     reasons: list[Reason] = []
     codes = status.tolist()
     if NOT_REACHABLE not in codes and WAITS not in codes and NO_FACE not in codes:
@@ -592,7 +603,7 @@ def cartesian_reasons(
         left, may = float(task_error[i]), float(allowed[i])
         if codes[i] == NOT_REACHABLE:
             hint = "the arm lacks this freedom here: leave the singularity by joints, or give another goal"
-            # an angle can only be measured by the operator that the arm lacks
+            # an angle can only be measured by an operator that the arm lacks
             value = left if component in (TRANSLATION, ROTATION) else None
             reasons.append(Reason("NOT_REACHABLE", "slow", component, value, None, in_unit, hint))
         elif codes[i] == WAITS and stuck:
@@ -611,12 +622,12 @@ def cartesian_reasons(
 
 
 def cartesian3(scene: Scene, task: Task, options: Options) -> LawStep:
-    """``q̇ = [q̂_t q̂_r q̂_p] Λ e``, ``e = (τ, θ_r, θ_p)`` the motion still to be made (8.42)."""
+    """``q̇ = [q̂_t q̂_r q̂_p] Λ e``, ``e = (τ, θ_r, θ_p)`` the remaining motion (8.42)."""
     return velocity_step(scene, task, options, 3)
 
 
 def cartesian3_reasons(step: LawStep) -> tuple[Reason, ...]:
-    """Components that the arm cannot make, or that wait; empty when all move."""
+    """Reasons for components that the arm cannot make, or that wait; empty if all move."""
     return cartesian_reasons(COMPONENTS, UNITS, step.error, step.allowed, step.status)
 
 

@@ -1,7 +1,7 @@
-"""Control law ``image``: image-based servoing in any number of cameras, one is enough (thesis 8.26).
+"""Control law ``image``: image-based servoing in any number of cameras; one is sufficient (thesis 8.26).
 
-The Jacobian is developed around points that the kinematics carry along (8.29, 8.30), so that control goes on where
-a camera drops out.
+The Jacobian is evaluated at points predicted by the kinematics (8.29, 8.30), so that control continues when a camera
+drops out.
 """
 
 from __future__ import annotations

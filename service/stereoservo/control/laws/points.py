@@ -1,8 +1,8 @@
-"""Control law ``points``: servoes the triangulated marker points to their goal points in projective space (thesis 8.13
-to 8.17, 8.34), differences measured in pixels.
+"""Control law ``points``: moves the triangulated marker points to their goal points in projective space (thesis 8.13 to
+8.17, 8.34), with differences measured in pixels.
 
-A projective frame has no lengths of its own: a displacement of a point counts as what it moves in the images of all
-cameras. The command then does not depend on the frame.
+A projective frame has no lengths of its own: a displacement of a point is measured by its motion in the images of all
+cameras. So the command does not depend on the frame.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from stereoservo.numerics.linear import add_equation, damped_solve
 
 @kernel
 def pixel_metrics(matrices: FloatArray, points: FloatArray) -> FloatArray:
-    """``J_G P`` of all cameras (m, 2c, 4): what a displacement of a point (m, 4) is worth in pixels; NaN at depth 0."""
+    """``J_G P`` of all cameras (m, 2c, 4): converts a displacement of a point (m, 4) to pixels; NaN at depth 0."""
     out = np.empty((points.shape[0], 2 * matrices.shape[0], 4))
     for p in range(points.shape[0]):
         out[p] = pixel_gradients(matrices, points[p])
@@ -39,8 +39,8 @@ def pixel_metrics(matrices: FloatArray, points: FloatArray) -> FloatArray:
 
 
 class PointTask(NamedTuple):
-    """Marker ``points`` (m, 4) and where they shall be, ``target_points`` (m, 4), with ``weights`` (m,), 0 where that
-    is not known; ``metrics`` (m, k, 4): what k numbers, such as pixels, a displacement of each is measured by.
+    """Marker ``points`` (m, 4) and their goal points ``target_points`` (m, 4), with ``weights`` (m,), 0 where the goal
+    point is unknown; ``metrics`` (m, k, 4): convert a displacement of each to k numbers, such as pixels.
     """
 
     points: FloatArray
@@ -88,7 +88,7 @@ def points_step(operators: FloatArray, task: PointTask, gains: Gains) -> tuple[F
             add_equation(row, error, w * w, N, b)
     conditioning = damped_solve(N, b, damping, x)
     if choice == MEAN:
-        # The mean finds a turn by θ as 2 tan(θ/2): back to the angle.
+        # The mean yields 2 tan(θ/2) for a rotation by θ: convert to the angle.
         square = 0.0
         for i in range(4):
             for k in range(4):
@@ -136,8 +136,8 @@ def points_kernel(room: Record) -> None:
 def points(scene: Scene, task: Task, options: Options) -> LawStep:
     """``q̇ = gain·J⁺(M* − M)`` over the markers that any camera sees and whose goal is known, in pixels.
 
-    With the mean Jacobian ``Ĥ_j (M + M*)/2`` the motion is the screw from here to the goal, from anywhere short of
-    half a turn. There is no fixed depth in space: that choice is the present points.
+    With the mean Jacobian ``Ĥ_j (M + M*)/2`` the motion is the screw from the current pose to the goal, from any pose
+    less than half a turn away. There is no fixed depth in space: that choice means the current points.
     """
     measured = (
         scene.points, task.target_points, _seen(scene, task), pixel_metrics(scene.matrices, scene.points)
@@ -148,7 +148,7 @@ def points(scene: Scene, task: Task, options: Options) -> LawStep:
 
 
 def _seen(scene: Scene, task: Task) -> FloatArray:
-    """Weights (m,) of the markers: of the camera that sees each best, 0 where the goal's point is not known."""
+    """Weights (m,) of the markers: of the camera with the highest weight, 0 if the goal's point is unknown."""
     found: FloatArray = scene.weights.max(axis=0, initial=0.0) * (task.target_known > 0.0)
     return found
 

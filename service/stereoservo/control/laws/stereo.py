@@ -1,7 +1,5 @@
 """Control law ``stereo``: image-based servoing on the pixel errors of all cameras, stacked (thesis 8.26 to 8.36). Also
-the damped least-squares step in the images, with rate limits, which the other laws in the images share.
-
-The damped least-squares step in the images is here, which `image`, `points` and `trajectory` share.
+the damped least-squares step in the images, with rate limits, shared by `image`, `points` and `trajectory`.
 """
 
 from __future__ import annotations
@@ -53,7 +51,9 @@ class View(NamedTuple):
 
 
 class Body(NamedTuple):
-    """Marker ``points`` (m, 4) now, and at the goal ``target_points`` (m, 4) where ``target_known`` (m,) is 1."""
+    """Marker ``points`` (m, 4) at present, and ``target_points`` (m, 4) at the goal where
+    ``target_known`` (m,) is 1.
+    """
 
     points: FloatArray
     target_points: FloatArray
@@ -61,8 +61,8 @@ class Body(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """How a law in the images works: ``gain`` [1/s] of a velocity as it is held, ``choice`` of the Jacobian
-    (`JacobianChoice`), ``damping`` relative to the largest diagonal of the normal matrix.
+    """Parameters of a law in the images: ``gain`` [1/s] of a velocity as it is held, ``choice`` of the Jacobian
+    (`JacobianChoice`), ``damping`` relative to the largest diagonal element of the normal matrix.
     """
 
     gain: float
@@ -72,7 +72,7 @@ class Gains(NamedTuple):
 
 @kernel
 def velocities_into(operators: FloatArray, M: FloatArray, out: FloatArray) -> None:
-    """``Ĥ_j M`` of one point (4,) into (n, 4)."""
+    """Write ``Ĥ_j M`` of one point (4,) to (n, 4)."""
     for j in range(operators.shape[0]):
         G = operators[j]
         for i in range(4):
@@ -97,7 +97,9 @@ def pixel_gradients(matrices: FloatArray, X: FloatArray) -> FloatArray:
 
 @kernel
 def add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, rows: FloatArray) -> None:
-    """``share`` times ``J_G P Ĥ_j M`` (8.33) onto (2, n), for velocities ``Ĥ_j M`` (n, 4); NaN at depth 0."""
+    """Add ``share`` times ``J_G P Ĥ_j M`` (8.33) to ``rows`` (2, n), for velocities ``Ĥ_j M`` (n, 4);
+    NaN at depth 0.
+    """
     d = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
     scale = 1.0 / d if d != 0.0 else math.nan
     for r in range(2):
@@ -115,7 +117,7 @@ def add_rows(P: FloatArray, M: FloatArray, velocity: FloatArray, share: float, r
 def image_equations_into(
     operators: FloatArray, view: View, body: Body, gain: float, choice: int, equations: NormalSystem
 ) -> None:
-    """The normal equations of `image_step`, undamped; of the matrix the lower triangle."""
+    """Write the normal equations of `image_step`, undamped; of the matrix only the lower triangle."""
     matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
     points, target_points, target_known = body
     N, b = equations
@@ -153,7 +155,7 @@ def image_equations_into(
             elif kind == DESIRED:
                 add_rows(P, target_points[p], then, 1.0, rows)
             elif kind == FIXED_DEPTH:
-                # On the ray of the present point, at the depth of the target: P maps the centre to nothing.
+                # On the ray of the current point, at the depth of the target: P maps the centre to zero.
                 M, T = points[p], target_points[p]
                 depth = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
                 wanted_depth = P[2, 0] * T[0] + P[2, 1] * T[1] + P[2, 2] * T[2] + P[2, 3] * T[3]
@@ -171,7 +173,9 @@ def image_equations_into(
 
 @kernel
 def image_step(operators: FloatArray, view: View, body: Body, gains: Gains) -> tuple[FloatArray, float]:
-    """Velocity (n,) of least ``Σ w²|J q̇ − gain (s* − s) − ṡ*|²``, damped, and the conditioning; see `control.law`."""
+    """Velocity (n,) that minimises ``Σ w²|J q̇ − gain (s* − s) − ṡ*|²``, damped, and the conditioning; see
+    `control.law`.
+    """
     gain, choice, damping = gains
     n = operators.shape[0]
     N, b, x = np.empty((n, n)), np.empty(n), np.zeros(n)
@@ -184,7 +188,7 @@ def image_step(operators: FloatArray, view: View, body: Body, gains: Gains) -> t
 def _image_step_into(
     operators: FloatArray, view: View, body: Body, gains: Gains, velocity: FloatArray
 ) -> float:
-    """`image_step` into ``velocity`` (n,); the conditioning."""
+    """Write `image_step` to ``velocity`` (n,); returns the conditioning."""
     x, conditioning = image_step(operators, view, body, gains)
     velocity[:] = x
     return conditioning
@@ -200,7 +204,7 @@ def _image_step(
 
 @kernel
 def image_kernel(room: Record) -> None:
-    """`image_step` of set-points that stand, as the ``kernel`` of a law."""
+    """`image_step` for static set-points, as the ``kernel`` of a law."""
     work = room[0]
     n, c, m = work.joints, work.cameras, work.markers
     view = View(
@@ -227,9 +231,8 @@ def gain_held(gain: float, dt_s: float) -> float:
 def limit_into(
     operators: FloatArray, centre: FloatArray, rotation_rate: float, translation_rate: float, x: FloatArray
 ) -> None:
-    """Scale a velocity ``x`` (n,) so that the body turns no faster than [rad/s], its centre (4,) moves no faster than
-
-    [lengths of the frame's coordinates a second].
+    """Scale a velocity ``x`` (n,) so that the body rotates no faster than ``rotation_rate`` [rad/s] and its centre (4,)
+    moves no faster than ``translation_rate`` [lengths of the frame's coordinates a second].
     """
     square, speed = 0.0, 0.0
     twist = np.zeros((4, 4))
@@ -254,7 +257,7 @@ def limit_into(
 
 
 def held_gain(options: Options) -> float:
-    """The gain [1/s] of a velocity held for ``dt_s``: an error decays by ``exp(−gain dt_s)`` all the same."""
+    """The gain [1/s] of a velocity held for ``dt_s``, for which an error decays by ``exp(−gain dt_s)``."""
     return float(gain_held(options.gain, options.dt_s))
 
 
@@ -281,7 +284,7 @@ def limited(scene: Scene, task: Task, options: Options, velocity: FloatArray, co
 
 
 def image_reasons(step: LawStep) -> tuple[Reason, ...]:
-    """What a law in the images has to tell of its step."""
+    """Reasons of a step of a law in the images."""
     if step.conditioning >= ILL_CONDITIONED:
         return ()
     hint = (
@@ -291,13 +294,13 @@ def image_reasons(step: LawStep) -> tuple[Reason, ...]:
 
 
 def stereo(scene: Scene, task: Task, options: Options) -> LawStep:
-    """``q̇ = gain·J⁺(s* − s)``, all cameras stacked (8.36): with one camera left it is the law of one camera."""
+    """``q̇ = gain·J⁺(s* − s)``, all cameras stacked (8.36); with one camera left it equals the law of one camera."""
     return image_velocity_step(scene, task, options, options.jacobian, standing(task.rates.shape))
 
 
 @lru_cache(maxsize=8)
 def standing(shape: tuple[int, ...]) -> FloatArray:
-    """Rates of set-points that stand; not to be written to."""
+    """Rates of static set-points (zeros); read-only."""
     return np.zeros(shape)
 
 

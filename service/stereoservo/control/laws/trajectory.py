@@ -21,15 +21,17 @@ from stereoservo.numerics.linear import NormalSystem, cholesky_solve, damped_sol
 JOINT_SHARE = 1e-4
 """Squared weight of a planned joint, relative to the images' in the same joint.
 
-Above it: arm and plan disagree on lengths by some share of the arm's reach R. Where an elbow of depth ``c δ²``,
-``c`` about R/4, is stretched, images and joints have one solution, the plan's side, if ``share·R² > 2 c ε``: 1e-4 is
-right for ``ε`` up to 2e-4 of the reach, more than a calibration leaves. Below it: what the joints would
-bias a well determined direction by is 1e-4 of their disagreement, below image noise.
+Lower bound: arm and plan disagree on lengths by some fraction ``ε`` of the arm's reach R. If an elbow of depth
+``c δ²``, ``c`` about R/4, is stretched, images and joints have one solution, the plan's side, if this weight,
+``share``, satisfies ``share·R² > 2 c ε``: 1e-4 is right for ``ε`` up to 2e-4 of the reach, more than remains after
+calibration. Upper bound: the joints bias a well determined direction by 1e-4 of their disagreement, below image noise.
 """
 
 
 class PlannedJoints(NamedTuple):
-    """Of a plan now: joint ``rates`` (n,), joint ``error`` (n,), its ``weight`` [0, 1]; empty arrays without a plan."""
+    """Joints of a plan at present: ``rates`` (n,), ``error`` (n,), and their ``weight`` [0, 1]; empty arrays without a
+    plan.
+    """
 
     rates: FloatArray
     error: FloatArray
@@ -45,8 +47,8 @@ class Pull(NamedTuple):
 
 
 class HeldStep(NamedTuple):
-    """The ``gain`` [1/s], how long the velocity is held, ``dt_s`` [s], and ``damping`` relative to the largest diagonal
-    of the normal matrix.
+    """The ``gain`` [1/s], the time ``dt_s`` [s] for which the velocity is held, and ``damping`` relative to the largest
+    diagonal element of the normal matrix.
     """
 
     gain: float
@@ -96,7 +98,7 @@ def trajectory_step(
 def _refine(
     arm: PresentArm, view: View, points: FloatArray, plan: Pull, held_step: HeldStep, x: FloatArray
 ) -> None:
-    """Refine a velocity ``x`` (n,), held, so that the images move as meant to all orders; the gain is that of a
+    """Refine a held velocity ``x`` (n,), so that the images move as intended to all orders; the gain is that of a
     velocity that is held.
     """
     operators, composition = arm
@@ -159,15 +161,16 @@ def _refine(
 
 
 def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
-    """``q̇ = J⁺(ṡ* + gain (s* − s))``: feed-forward along the way, feedback on the deviation from it.
+    """``q̇ = J⁺(ṡ* + gain (s* − s))``: feed-forward along the path, feedback on the deviation from it.
 
-    Where the images say little (near singular postures, self-motions) the joints go as they are planned, if they are:
-    ``Σ p_j |q̇_j − (q̇*_j + gain (q*_j − q_j))|²`` is added to what is least, with `JOINT_SHARE` of the images' weight.
+    In directions that the images hardly determine (near singular postures, self-motions) the joints move as planned, if
+    they are planned:
+    ``Σ p_j |q̇_j − (q̇*_j + gain (q*_j − q_j))|²`` is added to the objective, with `JOINT_SHARE` of the images' weight.
 
-    The set-points are near, so the Jacobian is the present one whatever ``options`` say. One camera is enough. With
-    ``dt_s`` the velocity, held so long, moves the images as meant to all orders; ``task.rates`` are then best the mean
-    rates of the set-points over the step that begins. Rests, with conditioning 0, where the planned joints are not
-    finite. Raises ValueError for planned joints of another arm.
+    The set-points are near, so the Jacobian is always the current one, whatever ``options`` state. One camera is
+    sufficient. With ``dt_s`` the velocity, held for that time, moves the images as intended to all orders;
+    ``task.rates`` should then be the mean rates of the set-points over the next step. The velocity is zero, with
+    conditioning 0, if the planned joints are not finite. Raises ValueError for planned joints of another arm.
     """
     n = len(scene.operators)
     if len(task.joint_rates) not in (0, n) or len(task.joint_error) != len(task.joint_rates):

@@ -79,11 +79,11 @@ _IDS: dict[type[Any], Callable[[Any], str]] = {
     RunGoal: attrgetter("goal.id"),
     **dict.fromkeys((RenewGoal, CancelGoal, UpdateGoal, AcknowledgeGoal, Home, Calibrate), attrgetter("id")),
 }
-"""Where a command has the id of the goal that it is about."""
+"""How to read the id of the goal that a command is about."""
 
 
 def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | None:
-    """Accept or refuse a goal: at once, or (None) once it is planned. Raises RefusalError."""
+    """Accept or refuse a goal: immediately, or (None) once it is planned. Raises RefusalError."""
     state = context.state
     if not goal.check:
         require_motion_allowed(context)
@@ -102,14 +102,14 @@ def run_goal(goal: Goal, request: Request, context: StepContext) -> Accepted | N
 
 
 def require_motion_allowed(context: StepContext) -> None:
-    """Raises RefusalError where the arm may not move now."""
+    """Raises RefusalError if the arm may not move now."""
     _require_powered(context)
     if context.state.held:
         raise RefusalError("HELD", "the cell is held; resume it first")
 
 
 def _require_powered(context: StepContext) -> None:
-    """Raises RefusalError where the drives are off, or were stopped."""
+    """Raises RefusalError if the drives are off, or were stopped."""
     state = context.state
     if state.lifecycle != Lifecycle.ACTIVE:
         raise RefusalError(
@@ -122,7 +122,7 @@ def _require_powered(context: StepContext) -> None:
 
 
 def report_without_plan(source: Source, context: StepContext) -> PlanReport | None:
-    """The report of a source for which no path is planned. Raises RefusalError where it meets a keep-out."""
+    """The report of a source for which no path is planned. Raises RefusalError if it meets a keep-out."""
     report = MOTION_SOURCES[type(source)].report
     return None if report is None else report(source, context)
 
@@ -142,7 +142,7 @@ def _known(goal_id: str, context: StepContext) -> bool:
 
 
 def new_id(goal_id: str, context: StepContext) -> None:
-    """Raises RefusalError for an id that another goal has: each ends in one event of its own."""
+    """Raises RefusalError for an id that another goal has: each goal ends with an event of its own."""
     if _known(goal_id, context):
         raise RefusalError(
             "ID_IN_USE", f"a goal {goal_id} is active or queued; give an id of its own", subject=goal_id
@@ -150,7 +150,7 @@ def new_id(goal_id: str, context: StepContext) -> None:
 
 
 def _enqueue(goal: Goal, request: int, context: StepContext) -> Accepted | None:
-    """Queue a goal: at once, or (None) once it is resolved."""
+    """Queue a goal: immediately, or (None) once it is resolved."""
     state = context.state
     if len(state.queue) >= QUEUE_LENGTH:
         raise RefusalError(
@@ -160,7 +160,7 @@ def _enqueue(goal: Goal, request: int, context: StepContext) -> Accepted | None:
             threshold=float(QUEUE_LENGTH),
             unit="goals",
         )
-    # what cannot be at all is refused now; its way is planned when its turn comes
+    # an impossible goal is refused now; its path is planned when its turn comes
     prepared = prepare(goal, context, "enqueue", request)
     if isinstance(prepared, PlanJob):
         state.planning = prepared
@@ -169,7 +169,7 @@ def _enqueue(goal: Goal, request: int, context: StepContext) -> Accepted | None:
 
 
 def enqueue(goal: Goal, context: StepContext) -> str:
-    """Put a goal that can be into the queue."""
+    """Add a feasible goal to the queue."""
     state = context.state
     state.queue.append(goal)
     _renew_queued(goal, context)
@@ -182,7 +182,7 @@ def _renew_queued(goal: Goal, context: StepContext) -> None:
 
 
 def accept(goal: Goal, source: Source, report: PlanReport | None, context: StepContext) -> Accepted:
-    """Begin a goal in place of the active one, or answer its check. Raises RefusalError where none may move."""
+    """Start a goal in place of the active one, or answer its check. Raises RefusalError if no motion is allowed."""
     if goal.check:
         try:
             require_motion_allowed(context)
@@ -214,7 +214,7 @@ def renew(command: RenewGoal, context: StepContext) -> str:
 
 
 def extend_leases(command: ExtendLeases, context: StepContext) -> None:
-    """Give clients the time in which nobody could hear them."""
+    """Extend clients' leases by the time in which their messages could not be received."""
     state, by_ns = context.state, round(command.seconds * 1e9)
     source = state.source
     if MOTION_SOURCES[type(source)].leased:
@@ -277,7 +277,7 @@ def cancel(command: CancelGoal, context: StepContext) -> str:
 
 
 def _cancel_waiting(goal_id: str, context: StepContext) -> bool:
-    """Refuse what waits behind a goal that is being planned; whether there was such a request."""
+    """Refuse the requests that wait behind a goal that is being planned; returns whether there were any."""
     state = context.state
     found = [r for r in state.waiting if id_of(r.command) == goal_id]
     state.waiting = [r for r in state.waiting if id_of(r.command) != goal_id]
@@ -287,7 +287,7 @@ def _cancel_waiting(goal_id: str, context: StepContext) -> bool:
 
 
 def refuse(requests: list[Request], reasons: tuple[Reason, ...], context: StepContext) -> None:
-    """Answer requests that are not carried out any more."""
+    """Answer requests that will not be carried out."""
     for request in requests:
         context.emit(
             "reply", request=request.request, accepted=False, id=id_of(request.command), message=reasons[0].hint,
@@ -296,7 +296,7 @@ def refuse(requests: list[Request], reasons: tuple[Reason, ...], context: StepCo
 
 
 def refuse_waiting(reasons: tuple[Reason, ...], context: StepContext) -> None:
-    """What waits to move the arm was asked for before it was told not to."""
+    """Refuse the waiting requests that would move the arm: they were sent before motion was forbidden."""
     state = context.state
     moves = [
         r for r in state.waiting
@@ -312,7 +312,7 @@ def id_of(command: Command) -> str:
 
 
 def acknowledge(command: AcknowledgeGoal, context: StepContext) -> str:
-    """A client says that a reached goal may be left. Raises RefusalError."""
+    """Handle a client's confirmation that a reached goal may be left. Raises RefusalError."""
     source = context.state.source
     if not isinstance(source, AwaitingAcknowledgement) or source.id != command.id:
         waited_for = source.id if isinstance(source, AwaitingAcknowledgement) else "none"
@@ -330,11 +330,11 @@ HOME_SPEED = 0.5
 
 
 IN_ORDER = (RunGoal, Home, Calibrate, Teach)
-"""Requests that wait while a goal is planned, so that they are answered in the order in which they came."""
+"""Requests that wait while a goal is planned, so that they are answered in the order of their arrival."""
 
 
 def answer_all(requests: tuple[Request, ...], context: StepContext) -> None:
-    """Answer a step's requests in order. Of several set-points for one goal the newest counts: each is work."""
+    """Answer a step's requests in order. Of several set-points for one goal only the newest is used, to save time."""
     newest = {r.command.id: r.request for r in requests if isinstance(r.command, UpdateGoal)}
     for request in requests:
         command = request.command
@@ -346,7 +346,7 @@ def answer_all(requests: tuple[Request, ...], context: StepContext) -> None:
 
 
 def answer(request: Request, context: StepContext) -> None:
-    """Carry out one request and emit its reply: at once, or once what it asks for is planned."""
+    """Carry out one request and emit its reply: immediately, or once its goal is planned."""
     if not isinstance(request.command, IN_ORDER):
         _answer(request, context)
         return
@@ -363,14 +363,16 @@ def answer(request: Request, context: StepContext) -> None:
 
 
 def answer_waiting(context: StepContext) -> None:
-    """Answer what has waited for a plan."""
+    """Answer the requests that have waited for a plan."""
     waiting = context.state.waiting
     while waiting and _free(context):
         _answer(waiting.pop(0), context)
 
 
 def _free(context: StepContext) -> bool:
-    """Whether the next request may be looked at: no goal is planned before it, and no other was read in this step."""
+    """Whether the next request may be handled: no goal is planned before it, and no other goal was handled in this
+    step.
+    """
     return not planning_pending(context) and not context.goals_read
 
 
@@ -413,7 +415,7 @@ def _reset(command: Reset, request: Request, context: StepContext) -> str:
     state = context.state
     if state.lifecycle != Lifecycle.FAULT:
         raise RefusalError("NOT_IN_FAULT", f"the cell is {state.lifecycle}; there is nothing to reset")
-    state.fault = []  # latched until here; a cause that is still there latches it again
+    state.fault = []  # latched until here; a persisting cause latches it again
     state.driver_request = "reset"
     return "resetting"
 
@@ -519,7 +521,7 @@ def _jog(command: Jog, request: Request, context: StepContext) -> str:
 
 
 def _order_auxiliary(command: OrderAuxiliary, request: Request, context: StepContext) -> str:
-    """The servo process hands what is accepted here to the driver: it is no motion of the model's joints."""
+    """Accept an order; the servo process passes it to the driver. It is no motion of the model's joints."""
     _require_powered(context)
     return "ordered: " + ", ".join(f"{name} {value:g}" for name, value in command.values.items())
 
@@ -527,7 +529,7 @@ def _order_auxiliary(command: OrderAuxiliary, request: Request, context: StepCon
 def _of_command(
     carry_out: Callable[[Any, StepContext], str | None],
 ) -> Callable[[Any, Request, StepContext], str | None]:
-    """A handler that needs nothing of the request but its command."""
+    """A handler that needs only the command of the request."""
     return lambda command, request, context: carry_out(command, context)
 
 
@@ -550,7 +552,8 @@ _HANDLERS: dict[type[Any], Callable[[Any, Request, StepContext], str | Accepted 
     Home: _home,
     Calibrate: _calibrate,
 }
-"""What carries out a request, by its command: the message of an accepted one, with a plan, or None until it is planned.
+"""Handlers of requests, by their command. Each returns the message of an accepted request, with a plan, or None until
+it is planned.
 
 Each raises RefusalError.
 """

@@ -27,7 +27,7 @@ def begin(source: Source, context: StepContext) -> None:
 
 
 def finish(motion: SourceOutput, context: StepContext) -> None:
-    """A source has finished: the arm holds, or waits to be acknowledged."""
+    """End a source that has finished: the arm holds, or waits for the acknowledgement."""
     source = context.state.source
     wait_s = MOTION_SOURCES[type(source)].acknowledge_s(source)
     drop_lookahead_plan(context)
@@ -66,17 +66,17 @@ def end_source(
 
 
 def awaits_client(source: Source) -> bool:
-    """Whether what is queued behind ``source`` may begin only once a client has acknowledged it."""
+    """Whether the goals queued behind ``source`` may start only once a client has acknowledged it."""
     return MOTION_SOURCES[type(source)].acknowledge_s(source) is not None
 
 
 def end_followers(context: StepContext, ended: str, reasons: tuple[Reason, ...]) -> None:
-    """The queue behind goal ``ended``, which a client was to acknowledge, ends with it."""
+    """End the queue behind goal ``ended``, which a client was to acknowledge."""
     cancel_queue(context, reasons, f"goal {ended} ended before it was acknowledged")
 
 
 def drop_lookahead_plan(context: StepContext) -> None:
-    """What is planned for the active source, or from where it ends, goes with it."""
+    """Discard plans made for the active source, or from where it ends."""
     state = context.state
     state.ahead = None
     if state.planning is not None and state.planning.purpose in ("ahead", "again"):
@@ -84,7 +84,7 @@ def drop_lookahead_plan(context: StepContext) -> None:
 
 
 def end_queue(context: StepContext, reasons: tuple[Reason, ...], message: str) -> None:
-    """Every queued goal ends with a terminal event too, and what is being planned is not begun."""
+    """End every queued goal with a terminal event, too; a goal that is being planned is not started."""
     job = context.state.planning
     if job is not None and not job.goal.check:
         drop_plan(context, reasons, message)
@@ -92,7 +92,7 @@ def end_queue(context: StepContext, reasons: tuple[Reason, ...], message: str) -
 
 
 def cancel_queue(context: StepContext, reasons: tuple[Reason, ...], message: str) -> None:
-    """Every queued goal ends, also the one whose way is being planned; who waits for an answer is not concerned."""
+    """End every queued goal, also the one that is being planned; clients that wait for an answer are not affected."""
     state = context.state
     if state.planning is not None and state.planning.purpose == "queue":
         drop_plan(context, reasons, message)
@@ -103,7 +103,7 @@ def cancel_queue(context: StepContext, reasons: tuple[Reason, ...], message: str
 
 
 def drop_plan(context: StepContext, reasons: tuple[Reason, ...], message: str) -> None:
-    """Stop planning: who waits for the answer is refused, a goal that was accepted already ends."""
+    """Stop planning: a client that waits for the answer is refused; a goal that was accepted already ends."""
     state = context.state
     job, state.planning = state.planning, None
     if job is None:

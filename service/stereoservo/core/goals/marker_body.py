@@ -1,10 +1,10 @@
 """The marker body of a goal: its current points, its pose at the goal (rigid displacement fitted to the set-points),
 and checks that the cameras can see it there, from its front and not mirrored.
 
-Three triangulated points would do for (7.21)-(7.24), but every marker of the goal says something. The displacement from
-the present to the goal is found by integrating the Cartesian law itself, which converges from anywhere, and refined on
-the reprojection error of all set-points. What comes out is one rigid displacement of the calibrated structure, so also
-markers that the goal does not show have their place.
+Three triangulated points would be enough for (7.21)-(7.24), but every marker of the goal is used. The displacement from
+the current pose to the goal is found by integrating the Cartesian law itself, which converges from anywhere, and
+refined by minimising the reprojection error of all set-points. The result is one rigid displacement of the calibrated
+structure, so it also determines markers that the goal does not show.
 """
 
 from __future__ import annotations
@@ -43,35 +43,39 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
 MIN_MARKERS = 3
-"""That fix the pose of a body that may stand anywhere."""
+"""Number of markers that determine the pose of a free body."""
 RIGID_SHARE = 0.1
-"""Of the body's extent that goals in points or matrices may differ by from a rigid displacement, for their noise."""
+"""Largest deviation of goals in points or matrices from a rigid displacement, for their noise, as a fraction of the
+body's extent.
+"""
 BODY_DEPTH = 0.02
-"""Volume of four markers, relative to the cube of their extent, from which a mirror image can be told."""
+"""Volume of four markers, relative to the cube of their extent, above which a mirror image can be detected."""
 MAX_GOAL_RESIDUAL_PX = 5.0
 LAW_STEPS = 80
 NEAR = 1e-5
-"""Of a step in the basis: least squares goes on from there."""
+"""Size of a step in the basis below which least squares continues."""
 LAW_GAIN = 0.3
-"""Of the way still to be made, a step."""
+"""Fraction of the remaining displacement that is made in a step."""
 REFINEMENTS = 12
 REFINE_DAMPING = 1e-12
 CONVERGED = 1e-13
-"""Of a refinement's step in the basis."""
+"""Size of a refinement's step in the basis at which it has converged."""
 
 
 ARM_ROUNDS = 60
-"""Of least squares in an arm's joints."""
+"""Iterations of least squares in an arm's joints."""
 ARM_STEP = 0.3
-"""Largest step of a joint in such a round [rad or m]: what is linear there."""
+"""Largest step of a joint in such an iteration [rad or m]: the range of linearity."""
 ARM_DAMPING = 1e-9
-"""Of these rounds: what the markers do not ask for, the joints do not do."""
+"""Damping of these iterations: joints do not move in directions that the markers do not determine."""
 ARM_CONVERGED = 1e-10
-"""Of a round's step [rad or m]."""
+"""Step of an iteration [rad or m] at which it has converged."""
 
 
 def fewest_markers(joints: int) -> int:
-    """How many markers a goal has to show: those of an arm of fewer than six joints that it can reach fix more."""
+    """Least number of markers that a goal has to show. For an arm of fewer than six joints fewer are sufficient,
+    because the goal must be reachable.
+    """
     return MIN_MARKERS if joints >= RIGID_FREEDOMS else 1
 
 
@@ -79,26 +83,28 @@ RIGID_FREEDOMS = 6
 
 
 def markers_needed(wanted: FloatArray) -> int:
-    """How many markers of an accepted goal have to be seen, which shows those that are ``wanted`` (c, m): all of them
-    where they are fewer than would fix a pose.
+    """Number of markers of an accepted goal that have to be seen; ``wanted`` (c, m): those that it shows. All of them,
+    if they are fewer than would determine a pose.
     """
     return min(MIN_MARKERS, int((wanted.max(axis=0) > 0.0).sum()))
 
 
 @dataclass(frozen=True)
 class BodyState:
-    """From where a target counts: the body's ``points`` (m, 4) of height 1 and the arm's ``operators`` (n, 4, 4)."""
+    """The body's current state, from which a target is resolved: its ``points`` (m, 4) of height 1 and the arm's
+    ``operators`` (n, 4, 4).
+    """
 
     settings: CoreSettings
     arrays: ModelArrays
     points: FloatArray
     operators: FloatArray
     faces: Faces
-    """Of the body, where it is now."""
+    """Faces of the body at its current pose."""
 
 
 def place_now(context: StepContext) -> BodyState:
-    """The body as the estimate has it now. Only with a model."""
+    """The body as currently estimated. Needs a model."""
     arrays, prediction = context.arrays, context.prediction
     assert arrays is not None
     assert prediction is not None
@@ -108,16 +114,18 @@ def place_now(context: StepContext) -> BodyState:
     )
     if arrays.groups is not None:
         faces = select_faces(arrays.groups, points, arrays.camera_centres, seen)
-    else:  # recorded before models had them: found for each goal, from the pose that it sets out from
+    else:  # recorded before models stated them: found for each goal, from the pose at its start
         faces = find_faces(
             points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators
         )
-    # The goal may be resolved over several steps: what the room holds is of this one.
+    # A goal may be resolved over several steps, but the workspace is overwritten in each: copy.
     return BodyState(context.settings, arrays, points, prediction.operators.copy(), faces)
 
 
 def view_of(settings: CoreSettings, arrays: ModelArrays, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Ideal pixels (c, m, 2) of ``points`` (m, 4), and (c, m) 1 where they lie in the camera's image, 0 elsewhere."""
+    """Ideal pixels (c, m, 2) of ``points`` (m, 4), and (c, m) 1 where they are inside the camera's
+    image, 0 elsewhere.
+    """
     sizes = np.array([(camera.width, camera.height) for camera in settings.cameras], dtype=np.float64)
     found: tuple[FloatArray, FloatArray] = _view(arrays.matrices, arrays.lenses, sizes, points)
     return found
@@ -144,7 +152,7 @@ def _view(
 class GoalPose:
     """Marker points at the goal (m, 4) of height a∞ᵀM = 1, and how well they explain the set-points [px].
 
-    ``displacement`` (4, 4) takes the body there from where it was.
+    ``displacement`` (4, 4): from the body's initial pose to the goal.
     """
 
     points: FloatArray
@@ -166,8 +174,9 @@ def goal_pose(
 ) -> GoalPose:
     """Fit one rigid displacement of ``points`` (m, 4) to the set-points.
 
-    ``targets`` (m, 4): triangulated goal points where ``known`` (m,); ``face`` (3,) spans a face. ``operators``
-    (n, 4, 4): the arm's at present, a basis of displacements where the model knows no metric one.
+    ``targets`` (m, 4): triangulated goal points where ``known`` (m,).
+    ``face`` (3,): spans a face.
+    ``operators`` (n, 4, 4): the arm's current ones, a basis of displacements if the model has no metric one.
     """
     displacement, _ = displacement_by_law(
         arrays, operators, points, targets, known, face, set_points, wanted, np.eye(4), LAW_STEPS
@@ -177,7 +186,7 @@ def goal_pose(
 
 
 def displacement_basis(arrays: ModelArrays, operators: FloatArray) -> FloatArray:
-    """Twists (k, 4, 4) that span displacements: the model's, or where it has none the arm's ``operators`` (n, 4, 4)."""
+    """Twists (k, 4, 4) that span displacements: the model's, or if it has none the arm's ``operators`` (n, 4, 4)."""
     return operators if arrays.metric_basis is None else arrays.metric_basis
 
 
@@ -193,12 +202,12 @@ def displacement_by_law(
     displacement: FloatArray,
     steps: int,
 ) -> tuple[FloatArray, bool]:
-    """A displacement (4, 4) for least squares to start from, by so many ``steps`` of the law from the ``displacement``
-    of the steps before; and whether it has come near. Other arguments as of `goal_pose`.
+    """A displacement (4, 4) as the initial value of least squares, by so many ``steps`` of the law from the
+    ``displacement`` of the previous steps; and whether it is close to the solution. Other arguments as in `goal_pose`.
     """
     basis = displacement_basis(arrays, operators)
     few = np.flatnonzero(known)
-    if len(few) > MOST_TRIED:  # a start for least squares: it takes no more of a large body
+    if len(few) > MOST_TRIED:  # only an initial value for least squares: a part of a large body is enough
         few = np.union1d(face, spread_in_images(few, set_points, wanted))
         face, some = np.searchsorted(few, face), np.ones(len(few), dtype=bool)
         D, near = _displacement_by_law(basis, points[few], (targets[few], some), face, displacement, steps)
@@ -211,7 +220,7 @@ def refined_pose(
     arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
     wanted: FloatArray, refinements: int = REFINEMENTS,
 ) -> tuple[GoalPose, bool]:  # fmt: skip
-    """Least squares on all set-points, from a ``displacement`` (4, 4) near by, and whether it has converged in so many
+    """Least squares on all set-points from a nearby ``displacement`` (4, 4), and whether it has converged in so many
     ``refinements``; ``basis`` (k, 4, 4) of displacements.
     """
     D, moved, pixels, converged = _refine(
@@ -228,13 +237,13 @@ def _displacement_by_law(
     basis: FloatArray, points: FloatArray, there: tuple[FloatArray, BoolArray], face: IntArray,
     displacement: FloatArray, steps: int,
 ) -> tuple[FloatArray, bool]:  # fmt: skip
-    """Displacement (4, 4) that the Cartesian law comes to: the face of ``points`` (m, 4) onto that of the targets
-    (m, 4), ``there`` with those that are known (m,).
+    """Displacement (4, 4) to which the Cartesian law converges: the face of ``points`` (m, 4) onto that of the targets.
+    Returns it after so many ``steps`` from a ``displacement``, and whether it is close to the solution.
 
-    From a ``displacement``, by so many ``steps``; and whether these have come near.
+    ``there``: the targets (m, 4), and which of them are known (m,).
     """
     targets, known = there
-    nobody = np.zeros((0, 4))  # on paper no camera has to keep sight of the face
+    nobody = np.zeros((0, 4))  # in this computation no camera has to see the face
     gains = np.full(3, LAW_GAIN)
     D = displacement.copy()
     moved = transform_points(D, points)
@@ -253,8 +262,8 @@ def _displacement_by_law(
 def left_by_components(
     arrays: ModelArrays, operators: FloatArray, points: FloatArray, targets: FloatArray, face: IntArray
 ) -> float:
-    """Largest distance [px] from the goal at which a law in components comes to rest with the freedoms ``operators``
-    (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
+    """Largest distance [px] from the goal at which a law in components comes to rest with the degrees of freedom
+    ``operators`` (n, 4, 4), from ``points`` to ``targets`` (m, 4); ``face`` (3,) of the markers.
     """
     known = np.ones(len(points), dtype=bool)
     D, _ = _displacement_by_law(operators, points, (targets, known), face, np.eye(4), LAW_STEPS)
@@ -265,7 +274,7 @@ def left_by_components(
 
 @kernel
 def _middle(points: FloatArray, known: BoolArray) -> FloatArray:
-    """Mean (4,) of the ``known`` of ``points`` (m, 4)."""
+    """Mean (4,) of the ``known`` ones of ``points`` (m, 4)."""
     middle = np.zeros(4)
     count = 0.0
     for p in range(points.shape[0]):
@@ -319,12 +328,12 @@ def _onwards(basis: FloatArray, twist: FloatArray, D: FloatArray) -> FloatArray:
 
 @kernel
 def _all_below(values: FloatArray, limit: float) -> bool:
-    """Whether the sizes of all ``values`` (k,) are below ``limit``; not where one is NaN."""
+    """Whether the absolute values of ``values`` (k,) are all below ``limit``; False if one is NaN."""
     return bool((np.abs(values) < limit).all())
 
 
 def one_body(pose: GoalPose, points: FloatArray, targets: FloatArray, known: BoolArray) -> None:
-    """Raises RefusalError where no rigid displacement of ``points`` (m, 4) fits the goal: ``pose`` is the best."""
+    """Raises RefusalError if no rigid displacement of ``points`` (m, 4) fits the goal: ``pose`` is the best fit."""
     if pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
         return
     said = (
@@ -348,8 +357,8 @@ def one_body(pose: GoalPose, points: FloatArray, targets: FloatArray, known: Boo
 
 @dataclass(frozen=True)
 class ReachedPose:
-    """Where an arm brings the markers nearest to set-points: its ``joints`` (n,), the ``points`` (m, 4) there, and
-    ``pixels`` (c, m, 2); the ``worst`` distance [px], of ``marker`` in ``camera``, their indices.
+    """The pose nearest to set-points that an arm can reach: its ``joints`` (n,), the ``points`` (m, 4) there, and
+    ``pixels`` (c, m, 2); the ``worst`` distance [px], with the indices of its ``marker`` and ``camera``.
     """
 
     joints: FloatArray
@@ -365,7 +374,7 @@ def reached_pose(
 ) -> ReachedPose:
     """Least squares of set-points (c, m, 2) that are ``wanted`` (c, m) in the arm's own joints, from ``joints`` (n,).
 
-    Freedoms that the set-points do not ask for stay where they are.
+    Degrees of freedom that the set-points do not determine are not moved.
     """
     q = joints.copy()
     weights = np.repeat(wanted.reshape(-1), 2)
@@ -388,11 +397,11 @@ def reached_pose(
     return ReachedPose(q, points, pixels, float(distance.max()), camera, marker)
 
 
-# -- what it has to keep there --------------------------------------------------------------------------------
+# -- what must remain visible there ---------------------------------------------------------------------------
 
 
 def enough_in_view(place: BodyState, pixels: FloatArray, shown: FloatArray, known: BoolArray) -> None:
-    """Raises RefusalError where no camera has ``shown`` (c, m) enough of the ``known`` markers at the goal."""
+    """Raises RefusalError if in no camera enough of the ``known`` markers are ``shown`` (c, m) at the goal."""
     best = int(shown.sum(axis=-1).argmax())
     count = int(shown[best].sum())
     if count >= MIN_MARKERS:
@@ -425,7 +434,9 @@ def keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> 
 
 
 def turned_to(place: BodyState, displacement: FloatArray) -> FloatArray:
-    """(c, m) 1 where a marker's face is turned to the camera after ``displacement``; 1 where no side of it is known."""
+    """(c, m) 1 where a marker's face is turned to the camera after ``displacement``, and where its side is unknown;
+    else 0.
+    """
     faces = place.faces
     found = np.ones((len(place.arrays.camera_centres), len(place.points)))
     if not bool((faces.sided > 0.0).any()):
@@ -439,7 +450,7 @@ def turned_to(place: BodyState, displacement: FloatArray) -> FloatArray:
 
 
 def enough_shown(place: BodyState, shown: FloatArray) -> None:
-    """Raises RefusalError where the body turns its back: too few markers are ``shown`` (c, m) from their front."""
+    """Raises RefusalError if the body shows its back: too few markers are ``shown`` (c, m) from their front."""
     best = int(shown.sum(axis=-1).argmax())
     count = int(shown[best].sum())
     if count >= MIN_MARKERS:
@@ -454,12 +465,12 @@ def enough_shown(place: BodyState, shown: FloatArray) -> None:
 
 
 def in_front(place: BodyState, targets: FloatArray, known: BoolArray) -> None:
-    """Raises RefusalError for a goal behind a camera that has the body before it now."""
+    """Raises RefusalError for a goal behind a camera that has the body in front of it now."""
     for c, P in enumerate(place.arrays.matrices):
         now = (place.points * P[2]).sum(axis=-1)
         side = 1.0 if float(np.sign(now).sum()) >= 0.0 else -1.0
         if not bool((side * now > 0.0).all()):
-            continue  # the body is about this camera's plane already: it tells nothing
+            continue  # the body intersects this camera's plane: the test is not possible
         then = side * (targets * P[2]).sum(axis=-1)
         behind = np.flatnonzero(known & ~(then > 0.0))
         if behind.size:
@@ -474,7 +485,9 @@ def in_front(place: BodyState, targets: FloatArray, known: BoolArray) -> None:
 
 
 def mirrored(points: FloatArray, targets: FloatArray, known: BoolArray) -> bool:
-    """Whether four markers that span a wide volume have turned inside out. False for a flat body: not to be told."""
+    """Whether four markers that span a large volume are mirrored. False for a flat body, for which this is
+    undetectable.
+    """
     four = _widest(points, np.flatnonzero(known))
     now, then = points[four], targets[four]
     extent = float(np.sqrt(((now[1:] - now[0]) ** 2).sum(axis=-1).max()))
@@ -484,7 +497,7 @@ def mirrored(points: FloatArray, targets: FloatArray, known: BoolArray) -> bool:
 
 
 def _widest(points: FloatArray, candidates: IntArray) -> list[int]:
-    """Up to four of the ``candidates``, each the farthest from what those before it span."""
+    """Up to four of the ``candidates``, each the farthest from the span of those before it."""
     rest = points[candidates] - points[candidates].sum(axis=0) / max(len(candidates), 1)
     four: list[int] = []
     for _ in range(min(4, len(candidates))):

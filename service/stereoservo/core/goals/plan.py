@@ -1,8 +1,8 @@
-"""Prepares goals: from a target to the motion source that it comes to, a part of a large body's work a step; and plans
-the path to a goal in slices over control steps before the arm moves: reports it or refuses the goal.
+"""Prepares goals: resolves a target to a motion source, for a large body in parts over several steps; and plans the
+path to a goal in slices over control steps before the arm moves: reports it or refuses the goal.
 
-What comes out is told with the reply. Planned laws follow the plan; straight ones drive the straight way that was
-planned; free ones go their own way, so that only the goal itself can be refused.
+The result is reported with the reply. Planned laws follow the plan. Straight laws drive the straight path that was
+planned. Free laws take a path of their own, so only the goal itself can be refused.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanReq
 from stereoservo.planning.planner import PlanRequestError, start_planning
 
 SLICE = 8
-"""Samples of the arm's way that a step works on."""
+"""Samples of the arm's path that a step processes."""
 PIXELS_PER_STEP = 512
-"""Pixels of markers that these samples may have together; a step works on fewer samples of a large body."""
+"""Largest number of marker pixels in these samples; a step processes fewer samples of a large body."""
 VIEW_MARGIN_PX = 5.0
 PLANNED_SPEED, PLANNED_ACCELERATION = 0.9, 0.7
-"""Shares of the limits that a way is planned with: the rest is feedback's."""
+"""Fractions of the limits with which a path is planned; the rest is left for feedback."""
 
 
 def begin_plan(job: PlanJob, context: StepContext) -> None:
-    """Begin to plan the way of the job's source from where it sets out.
+    """Start planning the path of the job's source from its start.
 
-    Raises RefusalError where the request makes no sense.
+    Raises RefusalError if the request is inconsistent.
     """
     source, arrays = job.source, context.arrays
     assert source is not None
@@ -74,7 +74,7 @@ def begin_plan(job: PlanJob, context: StepContext) -> None:
 
 
 def plan_again(source: ServoGoal, context: StepContext) -> PlanJob:
-    """Begin to plan the way of the active ``source`` anew, from where the body is. Raises RefusalError."""
+    """Start planning the path of the active ``source`` again, from the body's current pose. Raises RefusalError."""
     assert context.arrays is not None
     points = markers_at(context.arrays, context.q + context.state.block.correction)
     job = PlanJob(
@@ -143,7 +143,9 @@ def _posture(named: dict[str, float], joints: FloatArray, context: StepContext) 
 
 
 def go_on_planning(job: PlanJob) -> bool:
-    """A step's share of the work on a way; whether all is done: of a large body a step later, which reports it."""
+    """Do one step's share of planning a path; returns whether planning is complete. For a large body it is complete one
+    step later, and reported then.
+    """
     planning = job.planning
     assert planning is not None
     if planning.finished:
@@ -155,7 +157,9 @@ def go_on_planning(job: PlanJob) -> bool:
 
 
 def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
-    """What came out, and the plan into the job's source. Raises RefusalError where the goal is not to be driven."""
+    """The report of the result; stores the plan in the job's source. Raises RefusalError if the goal must not be
+    driven.
+    """
     source, planning = job.source, job.planning
     assert source is not None
     assert planning is not None
@@ -195,8 +199,8 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
 
 
 def _require_components(job: PlanJob, context: StepContext) -> None:
-    """Raises RefusalError where a law in components would come to rest beside the goal, since the arm can make hinge
-    and turn of the face only together.
+    """Raises RefusalError if a law in components would come to rest beside the goal, because the arm can make hinge and
+    planar turn of the face only together.
     """
     source, arrays = job.source, context.arrays
     assert source is not None
@@ -224,7 +228,7 @@ def _require_components(job: PlanJob, context: StepContext) -> None:
 
 
 def planning_reason(job: PlanJob) -> Reason:
-    """That a goal is being planned."""
+    """Reason: a goal is being planned."""
     done = 0 if job.planning is None else job.planning.followed
     hint = f"goal {job.goal.id} is being planned ({done} ways tried); cancel it, hold or stop at any time"
     return Reason("PLANNING", "info", job.goal.id, float(done), None, "ways", hint)
@@ -267,7 +271,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
 
 
 def _exponential_s(job: PlanJob, context: StepContext) -> float:
-    """Time in which the error decays to its tolerance at the goal's gain and damping."""
+    """Time in which the error decays to its tolerance at the goal's gain and damping [s]."""
     source, arrays = job.source, context.arrays
     assert source is not None
     assert arrays is not None
@@ -292,7 +296,7 @@ def _largest_error(
 
 
 def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> goals.Approach:
-    """An approach with names instead of numbers."""
+    """An approach with names instead of indices."""
     settings, arrays = context.settings, context.arrays
     assert arrays is not None
     index = approach.index
@@ -312,7 +316,7 @@ def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> 
 
 
 def _text(failure: goals.Approach, context: StepContext, asked_posture: bool) -> str:
-    """In words where and on what a way fails."""
+    """Text: where a path fails, and why."""
     where = "at the goal" if failure.share >= 1.0 else f"at {100.0 * failure.share:.0f} % of the way"
     value, limit, unit = f"{failure.value:.4g}", f"{failure.limit:.4g}", failure.unit
     if failure.code == "JOINT_LIMIT":
@@ -340,7 +344,7 @@ def _text(failure: goals.Approach, context: StepContext, asked_posture: bool) ->
 
 
 Prepared = JointMove | IncidenceGoal | ServoGoal | PlanJob
-"""The source that a goal comes to; or the work on it, where some is left or its way is to be planned."""
+"""The source of a goal; or a job, if parts of the resolution are left or its path must be planned."""
 
 
 def prepare(
@@ -351,8 +355,9 @@ def prepare(
     place: BodyState | None = None,
     joints: FloatArray | None = None,
 ) -> Prepared:
-    """A goal for a ``purpose``, setting out from a ``place`` of the body with the arm at ``joints`` (n,), None: from
-    where they are. Raises RefusalError.
+    """Prepare a goal for a ``purpose``. Raises RefusalError.
+
+    ``place``, ``joints`` (n,): start of the body and the arm; None: their current ones.
     """
     target = goal.target
     if goal.posture is not None:
@@ -384,7 +389,7 @@ def prepare(
 
 
 def _require_plan(goal: Goal, context: StepContext) -> None:
-    """Raises RefusalError where a goal with a posture is none that a law reaches by a plan."""
+    """Raises RefusalError for a goal with a posture if its law does not follow a plan."""
     name, law = law_of(goal, context)
     planned = " or ".join(LAWS.on_path("planned")) or "none is installed"
     if isinstance(goal.target, JointTarget | IncidenceTarget):
@@ -399,7 +404,9 @@ def _require_plan(goal: Goal, context: StepContext) -> None:
 
 
 def set_up(job: PlanJob, context: StepContext) -> bool:
-    """A step's share of what comes before the search for a way; whether all is done. Raises RefusalError."""
+    """Do one step's share of the resolution before the path search; returns whether it is complete. Raises
+    RefusalError.
+    """
     while not _set_up_part(job, context):
         assert context.arrays is not None
         if context.arrays.sights > AT_ONCE:
@@ -423,7 +430,7 @@ def _set_up_part(job: PlanJob, context: StepContext) -> bool:
 
 
 def trusted_model(context: StepContext) -> int:
-    """Epoch of the model in use. Raises RefusalError where there is none, or none that holds."""
+    """Epoch of the model in use. Raises RefusalError if there is none, or no valid one."""
     state = context.state
     if state.model is None or context.arrays is None or state.readiness == ModelReadiness.NONE:
         raise no_model(context, "the cell has no model yet: calibrate first")

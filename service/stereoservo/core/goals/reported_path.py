@@ -15,25 +15,25 @@ from stereoservo.numerics.compilation import kernel
 REPORTED = 17
 """Samples of a path that a report holds."""
 REPORTED_PIXELS = 2048
-"""Pixels that a report holds at most: of a large body it has fewer samples, at least the ends of the path."""
+"""Largest number of pixels in a report: of a large body it has fewer samples, at least the ends of the path."""
 REPORTED_OF_LARGE = 512
-"""The same where the ends alone would be more: of these it has every second, third … marker."""
+"""The same if the ends alone would exceed it: then only every second, third … marker is reported."""
 
 Pixels = dict[int, tuple[tuple[float, float], ...]]
 
 
 def reported_samples(arrays: ModelArrays | None) -> int:
-    """How many samples of a path a report holds: at least its ends."""
+    """Number of samples of a path in a report: at least its ends."""
     pixels = 1 if arrays is None else arrays.sights
     return max(2, min(REPORTED, REPORTED_PIXELS // pixels))
 
 
 def reported_pixels(arrays: ModelArrays, displacements: FloatArray, points: FloatArray) -> list[Pixels]:
-    """Of each camera: raw pixels of ``points`` (m, 4) after ``displacements`` (k, 4, 4), by marker.
+    """Raw pixels of ``points`` (m, 4) after ``displacements`` (k, 4, 4), by marker, for each camera.
 
     Markers that a lens does not image at all of them are left out.
     """
-    pixels = max(len(displacements), 2) * arrays.sights  # a way to where the arm is has one sample
+    pixels = max(len(displacements), 2) * arrays.sights  # a path to the current pose has one sample
     every = 1 if pixels <= REPORTED_PIXELS else math.ceil(pixels / REPORTED_OF_LARGE)
     told = np.ascontiguousarray(points[::every])
     paths = _raw_paths(arrays.matrices, arrays.lenses, displacements, told)

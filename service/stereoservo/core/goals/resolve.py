@@ -1,5 +1,5 @@
-"""Resolves a goal's target in the model's frame into set-points and the body's pose at the goal, in parts: of a large
-body one a step. Refuses invalid targets.
+"""Resolves a goal's target in the model's frame into set-points and the body's pose at the goal, for a large body in
+parts, one a step. Refuses invalid targets.
 """
 
 from __future__ import annotations
@@ -55,22 +55,22 @@ Resolvable = FeatureTarget | PointTarget | DisplacementTarget
 
 NOTHING = np.zeros(0)
 ROUNDS_OF_PIXELS = 4096
-"""Pixels of markers that the rounds of least squares of one step may have together."""
+"""Largest number of marker pixels in the least-squares iterations of one step."""
 AT_ONCE = 128
-"""Pixels of markers up to which a goal is resolved, and its plan set up, in one step."""
+"""Number of marker pixels up to which a goal is resolved, and its plan set up, in one step."""
 STEPS = 8
-"""Of the law that finds where least squares starts, in one step, for larger bodies."""
+"""Steps of the law that computes the initial value of least squares, in one control step, for larger bodies."""
 MIN_FACE_AREA_PX2 = 100.0
 SINGULAR = 1e-9
 """Determinant, relative to the fourth power of its largest entry, below which a matrix is no displacement."""
 COPLANAR = 1e-3
-"""Affine coordinate of a basis marker in the other four below which four of the five are taken for coplanar."""
+"""Affine coordinate of a basis marker in the other four below which four of the five count as coplanar."""
 FINITE_HEIGHT = 1e-9
-"""Height ``|a∞ᵀM|`` relative to ``|a∞||M|`` below which a point lies at infinity."""
+"""Height ``|a∞ᵀM|`` relative to ``|a∞||M|`` below which a point is at infinity."""
 
 
 def aim_at(target: Resolvable, place: BodyState, needs_pose: bool, epoch: int) -> GoalResolution:
-    """What ``target`` asks for. ``needs_pose``: of the law; ``epoch``: of the model in use. Raises RefusalError."""
+    """The resolution of ``target``. ``needs_pose``: of the law; ``epoch``: of the model in use. Raises RefusalError."""
     of_this_model(target.model_epoch, epoch)
     aim = begin_resolution(place, np.zeros(0), needs_pose)
     while not resolve_part(aim, target, place):
@@ -79,7 +79,7 @@ def aim_at(target: Resolvable, place: BodyState, needs_pose: bool, epoch: int) -
 
 
 def begin_resolution(place: BodyState, joints: FloatArray, needs_pose: bool) -> GoalResolution:
-    """A target of which nothing is resolved yet, for a body at ``place`` with the arm at ``joints`` (n,)."""
+    """A resolution before its first part, for a body at ``place`` with the arm at ``joints`` (n,)."""
     return GoalResolution(
         joints=joints, start=place.points, operators=place.operators, faces=place.faces, needs_pose=needs_pose,
         part=0, rounds=0, set_points=NOTHING, wanted=NOTHING, targets=NOTHING, known=np.zeros(0, np.bool_),
@@ -88,14 +88,16 @@ def begin_resolution(place: BodyState, joints: FloatArray, needs_pose: bool) -> 
 
 
 def resolve_part(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
-    """Do the next part of the work; whether it was the last. Raises RefusalError where the target cannot be."""
+    """Do the next part of the resolution; returns whether it was the last. Raises RefusalError if the target is
+    impossible.
+    """
     if _PARTS[aim.part](aim, target, place):
         aim.part += 1
     return aim.part == len(_PARTS)
 
 
 def of_this_model(model_epoch: int | None, epoch: int) -> None:
-    """Raises RefusalError where a goal was stated with another model than that of ``epoch``."""
+    """Raises RefusalError if a goal was stated with another model than that of ``epoch``."""
     if model_epoch is not None and model_epoch != epoch:
         raise RefusalError(
             "OTHER_MODEL",
@@ -112,7 +114,7 @@ def _features(aim: GoalResolution, target: FeatureTarget, place: BodyState) -> N
 
 
 def _triangulated(aim: GoalResolution, place: BodyState) -> None:
-    """Of set-points: where the markers are at the goal. Raises RefusalError where too few are shown."""
+    """Triangulate the markers at the goal from set-points. Raises RefusalError if too few are shown."""
     arrays = place.arrays
     aim.targets, aim.known = _intersected(
         arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity
@@ -130,9 +132,9 @@ def _triangulated(aim: GoalResolution, place: BodyState) -> None:
 
 
 def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray, FloatArray]:
-    """(c, m, 2) set-points as ideal pixels and (c, m) wanted, of a target in raw ones.
+    """Set-points (c, m, 2) as ideal pixels and wanted ones (c, m), of a target in raw pixels.
 
-    Raises RefusalError on a camera, marker or pixel that cannot be.
+    Raises RefusalError for an impossible camera, marker or pixel.
     """
     arrays, cameras = place.arrays, place.settings.cameras
     set_points, wanted = (
@@ -163,7 +165,7 @@ def ideal_pixels(lens: FloatArray, raw: FloatArray) -> FloatArray:
 
 
 def require_imaged(camera: CameraSettings, what: str, raw: Pixel, ideal: FloatArray) -> None:
-    """Raises RefusalError where the ``raw`` pixel of ``what`` is outside the image, or ``ideal`` (2,) is NaN."""
+    """Raises RefusalError if the ``raw`` pixel of ``what`` is outside the image, or ``ideal`` (2,) is NaN."""
     u, v = raw
     if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
         raise RefusalError(
@@ -261,7 +263,7 @@ def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
 
 
 def given_points(target: PointTarget, arrays: ModelArrays) -> tuple[FloatArray, BoolArray]:
-    """Points (m, 4) of height 1 that ``target`` gives, zeros elsewhere; and which these are (m,).
+    """Points (m, 4) of height 1 stated by ``target``, zeros elsewhere; and which these are (m,).
 
     Raises RefusalError.
     """
@@ -278,7 +280,7 @@ def given_points(target: PointTarget, arrays: ModelArrays) -> tuple[FloatArray, 
 
 @kernel
 def _unit_heights(points: FloatArray, plane: FloatArray) -> tuple[FloatArray, int]:
-    """`normalize_scale` of ``points`` (k, 4), and the first of them that it refuses, or -1."""
+    """`normalize_scale` of ``points`` (k, 4), and the index of the first that is invalid, or -1."""
     scaled = np.empty(points.shape)
     size = 0.0
     for i in range(4):
@@ -298,7 +300,7 @@ def _unit_heights(points: FloatArray, plane: FloatArray) -> tuple[FloatArray, in
 
 
 def normalize_scale(point: FloatArray, arrays: ModelArrays, what: str, subject: str = "") -> FloatArray:
-    """``point`` (4,) scaled to height 1. Raises RefusalError where it is not finite, or lies at infinity."""
+    """``point`` (4,) scaled to height 1. Raises RefusalError if it is not finite, or at infinity."""
     height = float((point * arrays.plane_at_infinity).sum())
     size = float(np.sqrt((point * point).sum() * (arrays.plane_at_infinity**2).sum()))
     if not isfinite(size) or not abs(height) > FINITE_HEIGHT * size:
@@ -339,7 +341,7 @@ def _displacement(aim: GoalResolution, target: DisplacementTarget, place: BodySt
 
 
 def _proper(matrix: FloatArray) -> FloatArray:
-    """``matrix`` (4, 4) with determinant 1. Raises RefusalError for NaN, singular, mirroring."""
+    """``matrix`` (4, 4) with determinant 1. Raises RefusalError for NaN, singular and mirroring matrices."""
     largest = float(np.abs(matrix).max())
     if not isfinite(largest):
         raise RefusalError("NON_FINITE", "the displacement holds an entry that is no finite number")
@@ -390,7 +392,7 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
 
 
 def _projected(aim: GoalResolution, place: BodyState, targets: FloatArray, known: BoolArray) -> None:
-    """A body at ``targets`` (m, 4) of height 1 where ``known`` (m,): set-points by projection."""
+    """Set-points by projection of a body at ``targets`` (m, 4) of height 1 where ``known`` (m,)."""
     if int(known.sum()) >= MIN_MARKERS and mirrored(place.points, targets, known):
         raise RefusalError(
             "MIRRORED_GOAL",
@@ -404,7 +406,9 @@ def _projected(aim: GoalResolution, place: BodyState, targets: FloatArray, known
 
 
 def _shown_set_points(aim: GoalResolution, pose: GoalPose, target: Resolvable, place: BodyState) -> None:
-    """Of a body at the goal: the error is taken over the markers of points, else over all that are in view."""
+    """Set-points of a body at the goal: the error is taken over the markers stated as points, else over all that are in
+    view.
+    """
     keeps_its_shape(pose.points, aim.targets, aim.known)
     pixels, shown = view_of(place.settings, place.arrays, pose.points)
     shown = shown * (aim.wanted if isinstance(target, PointTarget) else 1.0)
@@ -414,22 +418,22 @@ def _shown_set_points(aim: GoalResolution, pose: GoalPose, target: Resolvable, p
     aim.set_points, aim.wanted = np.where(shown[..., None] > 0.0, pixels, 0.0), shown
 
 
-# -- its parts ------------------------------------------------------------------------------------------------
+# -- parts of a resolution ------------------------------------------------------------------------------------
 
 
 def _read(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
-    """What the target says, in ideal pixels or points of height 1."""
+    """Read the target, as ideal pixels or points of height 1."""
     _READ[type(target)](aim, target, place)
     return True
 
 
 def _find_face(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
-    """Where its markers are, as far as two cameras tell, and three of them that span a face."""
+    """Find the markers at the goal, as far as two cameras determine them, and three of them that span a face."""
     if isinstance(target, FeatureTarget):
         _triangulated(aim, place)
     if int((aim.wanted.sum(axis=0) > 0).sum()) < MIN_MARKERS:
         _by_the_arm(aim, place)
-        aim.part = len(_PARTS) - 1  # the pose is found
+        aim.part = len(_PARTS) - 1  # the pose is known
         return True
     if aim.pose_known:
         aim.face = _face(aim.set_points, aim.wanted, aim.known, place.arrays)
@@ -437,8 +441,8 @@ def _find_face(aim: GoalResolution, target: Resolvable, place: BodyState) -> boo
 
 
 def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
-    """The pose at a goal of too few markers to fix it alone: the one that an arm of few joints reaches with the least
-    motion. Raises RefusalError where it reaches none.
+    """Find the pose at a goal of too few markers to determine it alone: the one that an arm of few joints reaches with
+    the least motion. Raises RefusalError if it reaches none.
     """
     arrays, cameras = place.arrays, place.settings.cameras
     start = aim.joints if aim.joints.size else arrays.zero
@@ -464,7 +468,7 @@ def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
 
 
 def _start_fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
-    """A displacement near by, from which least squares goes on."""
+    """Find a nearby displacement as the initial value of least squares."""
     if not aim.pose_known:
         return True
     if aim.rounds == 0:
@@ -482,7 +486,7 @@ def _start_fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> boo
 
 
 def _fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
-    """Rounds of least squares; after the last one, whether there is such a body at all."""
+    """Do iterations of least squares; after the last one, check that a rigid body fits."""
     if not aim.pose_known:
         return True
     rounds = min(max(1, ROUNDS_OF_PIXELS // place.arrays.sights), REFINEMENTS - aim.rounds)
@@ -501,21 +505,23 @@ def _fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
 
 
 _PARTS = (_read, _find_face, _start_fit, _fit)
-"""What is done of a target, one after the other; of a large body one a step."""
+"""Parts of the resolution of a target, in order; for a large body one a step."""
 
 _READ: dict[type[Any], Callable[[GoalResolution, Any, BodyState], None]] = {
     FeatureTarget: _features,
     PointTarget: _points,
     DisplacementTarget: _displacement,
 }
-"""How a target is read, by its kind."""
+"""Readers of a target, by its kind."""
 
 
 # -- the face -------------------------------------------------------------------------------------------------
 
 
 def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: ModelArrays) -> IntArray:
-    """Three markers known at the goal that span the largest triangle in the images: of many, of those spread out."""
+    """Three markers known at the goal that span the largest triangle in the images; of many markers, only well spread
+    ones are tried.
+    """
     candidates = np.flatnonzero(known)
     if candidates.size < MIN_MARKERS:
         raise RefusalError(
@@ -539,8 +545,8 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
 def _largest_triangle(
     candidates: IntArray, set_points: FloatArray, wanted: FloatArray
 ) -> tuple[IntArray, float]:
-    """Three of the ``candidates`` (k,) of the largest area, and twice that [px²]: the least of the cameras that see all
-    three.
+    """Three of the ``candidates`` (k,) with the largest area, and twice that [px²]: the smallest over the cameras that
+    see all three.
     """
     tried = spread_in_images(candidates, set_points, wanted)
     best = tried[:3].copy()

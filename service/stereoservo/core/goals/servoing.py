@@ -1,4 +1,4 @@
-"""The first state of a control law for a goal whose target is resolved: its options, cameras and centre."""
+"""Initial state of a control law for a goal whose target is resolved: its options, cameras and centre."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ JACOBIANS: dict[JacobianName, JacobianChoice] = {
 
 
 def law_of(goal: Goal, context: StepContext) -> tuple[LawName, Law]:
-    """The law that ``goal`` asks for, or the cell's. Raises RefusalError."""
+    """The law stated by ``goal``, or the cell's. Raises RefusalError."""
     name = goal.law or context.settings.law
     law = context.derived.laws.get(name)
     if law is None:
@@ -42,7 +42,7 @@ def law_of(goal: Goal, context: StepContext) -> tuple[LawName, Law]:
 def start_servoing(goal: Goal, aim: GoalResolution, context: StepContext) -> ServoGoal:
     """The state of a law before its first step, for a goal that is resolved.
 
-    Raises RefusalError naming what makes the goal unusable.
+    Raises RefusalError naming the reason if the goal is unusable.
     """
     name, _ = law_of(goal, context)
     arrays, model = context.arrays, context.state.model
@@ -70,7 +70,7 @@ def start_servoing(goal: Goal, aim: GoalResolution, context: StepContext) -> Ser
 
 
 def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, Any]:
-    """Fields of a `LawRun` before its first step: what the goal says, or else the cell."""
+    """Fields of a `LawRun` before its first step: the goal's values, or else the cell's."""
     settings = context.settings
     gain = goal.gain or settings.gain
     near, far, slope = (
@@ -94,7 +94,7 @@ def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, 
 
 
 def _stable_damping(goal: Goal, gain: float, context: StepContext) -> float:
-    """The damping that a goal asks for. Raises RefusalError where the drives are too late for it at its ``gain``."""
+    """The goal's damping. Raises RefusalError if the drives' delay is too large for it at its ``gain``."""
     damping = goal.damping or 0.0
     if damping == 0.0:
         return damping
@@ -114,7 +114,7 @@ def _stable_damping(goal: Goal, gain: float, context: StepContext) -> float:
 
 
 def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatArray:
-    """(c,) 1 for cameras that the law may use. Raises RefusalError where they show too few ``wanted`` (c, m)."""
+    """(c,) 1 for cameras that the law may use. Raises RefusalError if they show too few ``wanted`` (c, m)."""
     c = len(context.settings.cameras)
     if goal.cameras is None:
         return np.ones(c)
@@ -136,9 +136,10 @@ def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatA
 def _centre(
     centre: Centre | None, aim: GoalResolution, arrays: ModelArrays, epoch: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; at the goal.
+    """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; and the centre
+    at the goal.
 
-    The point is stated in the chain's zero. Default: the affine middle of the goal's markers.
+    The point is stated at the chain's zero. Default: the affine centroid of the goal's markers.
     """
     weights = np.zeros(len(arrays.marker_ids))
     body = np.zeros(4)

@@ -1,14 +1,14 @@
 """Relocalization of moved cameras while the goal waits: brakes, averages observations at rest, requests a model with
 new camera matrices, verifies it, reprojects the goals' set-points and resumes.
 
-That it was the cameras, and not the arm, must be proven at rest (`fault_isolation.doubt`); else no camera is
-relocalized, no goal is reprojected, and the goal stays held.
+It must be proven at rest that the cameras, and not the arm, have moved (`fault_isolation.doubt`); otherwise no camera
+is relocalized, no goal is reprojected, and the goal stays held.
 
-A relocalized model keeps the frame, so what is stated in points stays true. Set-points are intersected with the cameras
-they were meant for, as the pose that they all fix where they fix one, and projected with the new ones (thesis 8.6).
+A relocalized model keeps the frame, so values stated as points remain valid. Set-points are intersected with the
+cameras they were stated for, by the common pose if they determine one, and projected with the new ones (thesis 8.6).
 
-The core only observes; `calibration.relocalization` makes the model, outside the servo process. What is static at rest
-keeps its innovation: where that changes, a camera was moved again, and all begins anew.
+The core only observes; `calibration.relocalization` computes the model, outside the servo process. The innovation of
+static objects is constant at rest: if it changes, a camera was moved again, and the relocalization restarts.
 """
 
 from __future__ import annotations
@@ -44,30 +44,32 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 AT_REST = 1e-3
-"""Command [rad/s or m/s]."""
+"""Largest command at which the arm is at rest [rad/s or m/s]."""
 RESTING = 0.01
-"""Measured velocity [rad/s or m/s]."""
+"""Largest measured velocity at which the arm is at rest [rad/s or m/s]."""
 SETTLE_S = 0.15
 FRAMES = 16
-"""That are averaged, of each camera that has moved."""
+"""Number of frames that are averaged, of each camera that has moved."""
 COLLECT_S = 3.0
 ANSWER_S = 60.0
-"""How long a model may be waited for."""
+"""Longest time to wait for a model [s]."""
 VERIFY_ROUNDS = 3
 VERIFY_S = 3.0
 MOST_TRIES = 4
 MOVED_AGAIN_PX = 3.0
-"""Median change of what stands, at rest, from which a camera has been moved again."""
+"""Median change [px] of static objects, at rest, above which a camera has been moved again."""
 SAME_PLACE = 2e-3
 OTHER_PLACE = 0.05
-"""Joint motion [rad or m] after which what could not be found is looked for again."""
+"""Joint motion [rad or m] after which a camera that was not found is searched again."""
 AGAIN_S = 1.0
 FEWEST = 4
-"""Known points that a camera must see before a fit is worth trying."""
+"""Least number of known points that a camera must see before a fit is tried."""
 
 
 def begin(verdict: ModelDiagnosis, context: StepContext) -> None:
-    """Cameras have moved, or seem to have, by ``verdict``: no law runs until they are known again."""
+    """Start relocalization: cameras have moved, or seem to have, by the diagnosis ``verdict``. No law runs until their
+    poses are known again.
+    """
     state, settings = context.state, context.settings
     names = list(verdict.subjects)
     state.reanchoring = Relocalization(
@@ -92,7 +94,7 @@ def _rows(state: CoreState) -> int:
 
 
 def _forget(names: list[str], context: StepContext) -> None:
-    """What these cameras said last holds no more."""
+    """Discard the last estimates of these cameras."""
     for camera, estimate in zip(context.settings.cameras, context.state.cameras, strict=True):
         if camera.name in names:
             estimate.seen_ns[:] = 0
@@ -100,13 +102,13 @@ def _forget(names: list[str], context: StepContext) -> None:
 
 
 def unknown_cameras(state: CoreState) -> tuple[str, ...]:
-    """Cameras whose pixels mean nothing now."""
+    """Names of the cameras whose pixels cannot be used now."""
     run = state.reanchoring
     return () if run is None or run.phase == "verify" else run.cameras
 
 
 def reasons(state: CoreState) -> tuple[Reason, ...]:
-    """Why laws wait."""
+    """The reasons for which laws wait."""
     run = state.reanchoring
     if run is None:
         return ()
@@ -131,7 +133,7 @@ def _doubtful(run: Relocalization, hint: str) -> Reason:
 
 
 def misfit(state: CoreState, update: ModelUpdate) -> str:
-    """Why a re-anchored model is not the one that is waited for; empty where it is."""
+    """Why a relocalized model is not the expected one; empty if it is."""
     run, model = state.reanchoring, state.model
     if run is None or model is None or run.phase != "wait":
         return "no cameras are being found anew, or they have moved again since"
@@ -144,7 +146,9 @@ def misfit(state: CoreState, update: ModelUpdate) -> str:
 
 
 def refuse_while_moved(state: CoreState) -> None:
-    """Raises RefusalError while cameras are being found anew: pixels of then and now mean different things."""
+    """Raises RefusalError while cameras are being relocalized: pixels before and after refer to
+    different camera poses.
+    """
     run = state.reanchoring
     if run is not None and run.doubt:
         raise RefusalError(
@@ -160,13 +164,13 @@ def refuse_while_moved(state: CoreState) -> None:
 
 
 def step(context: StepContext) -> None:
-    """One step of it."""
+    """One step of the relocalization."""
     state = context.state
     run = state.reanchoring
     if run is None:
         return
     if isinstance(state.source, PoseMeasurement):
-        state.reanchoring = None  # what calibrates, or checks, needs no model of before
+        state.reanchoring = None  # calibration and check do not use the previous model
         return
     resting = bool(
         (np.abs(state.block.command) < AT_REST).all() and (np.abs(state.block.velocities) < RESTING).all()
@@ -203,7 +207,7 @@ def step(context: StepContext) -> None:
 
 
 def try_again(context: StepContext) -> None:
-    """Look again after a failure: more is seen, the arm stands elsewhere, or somebody asks for it."""
+    """Try again after a failure: more is visible, the arm is elsewhere, or a client requests it."""
     run = context.state.reanchoring
     if run is not None and run.phase == "failed":
         run.reason = None
@@ -212,7 +216,7 @@ def try_again(context: StepContext) -> None:
 
 
 def refused(command: ReanchorRefused, context: StepContext) -> str:
-    """The fit could not find the cameras. Raises RefusalError where nobody asked for it."""
+    """The fit could not determine the cameras. Raises RefusalError if no fit was requested."""
     run = context.state.reanchoring
     if run is None or run.phase != "wait":
         raise RefusalError("NOT_AWAITED", "no cameras are being found anew")
@@ -236,7 +240,7 @@ def _begin_to_look(run: Relocalization, context: StepContext) -> None:
 
 
 def _moved_again(run: Relocalization, context: StepContext) -> bool:
-    """Whether what stands has moved in some image since the arm rests; then everything begins anew."""
+    """Whether static objects have moved in some image since the arm rests; then the relocalization restarts."""
     if bool((np.abs(context.q - run.tried_at) > SAME_PLACE).any()):
         return False
     moved: list[str] = []
@@ -282,7 +286,7 @@ def _moved_again(run: Relocalization, context: StepContext) -> bool:
 
 
 def _moved(run: Relocalization, context: StepContext) -> list[int]:
-    """Numbers of the cameras that have moved."""
+    """Indices of the cameras that have moved."""
     return [c for c, camera in enumerate(context.settings.cameras) if camera.name in run.cameras]
 
 
@@ -309,7 +313,7 @@ def _look(run: Relocalization, context: StepContext) -> None:
         return
     if _unproven(run, context):
         return
-    samples = tuple(  # the model that is handed in has the adjusted ones where they were
+    samples = tuple(  # the model that is handed in has the adjusted cameras at their previous poses
         sample
         for sample in averages(run.sums, context.settings)
         if sample.camera in run.cameras or sample.camera not in state.adjusted
@@ -335,7 +339,7 @@ def _look(run: Relocalization, context: StepContext) -> None:
 
 
 def _unproven(run: Relocalization, context: StepContext) -> bool:
-    """Whether nothing proves that it was the cameras, and not the arm; then the goal stays held."""
+    """Whether it is not proven that the cameras, and not the arm, have moved; then the goal stays held."""
     state, settings = context.state, context.settings
     assert context.arrays is not None
     looked = [c for c in range(len(settings.cameras)) if _after(c, run.phase_ns, state)]
@@ -357,7 +361,9 @@ def _unproven(run: Relocalization, context: StepContext) -> bool:
 
 
 def _where_they_were(run: Relocalization, context: StepContext) -> bool:
-    """Whether the cameras, looked at at rest, stand where they stood; then all goes on with the model of before."""
+    """Whether the cameras, observed at rest, have their previous poses; then everything continues with the previous
+    model.
+    """
     state = context.state
     last = state.watching.last[-VERIFY_ROUNDS:]
     looked = all(
@@ -385,7 +391,9 @@ def _known(sample: Sample, context: StepContext) -> list[int]:
 
 
 def _seen_now(run: Relocalization, context: StepContext) -> int:
-    """Known points in the newest frames of the cameras that have moved; of all, where it is in doubt that they have."""
+    """Number of known points in the newest frames of the cameras that have moved; of all cameras if it is in doubt that
+    they have moved.
+    """
     cameras = range(len(context.settings.cameras)) if run.doubt else _moved(run, context)
     return sum(
         int(context.state.watching.sightings[c].seen.sum())
@@ -420,7 +428,7 @@ def _give_up(run: Relocalization, context: StepContext, reason: Reason) -> None:
 
 
 def _carry_over(run: Relocalization, context: StepContext) -> None:
-    """Say the goals in the new cameras' pixels; the model is taken with the next step."""
+    """Reproject the goals into the new cameras' pixels; the model is put in use in the next step."""
     state = context.state
     old, model = state.model, state.pending_model
     assert old is not None
@@ -437,9 +445,10 @@ def _carry_over(run: Relocalization, context: StepContext) -> None:
 def carry_all(
     new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int], context: StepContext
 ) -> None:
-    """Say the running and the queued goals in the pixels of the cameras ``moved``, as ``new`` has them.
+    """Reproject the running and the queued goals into the pixels of the cameras ``moved``, by their matrices in
+    ``new``.
 
-    ``epochs``: of the model before and of the new one. Goals that cannot be said end.
+    ``epochs``: of the previous and the new model. Goals that cannot be reprojected end.
     """
     state = context.state
     place = place_now(context)
@@ -465,7 +474,7 @@ def carry_all(
 
 
 def taken(run: Relocalization, state: CoreState, now_ns: int) -> None:
-    """The new model is in use: laws begin to count frames anew, and fresh frames must agree with it."""
+    """The new model is in use: laws restart counting frames, and new frames must agree with it."""
     run.phase, run.phase_ns = "verify", now_ns
     if isinstance(state.source, LawRun):
         law = state.block.numbers.run
@@ -517,12 +526,12 @@ def _known_again(run: Relocalization, context: StepContext) -> None:
 
 
 def carry_run(source: LawRun, place: BodyState, new: ModelArrays, moved: tuple[int, ...]) -> Reason | None:
-    """Say a running goal's set-points anew in the cameras ``moved``; the reason where too few are left.
+    """Reproject a running goal's set-points into the cameras ``moved``; returns the reason if too few are left.
 
-    ``place``: where the body is by the old cameras.
+    ``place``: the body's pose from the old cameras.
     """
     if isinstance(source, ServoGoal):
-        source.stream = None  # what was streamed is in the old pixels; the last of it stays the goal
+        source.stream = None  # streamed set-points are in the old pixels; the last ones remain the goal
         points, known = source.target_points, np.ones(len(source.target_points), bool)
         if not source.pose_known:
             points, known = _intersected(source.set_points, source.wanted, place.arrays)
@@ -551,7 +560,7 @@ def _say_anew(
     set_points: FloatArray, wanted: FloatArray, points: FloatArray, known: BoolArray, settings: CoreSettings,
     new: ModelArrays, moved: tuple[int, ...],
 ) -> None:  # fmt: skip
-    """Set-points (c, m, 2) of the cameras ``moved``; what their new images do not show is not wanted there any more."""
+    """Set-points (c, m, 2) in the cameras ``moved``; those outside their new images do not count there any more."""
     pixels, depths = project_points(new.matrices, np.ascontiguousarray(points))
     for c in moved:
         side = np.sign(depths[c][known]).sum()
@@ -566,7 +575,7 @@ def _say_anew(
 
 
 def _raw_in_view(settings: CoreSettings, arrays: ModelArrays, camera: int, pixel: FloatArray) -> Pixel | None:
-    """The raw pixel of an ideal one, None where the image does not show it."""
+    """The raw pixel of an ideal one, None if it is outside the image."""
     u, v = distort_pixel(arrays.lenses[camera], float(pixel[0]), float(pixel[1]))
     shape = settings.cameras[camera]
     return (u, v) if -0.5 <= u <= shape.width - 0.5 and -0.5 <= v <= shape.height - 0.5 else None
@@ -583,7 +592,9 @@ def _stale(goal_id: str, shown: int) -> Reason:
 def carry_goal(
     goal: Goal, place: BodyState, new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int]
 ) -> Goal | Reason:
-    """A goal that waits, said for the new cameras, or the reason why it cannot be. ``epochs``: the old and the new."""
+    """A waiting goal, reprojected for the new cameras, or the reason why that is impossible. ``epochs``: the old and
+    the new.
+    """
     centre = goal.centre
     if centre is not None and centre.model_epoch == epochs[0]:
         centre = msgspec.structs.replace(centre, model_epoch=epochs[1])
@@ -640,7 +651,7 @@ def _incidences(
     names = {place.settings.cameras[c].name for c in moved}
     features = [feature for spec in target.incidences for feature in (spec.moving, spec.fixed)]
     if any(names & set(feature.pixels) for feature in features):
-        return None  # pixels of a scene: told again they would be those of another moment
+        return None  # pixels of a scene: reprojected, they would be those of another time
     secondary = target.secondary
     if isinstance(secondary, FeatureTarget):
         secondary = _features(secondary, place, new, moved, epochs)

@@ -1,20 +1,20 @@
 """Collision thresholds of joint efforts and following errors, stated in the cell file or learnt from the calibration
 motion, and the test of the current loads against them.
 
-What `core.monitor` watches, joint by joint, while the arm moves by itself:
+Monitored by `core.monitor`, joint by joint, while the arm moves on its own:
 
 - the *departure* of the effort from its own moving mean over ``MEAN_S``. Gravity changes an effort with the posture by
-  far more than a contact does, but slowly; a contact is fast. So no model of masses is needed, and a slow push goes
-  unseen.
+  far more than a collision does, but slowly; a collision is fast. So no model of masses is needed, but a slow push is
+  not detected.
 - the following error, set less actual position, from zero.
 
-A joint is in contact when ``samples`` samples one after the other are beyond the same side of its threshold. If one
-sample in a thousand is wrong, independently, that happens in fewer than 1e-15 of all windows of five: once in 10 000
-years at 250 Hz with six joints and both signals; in windows of three, every four days. Five samples are 20 ms there.
+A joint is in collision if ``samples`` consecutive samples exceed its threshold on the same side. If one sample in a
+thousand is wrong, independently, that happens in fewer than 1e-15 of all windows of five: once in 10 000 years at 250
+Hz with six joints and both signals; with windows of three, every four days. Five samples are 20 ms there.
 
-Thresholds: the cell file's, else ``factor`` times what the trial motions showed, plus a floor. There joints move alone,
-in motion several do, with speeds that were not tried: the departures that each joint causes are added up, each
-raised by its speed allowed now over its speed tried.
+Thresholds: the cell file's, else ``factor`` times the loads observed in the trial motions, plus a floor. Trial motions
+move joints alone, but in normal motion several joints move, at speeds that were not tried. Therefore the departures
+caused by the joints are added, each multiplied by the ratio of the allowed speed to the tried speed.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from stereoservo.kinematics.model import JointLoads
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 
-ALONE = 0.05  # of the fastest joint's speed: what a joint that only holds its place may have
+ALONE = 0.05  # of the fastest joint's speed: limit for a joint that only holds its position
 EFFORT_FLOOR = 0.01
-"""Of the largest effort of any joint with the same unit: what a joint without weight may always do."""
+"""Fraction of the largest effort of any joint with the same unit: least threshold, also for joints without load."""
 
 
 def collision_thresholds(
     settings: CoreSettings, loads: JointLoads | None
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Thresholds (n,) of efforts' departures and of following errors, infinite where none is known; None: no watch."""
+    """Thresholds (n,) of efforts' departures and of following errors, infinite where unknown; None: no monitoring."""
     contact = settings.contact
     if contact is None or not contact.enabled:
         return None
@@ -50,7 +50,7 @@ def collision_thresholds(
 def learnt_collision_thresholds(
     settings: CoreSettings, loads: JointLoads | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Thresholds (n,), (n,) from what the trial motions showed; infinite where they showed nothing."""
+    """Thresholds (n,), (n,) from the trial motions; infinite for joints without data."""
     n = len(settings.joint_names)
     efforts, following = np.full(n, np.inf), np.full(n, np.inf)
     if loads is None or settings.contact is None:
@@ -69,7 +69,7 @@ def learnt_collision_thresholds(
 
 
 def learnt_loads(trials_id: str, state: CoreState) -> JointLoads | None:
-    """What the trial motions showed; None where the drives tell nothing."""
+    """The loads observed in the trial motions; None if the drives report none."""
     loads, block = state.loads, state.block
     if (
         loads is None
@@ -86,19 +86,19 @@ def learnt_loads(trials_id: str, state: CoreState) -> JointLoads | None:
 
 
 def _largest_alike(contact: ContactSettings, largest: FloatArray) -> FloatArray:
-    """For each joint, the largest of the efforts that are in its own unit (n,)."""
+    """For each joint, the largest of the efforts with its own unit (n,)."""
     units = contact.effort_units
     return np.array([max(largest[k] for k in range(len(units)) if units[k] == unit) for unit in units])
 
 
 def stated_thresholds(settings: CoreSettings) -> tuple[FloatArray, FloatArray]:
-    """Thresholds while others are learnt: those of the cell file alone, for the arm may carry something else now."""
+    """Thresholds while others are learnt: those of the cell file alone, because the arm may carry another load now."""
     unlimited = np.full(len(settings.joint_names), np.inf)
     return collision_thresholds(settings, None) or (unlimited, unlimited)
 
 
 def _lasting(window: FloatArray) -> FloatArray:
-    """How far all samples of a window (samples, n) are beyond on one side, (n,)."""
+    """By how much all samples of a window (samples, n) exceed zero on one side, (n,)."""
     least: FloatArray = np.maximum(window.min(axis=0), -window.max(axis=0))
     return np.maximum(least, 0.0)
 
@@ -106,7 +106,7 @@ def _lasting(window: FloatArray) -> FloatArray:
 def learn_loads(
     trials_id: str, state: CoreState, speed: FloatArray, efforts: FloatArray, following: FloatArray
 ) -> None:
-    """Note what a threshold would have had to bear: the same quantities as are watched."""
+    """Record the loads that a threshold must tolerate: the same quantities as are monitored."""
     n = speed.size
     loads, block = state.loads, state.block
     if loads is None or loads.id != trials_id:
@@ -116,7 +116,7 @@ def learn_loads(
     loads.velocities = np.maximum(loads.velocities, speed)
     loads.largest_efforts = np.maximum(loads.largest_efforts, np.abs(efforts))
     mover = int(speed.argmax())
-    if int((speed > ALONE * speed[mover]).sum()) == 1:  # from one joint's stops to the next one's, two move
+    if int((speed > ALONE * speed[mover]).sum()) == 1:  # two joints move between two joints' stops
         loads.efforts[:, mover] = np.maximum(loads.efforts[:, mover], _lasting(block.effort_excess))
     loads.following_errors = np.maximum(loads.following_errors, _lasting(block.following_excess))
 
@@ -135,7 +135,7 @@ def worst_contact(
     effort = bool(by_effort.max() >= by_following.max())
     joint = int((by_effort if effort else by_following).argmax())
     name = settings.joint_names[joint]
-    assert settings.contact is not None  # else there were no limits
+    assert settings.contact is not None  # otherwise there were no limits
     way = "is something in its way? Clear it, or resume and jog away from it; where nothing was, "
     way += "raise safety.contact." if learning else "calibrate anew, or raise safety.contact."
     if effort:

@@ -27,13 +27,13 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import ModelReadiness
 
 FEWEST_LEFT = 4
-"""Markers of a camera that must remain where others are masked."""
+"""Least number of markers of a camera that must remain if others are masked."""
 
 
 def start_model_monitor(
     state: CoreState, arrays: ModelArrays, settings: CoreSettings, masked: tuple[int, ...] = ()
 ) -> None:
-    """Watch over a new model. ``masked``: ids of markers that stay unused."""
+    """Start monitoring a new model. ``masked``: ids of markers that stay unused."""
     m = len(arrays.marker_ids)
     watching = nothing_sighted(len(settings.cameras), len(arrays.row_ids), len(settings.joint_names), m)
     for marker in masked:
@@ -44,7 +44,7 @@ def start_model_monitor(
 
 
 def emit_diagnosis(verdict: ModelDiagnosis, context: StepContext) -> None:
-    """Say a new verdict in an event."""
+    """Report a new diagnosis in an event."""
     message = verdict.text or "the images agree with the model again"
     reason = diagnosis_reason(verdict)
     context.emit(
@@ -54,7 +54,7 @@ def emit_diagnosis(verdict: ModelDiagnosis, context: StepContext) -> None:
 
 
 def diagnosis_reason(verdict: ModelDiagnosis) -> Reason | None:
-    """A verdict as a reason; None where all is well."""
+    """A diagnosis as a reason; None if there is no fault."""
     subject, value = ", ".join(verdict.subjects), verdict.size
     if verdict.kind in MOVED:
         return Reason("CAMERA_MOVED", "hold", subject, verdict.moved_px, None, "px", verdict.text)
@@ -72,7 +72,7 @@ def diagnosis_reason(verdict: ModelDiagnosis) -> Reason | None:
 
 
 def mask_marker(verdict: ModelDiagnosis, context: StepContext) -> bool:
-    """Use a slipped marker no more, where every camera has enough others; whether it is so."""
+    """Stop using a slipped marker, if every camera has enough others; returns whether it was masked."""
     state, arrays = context.state, context.arrays
     assert arrays is not None
     slipped = [arrays.index[int(marker)] for marker in verdict.subjects if int(marker) in arrays.index]
@@ -89,14 +89,14 @@ def mask_marker(verdict: ModelDiagnosis, context: StepContext) -> bool:
 
 
 def camera_moved_findings(verdict: ModelDiagnosis, context: StepContext, *, fresh: bool) -> Iterator[Finding]:
-    """The findings where a camera has moved: relocalization begins at rest; where it is not allowed, the model is
+    """The findings if a camera has moved: relocalization starts at rest; if it is not allowed, the model becomes
     suspect and the goals that rely on it end.
     """
     state = context.state
     reason = diagnosis_reason(verdict)
     assert reason is not None
     source = MOTION_SOURCES[type(state.source)]
-    if source.measures:  # a calibration, or a check, finds out itself whether it was the arm
+    if source.measures:  # a calibration or a check decides itself whether the arm moved
         if fresh and verdict.kind in MOVED:
             yield Finding("abort", reason, verdict.text)
         return
@@ -113,11 +113,11 @@ def camera_moved_findings(verdict: ModelDiagnosis, context: StepContext, *, fres
 
 
 BACK_ROUNDS = 30
-"""Rounds in which a masked marker must stand where it should, to be used again."""
+"""Rounds in which a masked marker must be at its place before it is used again."""
 
 
 def unmask_returned(watching: ModelMonitor, known: list[int], context: StepContext) -> None:
-    """A masked marker that stands where it should again, to every camera that sees it, is used again."""
+    """Use a masked marker again that is back in its place in every camera that sees it."""
     arrays = context.arrays
     assert arrays is not None
     masked = np.flatnonzero(watching.masked > 0.0)

@@ -1,11 +1,11 @@
 """Fault isolation from frames that contradict the model: which change (camera, marker, joint zero, marker body)
 explains the innovations best, and whether moved cameras can be distinguished from a moved arm.
 
-All cameras moved as one, and an arm that stands elsewhere than its joints say (play, a zero, the marker body), look
-alike in the images of the arm. `doubt` says whether something else tells them apart.
+A common displacement of all cameras, and a deviation of the arm from its joint readings (play, a zero, the marker
+body), look alike in the images of the arm. `doubt` decides whether other evidence distinguishes them.
 
-What the errors of joint readings explain that the model states of its arm is no change. Beside such errors a camera or
-a marker is named where it alone is at odds with the joints as the others see them.
+Innovations explained by the errors of joint readings that the model states are no change. With such errors, a camera or
+a marker is named if it alone disagrees with the joints as the others see them.
 """
 
 from __future__ import annotations
@@ -30,22 +30,26 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
 
 FALSE_ALARMS_PER_HOUR = 1e-3
-"""Of one round, in noise as stated; a verdict needs two of three besides."""
+"""False alarms per hour of single rounds, with noise as stated; a diagnosis requires two of three rounds
+in addition.
+"""
 LEAST_PX = 0.5
-"""Rms change of the pixels below which no cause is told: models are off by as much where nothing has changed."""
+"""Rms change of the pixels [px] below which no cause is reported: models have errors of that size
+without any change.
+"""
 SUSPECT_MARKERS = 3
-"""Of which each is left out in turn."""
+"""Number of suspect markers, each of which is left out in turn."""
 FEWEST_ON_ARM = 4
-"""Markers on the arm by which a camera may confirm that the arm is where its joints say."""
+"""Least number of markers on the arm for a camera to confirm that the arm agrees with its joint readings."""
 WAYS_OUT = (
     "Where cameras moved: put them back and resume, or calibrate. Where joints are off: calibrate --check "
     "--reset-zeros. Where the marker body moved on the arm: put it back and resume, or calibrate. Static markers in "
     "view of every camera ([scene] static) tell them apart"
 )
-"""What a person can do, cause by cause, where moved cameras and a moved arm cannot be told apart."""
+"""Possible remedies, cause by cause, if moved cameras and a moved arm cannot be distinguished."""
 FEWEST_STATIC = 3
-"""Static points that must have moved in the picture of a camera to prove that the camera has: one or two may have been
-pushed themselves.
+"""Number of static points that must have moved in the image of a camera to prove that the camera has moved: one or two
+may have been pushed themselves.
 """
 
 
@@ -58,19 +62,19 @@ def _thresholds(rate_hz: float, cameras: int, markers: int, joints: int) -> Thre
 
 
 def thresholds_of(settings: CoreSettings, markers: int, cameras: int) -> Thresholds:
-    """Thresholds of the watch over ``markers`` in so many of the cell's cameras."""
+    """Thresholds of the model monitor for ``markers`` in so many of the cell's cameras."""
     rate_hz = min((camera.rate_hz for camera in settings.cameras), default=30.0)
     return _thresholds(rate_hz, cameras, markers, len(settings.joint_names))
 
 
 def diagnosed(bench: Bench) -> ModelDiagnosis:
-    """What explains the innovations of one moment."""
+    """The diagnosis of the innovations of one moment."""
     found = bench.diagnose()
     cause, other = found.cause, found.runner_up
     if found.kind == "nothing":
         return ModelDiagnosis()
     if cause is not None and other is not None and {cause.kind, other.kind} == {"cameras", "joints"}:
-        # What stands between arm and cameras has moved: whichever it was, `doubt` asks the static points.
+        # Either the cameras or the arm moved: `doubt` examines the static points.
         cause, other = (cause if cause.kind == "cameras" else other), None
         words = " moved together"
     elif cause is not None and other is not None and {cause.kind, other.kind} == {"camera", "joints"}:
@@ -90,7 +94,7 @@ def diagnosed(bench: Bench) -> ModelDiagnosis:
 
 
 class Bench:
-    """One moment, with the arm at ``q`` (n,), as the cameras ``known`` saw it, for several questions.
+    """The observations of one moment, with the arm at ``q`` (n,), in the cameras ``known``, prepared for several tests.
 
     ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `prediction.FrameResiduals`.
     """
@@ -111,7 +115,9 @@ class Bench:
         return other
 
     def explained(self, believed: FloatArray) -> bool:
-        """Whether sights of weight ``believed`` (c, k) [1/px] are noise: in each camera together, and each of them."""
+        """Whether observations of weight ``believed`` (c, k) [1/px] are noise: in each camera together, and each of
+        them.
+        """
         squares = ((self.innovation * believed[..., None]) ** 2).sum(axis=-1)
         counts = 2.0 * (believed > 0.0).sum(axis=1)
         together = all(
@@ -121,7 +127,9 @@ class Bench:
         return together and float(squares.max()) <= gate_threshold(self.settings.gate_sigma)
 
     def diagnose(self, row: int | None = None, *, static_alone: bool = False) -> ChangeDiagnosis:
-        """What all cameras show, or the one of a ``row``; ``static_alone``: without the markers on the arm."""
+        """The most probable change seen by all cameras, or by the one of a ``row``; ``static_alone``: without the
+        markers on the arm.
+        """
         arrays, m = self.arrays, len(self.points)
         rows = list(range(len(self.known))) if row is None else [row]
         on_arm = self.weights[rows][:, :m] * (0.0 if static_alone else 1.0)
@@ -134,10 +142,10 @@ class Bench:
 
 
 def doubt(bench: Bench, moved: list[int], px: float) -> str:
-    """Why it is not proven that the cameras ``moved``, and not the arm, have moved; empty where it is.
+    """Why it is not proven that the cameras ``moved``, and not the arm, have moved; empty if it is proven.
 
-    Proof is another camera that sees the arm where its joints say or, in the picture of each camera, static points that
-    moved as the camera's own displacement moves them together with the arm. ``px``: rms disagreement.
+    Proof is another camera that sees the arm where its joint readings predict it or, in the image of each moved camera,
+    static points that moved by the camera's own displacement together with the arm. ``px``: rms disagreement.
     """
     if any(camera not in moved and _confirms_the_arm(bench, row) for row, camera in enumerate(bench.known)):
         return ""
@@ -170,7 +178,7 @@ def doubt(bench: Bench, moved: list[int], px: float) -> str:
 
 
 def _confirms_the_arm(bench: Bench, row: int) -> bool:
-    """Whether a camera sees enough of the arm, and all of it where the joints say."""
+    """Whether a camera sees enough of the arm, and all of it where the joint readings predict it."""
     seen = int((bench.weights[row, : len(bench.points)] > 0.0).sum())
     return seen >= FEWEST_ON_ARM and bench.diagnose(row).kind == "nothing"
 
@@ -178,7 +186,7 @@ def _confirms_the_arm(bench: Bench, row: int) -> bool:
 def _static_evidence(
     bench: Bench, camera: int
 ) -> tuple[Literal["moved", "stand", "few", "unexplained"], int]:
-    """What the static points in the picture of a camera say of it, and how many it sees."""
+    """What the static points in a camera's image prove about the camera, and how many it sees."""
     if camera not in bench.known:
         return "few", 0
     row = bench.known.index(camera)
@@ -191,12 +199,12 @@ def _static_evidence(
 
 
 def named(cameras: tuple[str, ...]) -> str:
-    """Cameras in words."""
+    """The names of cameras as text."""
     return f"camera{'s' if len(cameras) > 1 else ''} {', '.join(cameras)}"
 
 
 def _proven(verdict: ModelDiagnosis, bench: Bench) -> ModelDiagnosis:
-    """The verdict that cameras have moved; ``cameras_or_arm`` where the arm explains the same."""
+    """The diagnosis that cameras have moved; ``cameras_or_arm`` if a motion of the arm explains the same."""
     moved = [c for c, camera in enumerate(bench.settings.cameras) if camera.name in verdict.subjects]
     why = doubt(bench, moved, verdict.moved_px)
     if not why:
@@ -205,7 +213,9 @@ def _proven(verdict: ModelDiagnosis, bench: Bench) -> ModelDiagnosis:
 
 
 def _each_by_itself(bench: Bench) -> ModelDiagnosis | None:
-    """Two cameras or more may have moved, each in its own way: a displacement of its own explains each one's frame."""
+    """The diagnosis that two or more cameras moved independently: a displacement of its own explains each one's frame.
+    None if it does not apply.
+    """
     moved, effects = [], []
     for row, camera in enumerate(bench.known):
         alone = bench.diagnose(row)
@@ -279,10 +289,10 @@ def _joint_deviation(bench: Bench, joint: int) -> float:
 
 
 def without_joint_errors(bench: Bench, believed: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Innovations (c, k, 2) [px] less what the arm shows that stands beside its readings, and by how much (n,), over
-    the deviations that the model states; None where it states none.
+    """Innovations (c, k, 2) [px] without the part explained by errors of joint readings, and these errors (n,) relative
+    to the standard deviations that the model states; None if it states none.
 
-    The most probable joints are estimated from the sights of weight ``believed`` (c, k) [1/px].
+    The most probable joint positions are estimated from the observations of weight ``believed`` (c, k) [1/px].
     """
     arrays = bench.arrays
     if arrays.joint_accuracy is None:
@@ -300,12 +310,13 @@ def without_joint_errors(bench: Bench, believed: FloatArray) -> tuple[FloatArray
 
 
 def diagnosed_beside_joint_errors(bench: Bench, *, proven: bool) -> ModelDiagnosis:
-    """What explains the innovations of one moment of an arm whose joints may have errors; nothing where these do.
-    ``proven``: that a camera has moved; errors of the joints alone do not take it back.
+    """The diagnosis of the innovations of one moment for an arm whose joint readings may have errors; no diagnosis if
+    these explain the innovations.
+    ``proven``: a camera is known to have moved; then errors of the joints alone do not revoke it.
 
-    Where the innovations name neither a camera nor a marker, the joints are estimated without each camera, and without
-    each of the markers that is farthest from them, in turn: what was left out is named where it alone is what changed,
-    and nothing else that was left out would be.
+    If the innovations name neither a camera nor a marker, the joints are estimated without each camera, and without
+    each of the markers that fit them worst, in turn. The one left out is named if it alone has changed, and no other
+    candidate has the same effect.
     """
     fitted = without_joint_errors(bench, bench.weights)
     if fitted is None:
@@ -330,8 +341,8 @@ def diagnosed_beside_joint_errors(bench: Bench, *, proven: bool) -> ModelDiagnos
 
 
 def _with_one_left_out(bench: Bench, left: FloatArray) -> list[FloatArray]:
-    """Weights (c, k) without each camera, where there are others, and without each of the markers that fit worst to
-    the joints, by what is ``left`` (c, k, 2) [px].
+    """Weights (c, k) without each camera, if there are others, and without each of the markers that fit the joints
+    worst, by their residuals ``left`` (c, k, 2) [px].
     """
     weights = bench.weights
     cameras, markers = np.arange(len(bench.known)), np.arange(weights.shape[1])
@@ -342,12 +353,14 @@ def _with_one_left_out(bench: Bench, left: FloatArray) -> list[FloatArray]:
 
 
 def _likely_errors(found: FloatArray) -> bool:
-    """Whether joints may stand beside their readings by ``found`` (n,) standard deviations."""
+    """Whether errors of joint readings are likely, by the deviations ``found`` (n,) in standard deviations."""
     return float((found * found).sum()) <= improbable(float(found.size))
 
 
 def bench_now(state: CoreState, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
-    """The newest frames of the cameras ``known``; what is uncertain of a body that moves by itself is noise in them."""
+    """The newest frames of the cameras ``known``; the uncertainty of a body that moves on its own is added to their
+    noise.
+    """
     watching, beside_px2 = state.watching, MODEL_SIGMA_PX**2 + variance_of_carried(state.target)
     weights = np.zeros((len(known), len(arrays.row_ids)))
     innovation = np.zeros((len(known), len(arrays.row_ids), 2))

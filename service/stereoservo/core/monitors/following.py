@@ -1,9 +1,9 @@
-"""How drives follow their commands: bounds, sums and reasons of the watch on joints that do not, and drives that answer
-a while later.
+"""Following-error monitoring: bounds, sums and reasons for joints that do not follow their commands, and the delays of
+drives.
 
-What a joint was sent is compared with its reading as of now and as of its drive's delay (`measure_delays`), and what
-lies between the two is not missing. Nobody may have said of a drive that it is late: the delay of each joint is
-measured where it sets out from rest, from when it was sent a small travel until its reading shows it.
+The commanded travel of a joint is compared with its reading, once without delay and once with its drive's delay
+(`measure_delays`); travel between the two does not count as missing. The delay of a drive may be unknown. It is
+measured for each joint at each start from rest, as the time from a small commanded travel until the reading shows it.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, Record
 from stereoservo.numerics.compilation import kernel
 
-MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of per cents
+MEMORY_S = 1.0  # after which a missing travel is forgotten: drives have gain errors of a few per cent
 LAG_S = 0.15  # a healthy drive lags by less than this at full speed
 SILENCE_S = 0.25  # of motion after which a reading has answered, whatever the drive's lag
-PLAY = {"revolute": 0.06, "prismatic": 0.005}  # [rad, m] sent before a healthy joint's reading answers
+PLAY = {"revolute": 0.06, "prismatic": 0.005}  # [rad, m] commanded before a healthy joint's reading changes
 ANSWERS = {
     "revolute": 1e-3,
     "prismatic": 1e-4,
-}  # [rad, m] by which a reading answers, where its step is no coarser
+}  # [rad, m] least change of a reading, for encoders without coarser steps
 FRICTION = {"revolute": 0.01, "prismatic": 0.001}  # [rad/s, m/s] below which a healthy joint may stick
 
 
@@ -35,19 +35,19 @@ FRICTION = {"revolute": 0.01, "prismatic": 0.001}  # [rad/s, m/s] below which a 
 def of_kinds(
     kinds: tuple[str, ...], resolution: tuple[float, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds and encoder steps; not to be written to."""
+    """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds and encoder steps; read-only."""
     play, answers, friction = (
         np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION)
     )
     if resolution:
-        answers = np.maximum(answers, 1.5 * np.array(resolution))  # one step to and fro is no motion
+        answers = np.maximum(answers, 1.5 * np.array(resolution))  # one encoder step to and fro is no motion
     for value in (play, answers, friction):
         value.setflags(write=False)
     return play, answers, friction
 
 
 def not_following(joint: int, missing: float, limit: float, delay_s: float, settings: CoreSettings) -> Reason:
-    """That a joint lacks ``missing`` of its travel, with its sign, of which ``limit`` is lag."""
+    """Reason: a joint lacks ``missing`` of its travel, with its sign; ``limit`` is the travel explained by lag."""
     name, unit = settings.joint_names[joint], settings.joint_unit(joint)
     known = f", {delay_s:.2f} s of delay apart" if delay_s > 0.0 else ""
     return Reason(
@@ -58,7 +58,7 @@ def not_following(joint: int, missing: float, limit: float, delay_s: float, sett
 
 
 def silent(joint: int, sent: float, since_s: float, settings: CoreSettings) -> Reason:
-    """That the reading of a joint stood still for ``since_s`` while it was ``sent`` travel."""
+    """Reason: the reading of a joint did not change for ``since_s`` while the travel ``sent`` was commanded."""
     name, unit, limit = (
         settings.joint_names[joint],
         settings.joint_unit(joint),
@@ -73,9 +73,10 @@ def silent(joint: int, sent: float, since_s: float, settings: CoreSettings) -> R
 
 @kernel
 def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tuple[int, float]:
-    """The joint that lacks most of its travel, over what is ``allowed`` (n,), and how much, with its sign; -1: none.
+    """The joint with the largest missing travel relative to ``allowed`` (n,), and its missing travel with sign; -1:
+    none.
 
-    What it was sent as of ``now`` and as of its delay (``late``, (n,) each) bounds where it should be.
+    The missing travel without delay (``now``) and with the drive's delay (``late``), (n,) each, bound the true one.
     """
     worst, most = -1, 1.0
     missing = 0.0
@@ -88,8 +89,8 @@ def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tu
 
 @kernel
 def account_silence(block: Record, room: Record) -> None:
-    """Add up what each joint was sent, as it arrives, and for how long, since its reading changed; friction may hold
-    some of it back.
+    """Add up the travel commanded to each joint, at the time of its arrival, and its duration, since the reading last
+    changed, less the part that friction may hold back.
     """
     memory, work = block[0], room[0]
     n, dt_s = memory.joints, work.elapsed_s
@@ -115,22 +116,26 @@ def account_silence(block: Record, room: Record) -> None:
 
 
 LEAST_S = 0.04
-"""Friction and play look like less."""
+"""Least delay that is used [s]: friction and play look like shorter ones."""
 ONSET_S = 0.1
-"""In which a joint that sets out must be sent the travel that is timed; friction and play would count at less speed."""
+"""Time [s] within which the measured travel must be commanded at a start from rest; at lower speed, friction and play
+would distort the result.
+"""
 ONSET_TRAVEL = 2.0
-"""The travel that is timed, times that by which a reading answers."""
+"""Travel used for the measurement, as a multiple of the least change of a reading."""
 WAITS, RESTS, SETS_OUT = 0.0, 1.0, 2.0
 """Phases of a measurement."""
 STEADY = 0.1
-"""Share of a joint's command from which the one that arrives may differ in a motion that tells of the delay."""
+"""Largest difference between the current and the arriving command of a joint, as a fraction, for a motion to be steady
+enough to measure the delay.
+"""
 PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S, TOWARDS = range(7)
 """Rows of `DriveDelays.onset`."""
 
 
 @kernel
 def delays_of(block: Record) -> DriveDelays:
-    """The arrays of the ``block`` that are of late drives."""
+    """The arrays of the ``block`` for drive delays."""
     memory = block[0]
     n, past = memory.joints, memory.past
     return DriveDelays(
@@ -145,9 +150,9 @@ def delays_of(block: Record) -> DriveDelays:
 def measure_delays(
     command: FloatArray, q: FloatArray, answers: FloatArray, dt_s: float, delays: DriveDelays
 ) -> None:
-    """Account for ``dt_s`` [s] at the velocities ``command`` (n,), into the ``delays``.
+    """Update the ``delays`` by ``dt_s`` [s] at the velocities ``command`` (n,).
 
-    ``answers`` (n,): by which the readings ``q`` (n,) answer.
+    ``answers`` (n,): least change of the readings ``q`` (n,).
     """
     sent, onset, samples, delay_s = delays.sent, delays.onset, delays.samples, delays.delay_s
     for j in range(q.shape[0]):
@@ -162,7 +167,7 @@ def measure_delays(
                 continue
             onset[PHASE, j], onset[SINCE_S, j], onset[PASSED_S, j] = SETS_OUT, 0.0, -1.0
             if command[j] * onset[TOWARDS, j] < 0.0 and math.isfinite(samples[-1, j]):
-                onset[PHASE, j], onset[TOWARDS, j] = WAITS, command[j]  # through its play first
+                onset[PHASE, j], onset[TOWARDS, j] = WAITS, command[j]  # it must pass through its play first
         if onset[PHASE, j] != SETS_OUT:
             continue
         onset[SINCE_S, j] += dt_s
@@ -191,18 +196,18 @@ def _push(samples: FloatArray, newest: float) -> None:
 
 @kernel
 def _median(samples: FloatArray) -> float:
-    """Of those that are numbers: the middle one, of two the greater."""
+    """The median of the finite samples; of two middle ones the greater."""
     known = np.sort(samples[np.isfinite(samples)])
     return float(known[known.size // 2])
 
 
 @kernel
 def account_travel(block: Record, room: Record, command: FloatArray, told: bool, delays: DriveDelays) -> None:
-    """Account for the time since the last step of travel at the velocities ``command`` (n,), as of now in the
-    ``block``'s untold and missing travel, as of the delays in ``delays``.
+    """Update the travel by the time since the last step at the velocities ``command`` (n,): without delay in the
+    ``block``'s untold and missing travel, with delay in ``delays``.
 
-    ``told``: whether the readings are news. A joint that makes, in steady motion, what has not arrived yet by its delay
-    is less late: what it is goes into the samples.
+    ``told``: whether the readings are new. If a joint in steady motion has moved farther than its delay allows, its
+    delay is shorter; the shorter one is added to the samples.
     """
     memory, work = block[0], room[0]
     n, dt_s, step = memory.joints, work.elapsed_s, memory.delay_steps
@@ -231,6 +236,6 @@ def account_travel(block: Record, room: Record, command: FloatArray, told: bool,
         speed, travel = abs(velocity[j]), ONSET_TRAVEL * answers[j]
         ahead = -math.copysign(missing_late[j], missing_late[j] * velocity[j])
         steady = abs(velocity[j] - command[j]) <= STEADY * speed and speed * ONSET_S >= travel
-        if back > 0 and steady and ahead > LEAST_S * speed + travel:  # it was play that took so long
+        if back > 0 and steady and ahead > LEAST_S * speed + travel:  # play caused the longer time
             _push(samples[:, j], max(delay_s[j] - ahead / speed, 0.0))
             delay_s[j] = samples[-1, j] if samples[-1, j] >= LEAST_S else 0.0

@@ -1,10 +1,11 @@
 """Cameras declared mobile: re-estimated but unused while they move (from tool and other cameras), used again at rest
 (thesis 9, fig. 9.1).
 
-One that stands is a camera like any other. While it moves, laws go on without it: the model keeps it where it stood
-last, as after a drop-out, and in every frame a displacement of it is fitted to the markers where the joints, corrected
-by the cameras that stand, have them. Once some frames agree, it stands: the model has it at their mean, and what goals
-say in its pixels is said anew; but only where a camera that stands, or static points, prove that it was not the arm.
+A static mobile camera is treated like any other. While it moves, laws continue without it: the model keeps its last
+static pose, as after a drop-out, and in every frame its displacement is fitted to the markers at the positions given by
+the joints, corrected by the static cameras. Once several frames agree, it is static again: the model takes the mean of
+their poses, and goals stated in its pixels are reprojected. This requires proof, by a static camera or static points,
+that the camera moved and not the arm.
 """
 
 from __future__ import annotations
@@ -71,14 +72,14 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 FREEDOMS = 6
 REFUSED_FRAMES = 2
-"""In a row, after which a camera that nothing explains is said to move."""
+"""Consecutive unexplained frames after which a camera counts as moving."""
 STILL_FRAMES = 10
 STILL_PX = 0.1
-"""Besides its own noise, what a camera that stands may seem to move in that time, rms: models are not exact."""
+"""Apparent motion [px rms] allowed for a static camera in that time in addition to its noise: models are not exact."""
 STILL_CHANCE = 1e-4
-"""Of noise alone looking like motion, of one frame."""
+"""Probability that noise alone looks like motion, for one frame."""
 HAND_OVER_S = 2.0
-"""A camera at rest that nothing explains for so long is found anew like one that was bumped, where no goal runs."""
+"""Time [s] after which an unexplained camera at rest is relocalized like a displaced one, if no goal runs."""
 
 _STILL_CHI2 = chi2_quantile(STILL_CHANCE, FREEDOMS)
 
@@ -86,7 +87,7 @@ _STILL_CHI2 = chi2_quantile(STILL_CHANCE, FREEDOMS)
 def start(
     state: CoreState, settings: CoreSettings, arrays: ModelArrays, reanchored: tuple[str, ...], emit: Emit
 ) -> None:
-    """A model is in use from here on: of the cameras ``reanchored`` alone, or (empty) of all."""
+    """Adapt to a new model in use: of the cameras ``reanchored`` alone, or (empty) of all."""
     state.adjusted = tuple(name for name in state.adjusted if reanchored and name not in reanchored)
     metric = arrays.metric_basis is not None
     for c, camera in enumerate(settings.cameras):
@@ -104,7 +105,7 @@ def start(
 
 
 def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...]) -> CellModel:
-    """A re-anchored model, with mobile cameras that are not among the ``reanchored`` where they stand now."""
+    """A relocalized model in which mobile cameras that are not among the ``reanchored`` have their current matrices."""
     if state.model is None or not reanchored:
         return model
     here = {camera.name: camera for camera in state.model.cameras}
@@ -122,7 +123,9 @@ def see(
     state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, sights: FrameResiduals,
     prediction: Prediction, q: FloatArray, emit: Emit,
 ) -> FrameResiduals:  # fmt: skip
-    """One frame of a camera, with the arm at ``q`` (n,) at its shutter; what of it may be compared with the model."""
+    """Process one frame of a camera, with the arm at ``q`` (n,) at its shutter time; returns the residuals that may be
+    compared with the model.
+    """
     mobile = state.mobile[camera]
     if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
         return sights
@@ -130,7 +133,7 @@ def see(
     if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
         return (
             hidden if mobile.moving else sights
-        )  # joints that a faulty drive tells are no measure of cameras
+        )  # readings of a faulty drive must not be used to judge cameras
     points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
     basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
     assert basis is not None
@@ -157,8 +160,8 @@ def _known(
     state: CoreState, arrays: ModelArrays, camera: int, sights: FrameResiduals, prediction: Prediction,
     q: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Points (k, 4) where the joints ``q``, corrected, have them, with the static ones; what the camera saw of them
-    (k, 2) and its weights (k,) [1/px].
+    """Points (k, 4) at the positions given by the corrected joints ``q``, with the static ones; the pixels at which the
+    camera saw them (k, 2) and their weights (k,) [1/px].
     """
     H = chain_at(arrays, q + state.block.correction)[0]
     points = np.concatenate((transform_points(H, arrays.marker_points), arrays.scene_points))
@@ -172,14 +175,15 @@ def _known(
 def _follow(
     mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameResiduals, found: Adjusted
 ) -> None:
-    """Where the camera is by a frame that was explained, and whether it has moved since the frames before."""
+    """Update the camera's pose by an explained frame, and decide whether it has moved since the frames before."""
     then = moved_matrix(P, mobile.reference)
     way = np.empty((4, 4))
     multiply4_into(mobile.reference, found.D, way)
     used = found.weights > 0.0
     distance = apart(then, moved_matrix(P, way), points, used)
     noise = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1])
-    # The pixels of an estimate of six parameters deviate by chi-square of six freedoms in all; of two, by twice that.
+    # The pixels of an estimate of six parameters deviate by chi-square with six degrees of freedom in total; those of
+    # two, by twice that.
     random = math.sqrt(2.0 * _STILL_CHI2 * float(noise[used].sum())) / float(used.sum())
     if mobile.still == 0 or distance > STILL_PX + random:
         mobile.reference = way
@@ -195,7 +199,7 @@ def _follow(
 def _static_moved(
     P: FloatArray, way: FloatArray, points: FloatArray, weights: FloatArray, markers: int
 ) -> bool:  # fmt: skip
-    """Whether enough static points, behind the ``markers`` in ``points``, moved in the picture with the camera."""
+    """Whether enough static points, after the ``markers`` in ``points``, moved in the image with the camera."""
     static = weights > 0.0
     static[:markers] = False
     return int(static.sum()) >= FEWEST_STATIC and apart(P, moved_matrix(P, way), points, static) >= LEAST_PX
@@ -204,8 +208,8 @@ def _static_moved(
 def _sets_out(
     state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, found: Adjusted | None, seen: int
 ) -> bool:  # fmt: skip
-    """Whether a frame says that a camera that stood moves: a displacement explains it that is no noise, or nothing
-    does, and the frames before it were refused, too.
+    """Whether a frame shows that a static camera starts to move: a displacement above the noise explains it, or nothing
+    does, and the previous frames were rejected, too.
     """
     if _others_contradict(state, settings):
         return False
@@ -223,7 +227,7 @@ def _set_out(mobile: MobileCamera, camera: int, settings: CoreSettings, now_ns: 
 
 
 def _others_contradict(state: CoreState, settings: CoreSettings) -> bool:
-    """Whether cameras that stand for good refuse what they see, too: then it is not this camera."""
+    """Whether permanently static cameras reject their observations, too: then this camera is not the cause."""
     return any(
         estimate.rejected_frames > 0
         for camera, estimate in zip(settings.cameras, state.cameras, strict=True)
@@ -235,7 +239,7 @@ def _others_contradict(state: CoreState, settings: CoreSettings) -> bool:
 
 
 def takes(context: StepContext) -> bool:
-    """Whether the watch says that cameras have moved, and all of them are mobile: then they are adjusted."""
+    """Whether the diagnosis is that cameras have moved, and all of them are mobile: then they are adjusted."""
     state = context.state
     verdict = state.watching.verdict
     if verdict.kind not in MOVED:
@@ -253,7 +257,7 @@ def takes(context: StepContext) -> bool:
 
 
 def step(context: StepContext) -> None:
-    """Use cameras that stand again; the present is then the one with what is known now."""
+    """Use cameras that are static again; the estimate of the present is then repeated."""
     state, settings = context.state, context.settings
     arrays = context.arrays
     if arrays is None:
@@ -262,7 +266,7 @@ def step(context: StepContext) -> None:
         if mobile is None or not mobile.moving:
             continue
         if settings.cameras[c].name in unknown_cameras(state):
-            state.mobile[c] = standing_camera()  # it is found anew at rest
+            state.mobile[c] = standing_camera()  # it is relocalized at rest
         elif mobile.still >= STILL_FRAMES and state.planning is None and not state.pending_reanchored:
             mobile.doubtful = not _proven(c, context)
             if not mobile.doubtful:
@@ -276,9 +280,10 @@ def step(context: StepContext) -> None:
 
 
 def _proven(c: int, context: StepContext) -> bool:
-    """Whether it was the camera that moved, and not the arm that stands elsewhere than its joints say.
+    """Whether it is proven that the camera moved, and not the arm relative to its joint readings.
 
-    Another camera that is not on its way sees the arm, a mobile one where the joints say; or static points moved.
+    Proof: another camera that does not move sees the arm (for a mobile one: where the joints predict it); or static
+    points moved.
     """
     state, m = context.state, len(context.state.watching.masked)
     mobile = state.mobile[c]
@@ -295,7 +300,7 @@ def _proven(c: int, context: StepContext) -> bool:
 
 
 def _stand_as_before(c: int, context: StepContext) -> None:
-    """What looked like a moving camera has passed: the camera stands where the model has it."""
+    """End an apparent motion: the camera has the pose that the model states."""
     name = context.settings.cameras[c].name
     context.state.mobile[c] = standing_camera()
     message = f"camera {name} shows what it showed before it seemed to set out: it stands where it stood"
@@ -303,7 +308,7 @@ def _stand_as_before(c: int, context: StepContext) -> None:
 
 
 def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
-    """The camera is where the mean of the frames that agree has it."""
+    """Set the camera's pose to the mean of the frames that agree."""
     state, arrays, model = context.state, context.arrays, context.state.model
     assert arrays is not None
     assert model is not None
@@ -340,7 +345,7 @@ def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
 
 
 def mean_way(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:
-    """Displacement (4, 4) from where the camera stood to the mean of the frames that agree."""
+    """Displacement (4, 4) from the camera's last static pose to the mean of the frames that agree."""
     assert arrays.metric_basis is not None
     twist = mobile.twists / max(float(mobile.still), 1.0)
     way = np.empty((4, 4))
@@ -349,7 +354,7 @@ def mean_way(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:
 
 
 def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
-    """A camera that rests, sees enough and is lost all the same is found anew like one that was bumped."""
+    """Relocalize a camera like a displaced one if it is at rest, sees enough and is still lost."""
     state, settings = context.state, context.settings
     waited_s = (context.now_ns - mobile.found_ns) * 1e-9
     resting = bool((np.abs(state.block.command) < AT_REST).all())
@@ -366,12 +371,12 @@ def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
         begin(ModelDiagnosis("camera_moved", (name,), moved_px=mobile.moved_px, text=text), context)
 
 
-# -- what others ask ------------------------------------------------------------------------------------------
+# -- queries of other stages ----------------------------------------------------------------------------------
 
 
 def to_look_from(arrays: ModelArrays, context: StepContext) -> tuple[Prediction, list[int], tuple[str, ...]]:
-    """For the priors: the prediction with moving cameras where they are now, which these are, and the names of those
-    of whose place nothing is known.
+    """For the priors: the prediction with moving cameras at their current poses, the indices of these cameras, and the
+    names of those whose pose is unknown.
     """
     state, settings = context.state, context.settings
     assert context.prediction is not None
@@ -393,7 +398,7 @@ def to_look_from(arrays: ModelArrays, context: StepContext) -> tuple[Prediction,
 
 
 def moving_bits(state: CoreState) -> int:
-    """The cameras that move now, as bits of a number."""
+    """The cameras that move now, as a bit mask."""
     return sum(1 << c for c, mobile in enumerate(state.mobile) if mobile is not None and mobile.moving)
 
 
@@ -407,7 +412,7 @@ def moving_cameras(state: CoreState, settings: CoreSettings) -> tuple[str, ...]:
 
 
 def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
-    """What the status says of moving cameras."""
+    """The reasons about moving cameras for the status."""
     names = moving_cameras(state, settings)
     if not names:
         return ()
@@ -433,7 +438,7 @@ def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
 
 
 def refuse_pixels(target: Target, state: CoreState, settings: CoreSettings) -> None:
-    """Raises RefusalError for a goal in pixels of a camera that moves: they would be those of no one place."""
+    """Raises RefusalError for a goal in pixels of a moving camera, because these have no fixed meaning."""
     named: set[str] = set()
     if isinstance(target, IncidenceTarget):
         for spec in target.incidences:
@@ -446,7 +451,7 @@ def refuse_pixels(target: Target, state: CoreState, settings: CoreSettings) -> N
 
 
 def refuse_moving(names: tuple[str, ...]) -> None:
-    """Raises RefusalError where cameras ``names``, whose pixels are wanted, move."""
+    """Raises RefusalError if one of the cameras ``names``, whose pixels are required, moves."""
     if names:
         raise RefusalError(
             "CAMERA_MOVING",
@@ -456,7 +461,7 @@ def refuse_moving(names: tuple[str, ...]) -> None:
 
 
 def rehearse() -> None:
-    """Compile the kernels that no frame of a camera that stands needs."""
+    """Compile the kernels that frames of static cameras do not use."""
     exp_twist(np.zeros((4, 4)))
 
 
@@ -476,22 +481,22 @@ def _arrays_with(arrays: ModelArrays, matrices: FloatArray) -> ModelArrays:
 # -- fit of one frame: the displacement, with outliers rejected; whether its time stamp is wrong ---------------------
 
 FEWEST = 4
-"""Known points that a frame must show."""
+"""Least number of known points in a frame."""
 LEFT_OUT = 2
-"""Sights of a frame that may be wrong."""
+"""Largest number of wrong observations in a frame."""
 UNEXPLAINED_CHANCE = 1e-6
 
 
 @lru_cache(maxsize=256)
 def _unexplained(freedoms: int) -> float:
-    """Chi-square from which a frame is not explained."""
+    """Chi-square above which a frame is not explained."""
     return chi2_quantile(UNEXPLAINED_CHANCE, freedoms)
 
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """A displacement ``D`` (4, 4) of a camera, its ``twist`` (6,), and what it explains: ``weights`` (k,) [1/px] of
-    the sights that agree, chi-square ``before`` it and with it.
+    """A displacement ``D`` (4, 4) of a camera, its ``twist`` (6,), and the quality of its fit: ``weights`` (k,) [1/px]
+    of the observations that agree, chi-square ``before`` it and with it.
     """
 
     D: FloatArray
@@ -504,9 +509,9 @@ class Adjusted:
 def adjust(
     P: FloatArray, points: FloatArray, observed: FloatArray, weights: FloatArray, basis: FloatArray, gate: float
 ) -> Adjusted | None:  # fmt: skip
-    """The displacement of camera ``P`` (3, 4) that explains what it sees; None where none does.
+    """The displacement of camera ``P`` (3, 4) that explains its observations; None if there is none.
 
-    One sight after the other, the worst first, may be left out where it is beyond the gate.
+    Outliers beyond the gate may be left out one by one, the worst first.
     """
     weights = weights.copy()
     matrices, targets = P[None].copy(), observed[None].copy()
@@ -564,7 +569,7 @@ def pixels_of(P: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _side(P: FloatArray, points: FloatArray, weights: FloatArray) -> float:
-    """Sign of the depths of what is seen: +1, -1, or between where they differ."""
+    """Sign of the depths of the visible points: +1, -1, or between if they differ."""
     depths = project_points(P[None].copy(), points)[1][0]
     seen = weights > 0.0
     return float(np.sign(depths[seen]).sum()) / max(float(seen.sum()), 1.0)

@@ -1,13 +1,13 @@
 """Motion source of calibration: moves each joint alone from a base posture, chooses its range by the images of a small
 first motion, and averages the markers' pixels at every stop.
 
-From the base, joint l goes in steps to one side, then to the other (thesis 5.4.1, fig. 5.13), uneven ones
-(`stop_offset`). How far it goes is stated in the cell file, or found out on the way (`plan_sides`): as far as the
-markers stay in every view. At a stop the pixels are averaged at rest; a spread joint, where there is one, visits
-several positions there (fig. 5.16). A step that loses the markers is taken back and that side is closed. At last all
-joints stand apart from the base at once (`combined_offsets`), where the straight lines of the single ones say that the
-markers stay: what single ones cannot show is sag that depends on several joints, joints that turn with others, their
-order.
+From the base, joint l moves in steps to one side, then to the other (thesis 5.4.1, fig. 5.13); the steps are uneven
+(`stop_offset`). The range is stated in the cell file, or determined during the motion (`plan_sides`): as far as the
+markers remain in every view. At a stop the pixels are averaged at rest; a spread joint, if there is one, visits several
+positions there (fig. 5.16). A step that loses the markers is reversed and that side is closed. Finally all joints are
+offset from the base at once (`combined_offsets`), if linear extrapolation from the single-joint motions predicts that
+the markers remain visible. These poses identify what single joints cannot: sag that depends on several joints, coupled
+joints, and the order of the joints.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName
 
-NO_STEP = 1e-9  # a side that nothing is planned on
-MOST_STOPS = 1.5  # of calibration.stops, where a joint turns out to have more room than planned
+NO_STEP = 1e-9  # step of a side without planned stops
+MOST_STOPS = 1.5  # factor on calibration.stops, for a joint with a larger range than planned
 
 
 def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSettings) -> CalibrationMotion:
-    """The programme before its first move: to the base."""
+    """The calibration programme before its first move, to the base."""
     trials = trial_settings(settings)
     n = q.size
-    # One more than the positions of the spread joint: the last is that joint at its base.
+    # One more than the positions of the spread joint: the last one is that joint at its base.
     unseen = np.full(
         (len(trials.spread_offsets) + 1, len(settings.cameras), len(settings.marker_ids), 2), np.nan
     )
@@ -123,13 +123,17 @@ def _stop_done(
 
 
 WAY_FRAMES, WAY_JOINTS, WAY_MARKERS = 200, 2000, 8
-"""Frames and joint samples kept of one way, and markers of a frame: enough to tell how late its stamp is."""
+"""Largest numbers of frames and joint samples kept of one path, and of markers of a frame: enough to measure the delay
+of its stamps.
+"""
 WAY_APART_NS = 2_000_000
-"""Between joint samples that are kept."""
+"""Least time between joint samples that are kept [ns]."""
 
 
 def _record_way(trials: CalibrationMotion, context: StepContext) -> None:
-    """Keep what is seen on the way to a stop, until its markers are averaged; nothing of a way that is too long."""
+    """Record the observations on the path to a stop, until its markers are averaged; a path that is too long is not
+    recorded.
+    """
     cameras = [camera.name for camera in context.settings.cameras]
     for observation in context.observations:
         if len(trials.way_frames) < WAY_FRAMES and observation.ids.size:
@@ -148,7 +152,7 @@ def _record_way(trials: CalibrationMotion, context: StepContext) -> None:
 
 
 def _way_record(trials: CalibrationMotion) -> WayRecord | None:
-    """What was kept of the way that ends here; the next one begins."""
+    """The record of the path that ends here; recording restarts for the next one."""
     frames, times, joints = trials.way_frames, trials.way_ns, trials.way_joints
     trials.way_frames, trials.way_ns, trials.way_joints = [], [], []
     if len(times) == WAY_JOINTS or len(frames) < 2:
@@ -163,7 +167,7 @@ def _remember(
     samples: tuple[Sample, ...],
     mean: FloatArray,
 ) -> None:
-    """Keep the pixels for the extrapolation to the next stop, and how far and how fast the markers moved."""
+    """Store the pixels for the extrapolation to the next stop, and how far and how fast the markers moved."""
     pixels, sigmas = marker_pixels(samples, context.settings)
     slot = _slot(trials, context, settings)
     if trials.joint < 0:
@@ -190,7 +194,7 @@ def _progress(trials: CalibrationMotion, settings: TrialSettings) -> float:
 
 
 def _combining(trials: CalibrationMotion) -> bool:
-    """Whether the single joints are done, and all stand apart from the base at once."""
+    """Whether the single joints are done, and all joints are offset from the base at once."""
     return trials.joint == len(trials.stops)
 
 
@@ -198,7 +202,7 @@ def _combining(trials: CalibrationMotion) -> bool:
 
 
 def _turns(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> int:
-    """How many positions the spread joint visits at a stop of the present joint; 0: it stays at its base."""
+    """Number of positions that the spread joint visits at a stop of the current joint; 0: it stays at its base."""
     spread = settings.spread_joint
     if spread < 0 or trials.joint == spread or _combining(trials):
         return 0
@@ -211,7 +215,7 @@ def _turns(trials: CalibrationMotion, context: StepContext, settings: TrialSetti
 
 
 def _slot(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> int:
-    """Which position the spread joint has now, counted from its lowest; the last number is its base."""
+    """Index of the spread joint's current position, counted from its lowest; the last number is its base."""
     count = len(settings.spread_offsets)
     if trials.turn < 0 or _turns(trials, context, settings) == 0:
         return count
@@ -219,7 +223,7 @@ def _slot(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
 
 
 def _turn_to(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, turn: int) -> None:
-    """Aim the spread joint: there and back from stop to stop."""
+    """Set the target of the spread joint: its order of positions alternates from stop to stop."""
     trials.turn = turn
     slot = _slot(trials, context, settings)
     if slot < len(settings.spread_offsets):
@@ -234,7 +238,7 @@ def _turn_done(
     lost: str,
     mean: FloatArray | None = None,
 ) -> SourceOutput:
-    """Go on to the next position of the spread joint; after the last, the stop is done."""
+    """Continue with the next position of the spread joint; after the last, the stop is done."""
     turns = _turns(trials, context, settings)
     if lost and turns:
         name = context.settings.joint_names[settings.spread_joint]
@@ -273,7 +277,7 @@ def _next(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
                 enter(trials, "finish", context)
             return _rest(context)
         if trials.joint >= 0:
-            if trials.step == 0.0:  # how far it may go is not known yet
+            if trials.step == 0.0:  # its range is not known yet
                 size = probe_size(context.settings.joint_kinds[trials.joint])
                 if _aim(trials, context, settings, trials.side * size):
                     return _rest(context)
@@ -299,7 +303,7 @@ def _planned(trials: CalibrationMotion, settings: TrialSettings) -> bool:
 
 
 def _begin_joint(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> None:
-    """The joint's steps, or step 0: a probe is to tell them."""
+    """Set the joint's steps, or step 0: a probe determines them."""
     trials.side, trials.k, trials.step, trials.count = 1, 0, 0.0, 0
     _at_base(trials)
     if _planned(trials, settings):
@@ -322,7 +326,7 @@ def _probe_failed(trials: CalibrationMotion) -> None:
 
 
 def _plan(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> None:
-    """After the probe: the steps of both sides; the upper one first."""
+    """After the probe: set the steps of both sides, the upper one first."""
     trials.reach, steps, counts = plan_sides(
         trials.base_pixels, trials.last, trials.last_at, trials.reach, context.settings, settings
     )
@@ -331,7 +335,7 @@ def _plan(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
 
 
 def _other_side(trials: CalibrationMotion, settings: TrialSettings) -> None:
-    """The lower side: with the stated steps, or with what the upper one has left of the joint's stops."""
+    """The lower side: with the stated steps, or with the stops of the joint that remain after the upper one."""
     trials.side, trials.k = -1, 0
     _at_base(trials)
     if not _planned(trials, settings):
@@ -343,7 +347,7 @@ def _other_side(trials: CalibrationMotion, settings: TrialSettings) -> None:
 
 
 def _further(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
-    """Set out for the next stop of this side, where the markers will be seen there."""
+    """Start for the next stop of this side, if the markers are expected to be visible there."""
     offset = stop_offset(trials.side, trials.k + 1, trials.count, trials.step)
     if not _planned(trials, settings):
         if trials.k >= trials.count:
@@ -360,9 +364,10 @@ def _further(trials: CalibrationMotion, context: StepContext, settings: TrialSet
 def _promising(
     trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float
 ) -> bool:
-    """Whether a planned joint goes on to ``offset``: the plan, or the last two stops, say that the markers stay.
+    """Whether a planned joint continues to ``offset``: the markers remain visible according to the plan or to the last
+    two stops.
 
-    The plan's straight lines are corrected on the way: a side that turns out longer gets more stops.
+    The plan's linear extrapolation is corrected during the motion: a side that turns out longer gets more stops.
     """
     if trials.k == 0 or trials.count == 0:
         return trials.count > 0
@@ -375,7 +380,7 @@ def _promising(
 
 
 def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float) -> bool:
-    """Set out for ``offset`` from the base, unless a limit or a keep-out forbids it."""
+    """Start for ``offset`` from the base, unless a limit or a keep-out forbids it."""
     target = settings.base.copy()
     target[trials.joint] += offset
     why = blocked(target, [trials.joint], context)
@@ -398,7 +403,7 @@ def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSetting
 
 
 def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
-    """Set out for the next stop of all joints at once; False after the last."""
+    """Start for the next stop of all joints at once; False after the last."""
     everything = list(range(len(trials.stops)))
     low, high = trials.lowest - settings.base, trials.highest - settings.base
     weights = np.maximum(trials.slope_weights, 1e-300)[..., None]
@@ -428,7 +433,7 @@ def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSet
 
 
 def _left_out(trials: CalibrationMotion, context: StepContext, why: str) -> SourceOutput:
-    """Leave out a stop of all joints, by way of the base."""
+    """Skip a stop of all joints, and return to the base."""
     context.emit(
         "warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints {why}; left out"
     )
@@ -440,7 +445,7 @@ def _left_out(trials: CalibrationMotion, context: StepContext, why: str) -> Sour
 def _back_off(
     trials: CalibrationMotion, context: StepContext, settings: TrialSettings, where: str
 ) -> SourceOutput:
-    """Take the last step back; this side ends there, or goes on in smaller steps where it has only begun."""
+    """Reverse the last step; this side ends there, or continues with smaller steps if it has only started."""
     name = context.settings.joint_names[trials.joint]
     context.emit(
         "warning", id=trials.id,
@@ -480,23 +485,25 @@ def _abort(trials: CalibrationMotion, context: StepContext, reason: Reason) -> S
 
 GOLDEN = 0.6180339887498949
 UNEVEN_STEP = 0.5
-"""Share of a step by which stops of a single joint stand nearer at most."""
+"""Largest fraction of a step by which the stops of a single joint are moved towards the base."""
 SHARE, UNEVEN = 0.8, 0.5
-"""Of half the way that a joint was driven, how far it stands from the middle of that way at most; share of that by
-which stops differ, so that a gear's ripple does not repeat and what grows with the way shows."""
+"""Largest offset of a joint from the middle of its range, as a fraction of half the range in which it was driven; and
+the fraction of this offset by which stops differ, so that a gear's ripple does not repeat and errors that grow with the
+range become visible.
+"""
 ORDER = 16
-"""Of the Hadamard matrix that gives the sides on which joints stand: its columns after the first, of ones, are as many
-joints as a cell has at most."""
+"""Order of the Hadamard matrix whose signs give the sides to which joints are offset: its columns after the first, of
+ones, are as many as the joints of the largest cell.
+"""
 SHRUNK = (1.0, 0.75, 0.5)
-"""Shares of a stop that are tried one after the other until the markers stay in view."""
+"""Factors on the offsets of a stop, tried one after the other until the markers remain in view."""
 
 
 def stop_offset(side: int, k: int, count: int, step: float) -> float:
-    """Offset from the base [rad or m] of stop ``k`` of the ``count`` on a ``side``, 1 or -1; at its end, ``count``
-    steps.
+    """Offset from the base [rad or m] of stop ``k`` of ``count`` on a ``side``, 1 or -1; at its end, ``count`` steps.
 
-    Stops before the end stand up to half a step nearer, by the multiples of the golden ratio: where all were equally
-    far apart, a gear's ripple whose period divides that distance would show at none of them.
+    Stops before the end are moved towards the base by up to half a step, by multiples of the golden ratio: with equal
+    distances, ripple of a gear whose period divides the distance would be invisible.
     """
     if k == 0 or k == count:
         return side * k * step
@@ -504,11 +511,11 @@ def stop_offset(side: int, k: int, count: int, step: float) -> float:
 
 
 def combined_offsets(k: int, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Offsets (n,) from the base of stop ``k`` of all joints, which single ones were driven from ``low`` to ``high``
-    (n,).
+    """Offsets (n,) from the base of stop ``k`` of all joints. ``low``, ``high`` (n,): the range in which each was
+    driven alone.
 
-    Signs are those of the columns of a Hadamard matrix: within ``ORDER`` stops every pair of joints meets equally often
-    on either side.
+    Signs are those of the columns of a Hadamard matrix: within ``ORDER`` stops every pair of joints is offset equally
+    often to each combination of sides.
     """
     joint = np.arange(len(low))
     signs = np.array([1.0 - 2.0 * (((k % ORDER) & (1 + j)).bit_count() % 2) for j in joint.tolist()])
@@ -517,21 +524,21 @@ def combined_offsets(k: int, low: FloatArray, high: FloatArray) -> FloatArray:
 
 
 def in_view_at(offsets: FloatArray, in_view: Callable[[FloatArray], bool]) -> FloatArray | None:
-    """``offsets`` (n,), or the largest share of them, that ``in_view`` allows; None where it allows none."""
+    """``offsets`` (n,) multiplied by the largest factor of `SHRUNK` that ``in_view`` allows; None if it allows none."""
     for share in SHRUNK:
         if in_view(share * offsets):
             return share * offsets
     return None
 
 
-MIN_STOPS = 4  # of one joint, the base among them
+MIN_STOPS = 4  # of one joint, including the base
 MIN_MOTION_SIGMAS = 40.0
-"""Motion in the images below which a joint's axis drowns in the noise of its stops."""
+"""Motion in the images [sigmas] below which a joint's axis is lost in the noise of its stops."""
 PROBE: dict[JointKindName, float] = {"revolute": 0.02, "prismatic": 0.005}  # [rad, m]
 BORDER = 0.03
-"""Margin kept from the border of a view, of its width."""
+"""Margin to the border of a view, as a fraction of its width."""
 KEPT = 0.75
-"""Share of the markers seen at the base that must stay inside; never fewer than ``min_markers``."""
+"""Fraction of the markers seen at the base that must remain inside; never fewer than ``min_markers``."""
 
 
 def probe_size(kind: JointKindName) -> float:
@@ -540,7 +547,7 @@ def probe_size(kind: JointKindName) -> float:
 
 
 def room(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
-    """How far (2,) a joint may go upwards and downwards from its base: its limits, and a sensible largest range."""
+    """Range (2,) of a joint upwards and downwards from its base: its limits, and a reasonable largest range."""
     limits = core.limits
     margin = limits.position_margin + 4.0 * core.arrival[joint]
     base = settings.base[joint]
@@ -565,7 +572,7 @@ def marker_pixels(samples: tuple[Sample, ...], core: CoreSettings) -> tuple[Floa
 
 
 def image_motion(base: FloatArray, pixels: FloatArray, sigmas: FloatArray) -> float:
-    """Mean distance of the markers from where they were at the base, in sigmas, in the camera that shows it best.
+    """Mean distance of the markers from their pixels at the base, in sigmas, in the camera with the largest distance.
 
     ``base``, ``pixels`` (c, m, 2), ``sigmas`` (c, m) [px].
     """
@@ -583,7 +590,7 @@ def _needed(seen: int, settings: TrialSettings) -> int:
 
 
 def enough_inside(pixels: FloatArray, core: CoreSettings, settings: TrialSettings) -> bool:
-    """Whether enough of the markers (p, c, m, 2) lie inside every view by a margin; NaN: was not seen, not counted."""
+    """Whether enough of the markers (p, c, m, 2) are inside every view by a margin; NaN: not seen, not counted."""
     for c, camera in enumerate(core.cameras):
         inside = _inside(pixels[:, c], camera.width, camera.height)
         known = np.isfinite(pixels[:, c]).all(axis=-1)
@@ -612,10 +619,11 @@ def plan_sides(
     base: FloatArray, probe: FloatArray, offset: float, reach: FloatArray, core: CoreSettings,
     settings: TrialSettings,
 ) -> tuple[FloatArray, FloatArray, tuple[int, int]]:  # fmt: skip
-    """From a probe's pixels (p, c, m, 2) at ``offset``: reach (2,) up and down, steps (2,), numbers of stops.
+    """Plan both sides from a probe's pixels (p, c, m, 2) at ``offset``; returns the ranges (2,) up and down, steps
+    (2,), and numbers of stops.
 
-    The reach is where, on straight lines through base and probe, too few markers would be left in some view, and never
-    beyond ``reach`` (2,) as given.
+    By linear extrapolation through base and probe, the range ends where too few markers would be left in some view. It
+    is never larger than the given ``reach`` (2,).
     """
     rates = (probe - base) / offset
     found = np.array(
@@ -639,7 +647,7 @@ def plan_sides(
 
 
 def _way(pixels: FloatArray, rates: FloatArray, width: int, height: int, settings: TrialSettings) -> float:
-    """How far markers (m, 2) may go at ``rates`` (m, 2) [px a unit] until too few are left inside."""
+    """Joint offset at which too few markers (m, 2), moving at ``rates`` (m, 2) [px a unit], are left inside."""
     margin = BORDER * width
     low, high = np.full(2, margin), np.array([width, height]) - 1.0 - margin
     ways = []
@@ -661,8 +669,8 @@ def too_little(
     joint: int, stops: int, visited: float, motion: float, sigma_px: float, core: CoreSettings,
     settings: TrialSettings,
 ) -> Reason | None:  # fmt: skip
-    """Why a joint's trial cannot identify it, and the cure: too few stops, too small a range, or too little motion
-    in the images (``motion`` in sigmas of ``sigma_px``).
+    """Why a joint's trial cannot identify it, and the remedy: too few stops, too small a range, or too little motion in
+    the images (``motion`` in sigmas of ``sigma_px``); None if it can.
     """
     name = core.joint_names[joint]
     stated = np.isfinite(settings.range[joint])

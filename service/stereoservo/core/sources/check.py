@@ -1,8 +1,8 @@
-"""Motion source of the model check: a few stops around the base posture at which the markers' pixels are averaged, to
-be tested against the model in use without a fit.
+"""Motion source of the model check: a few stops around the base posture at which the markers' pixels are averaged and
+then tested against the model in use, without a fit.
 
-At stop l joint l stands above, and the joint after it below its base, so that every joint is seen on both sides and
-against the others, with one stop a joint and the base. `calibration.change.model_check` evaluates the pixels.
+At stop l joint l is above, and the next joint below its base, so that every joint is observed on both sides and against
+the others, with one stop a joint plus the base. `calibration.change.model_check` evaluates the pixels.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 
 SHARE = 0.5
-"""Of what a joint was driven to one side of its base for the model's calibration."""
+"""Fraction of the range to one side of its base in which a joint was driven for the model's calibration."""
 RESET_ZEROS = "reset_zeros"
 """Name of a ``check_finished`` event after which drifted joint zeros are to be reset."""
 
@@ -63,7 +63,7 @@ def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
 def start_check(
     goal_id: str, context: StepContext, model: CellModel, reset_zeros: bool = False
 ) -> CheckMotion:
-    """The check motion before its first move: to the base. ``reset_zeros`` is told when it has finished."""
+    """The check motion before its first move, to the base. ``reset_zeros`` is reported when it has finished."""
     targets = check_targets(context.settings, model)
     fields = first_visit(targets[0], context.q, context.now_ns, context.settings)
     return CheckMotion(

@@ -1,5 +1,5 @@
-"""Motion source of incidence goals, which bring points, lines and planes of the body onto ones of the scene (thesis
-2.5.3): start, joint velocity and end of the motion, and reasons why it stops short.
+"""Motion source of incidence goals, which move points, lines and planes of the body onto ones of the scene (thesis
+2.5.3): start, joint velocity and end of the motion, and reasons why it cannot be completed.
 """
 
 from __future__ import annotations
@@ -47,17 +47,19 @@ from stereoservo.numerics.arrays import FloatArray
 
 FEATURES = ("point", "line", "plane")
 SPAN_PX = 5.0
-"""Least distance in an image between markers, or from their line, that span a line or a plane."""
+"""Least distance in an image between markers, or from their line, for markers that span a line or a plane."""
 MAKEABLE = 0.999
-"""Share of the residual that joints can take away, above which the arm has the freedoms it needs."""
+"""Fraction of the residual that joints can reduce, above which the arm has the degrees of freedom needed."""
 SECOND_AT_REST = 5e-3
-"""Joint velocity [rad/s or m/s] below which a second task has come as far as it gets."""
+"""Joint velocity [rad/s or m/s] below which a second task has converged."""
 
 
 def start_incidence(
     goal: Goal, target: IncidenceTarget, context: StepContext, place: BodyState
 ) -> IncidenceGoal:
-    """The state of the incidence law before its first step. Raises RefusalError naming what makes it unusable."""
+    """The state of the incidence law before its first step. Raises RefusalError naming the reason if the goal is
+    unusable.
+    """
     model = context.state.model
     assert model is not None
     if len(context.settings.cameras) < 2:
@@ -144,7 +146,7 @@ def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> li
 def _fixed(
     feature: Feature, dimension: int, name: str, place: BodyState, model_epoch: int | None
 ) -> FloatArray:
-    """(3, 4): a point of height 1 of the fixed feature, then its directions of height 0."""
+    """The fixed feature (3, 4): a point of height 1, then its directions of height 0."""
     _one_way(feature, name, "fixed")
     if feature.markers:
         raise RefusalError(
@@ -203,7 +205,7 @@ def _triangulated(feature: Feature, name: str, place: BodyState) -> FloatArray:
 
 
 def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> None:
-    """Raises RefusalError for incidences that no motion of the arm brings nearer."""
+    """Raises RefusalError for incidences whose error no motion of the arm reduces."""
     assert context.weights is not None
     assert context.pixels is not None
     assert context.prediction is not None
@@ -225,14 +227,14 @@ def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> 
 
 
 def _has_freedoms(source: IncidenceGoal, scene: Scene, place: BodyState) -> None:
-    """Raises RefusalError for an incidence that needs a freedom which the arm lacks wherever it stands."""
+    """Raises RefusalError for an incidence that needs a degree of freedom which the arm lacks in every posture."""
     camera = f"camera {place.settings.cameras[0].name}"
     try:
         lacking = incidence_freedoms(
             scene, _task(source), place.arrays.plane_at_infinity, camera=camera, anywhere=True
         )
     except GeometryError:
-        return  # arm and cameras tell no right angles, so there are no words: the law itself will tell
+        return  # arm and cameras determine no right angles, so the motion has no name: the law itself will report it
     for name, freedom in zip(source.names, lacking, strict=True):
         if freedom is not None:
             raise RefusalError(
@@ -242,7 +244,7 @@ def _has_freedoms(source: IncidenceGoal, scene: Scene, place: BodyState) -> None
 
 
 def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutput:
-    """One step: the incidences, and the second task in what they leave free."""
+    """One step: the incidences, and the second task in their null space."""
     arrays, prediction, weights, pixels = context.arrays, context.prediction, context.weights, context.pixels
     if arrays is None or prediction is None or weights is None or pixels is None:
         raise AssertionError("a law runs only with a model")

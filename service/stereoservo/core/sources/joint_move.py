@@ -17,12 +17,12 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 
 APPROACH_GAIN = 15.0  # [1/s] end of a joint move
-BRAKE_SHARE = 0.6  # of the acceleration limit that a joint move plans with
+BRAKE_SHARE = 0.6  # fraction of the acceleration limit used to plan a joint move
 ARRIVED_STEPS = 5
 
 
 def joint_goal(goal: Goal, target: JointTarget, context: StepContext) -> JointMove:
-    """The move to ``target``. Raises RefusalError for joints that are not there and positions beyond limits."""
+    """The move to ``target``. Raises RefusalError for unknown joints and positions beyond limits."""
     wanted = context.q.copy()
     for name, position in target.positions.items():
         wanted[joint_index(name, context.settings)] = position
@@ -40,7 +40,7 @@ def joint_move_to(
     time_limit_s: float | None = None,
     lease_s: float | None = None,
 ) -> JointMove:
-    """A move of all joints to ``target`` (n,), as it begins."""
+    """A move of all joints to ``target`` (n,), in its initial state."""
     move = JointMove(
         id=goal_id,
         target=np.array(target),
@@ -72,7 +72,7 @@ def _inside_limits(target: FloatArray, context: StepContext) -> None:
 
 
 def joint_report(move: JointMove, context: StepContext) -> PlanReport:
-    """What the move would do. Raises RefusalError where its line meets a keep-out."""
+    """The expected course of the move. Raises RefusalError if its line meets a keep-out."""
     settings, limits = context.settings, context.settings.limits
     start = context.q
     for name, box in zip(limits.keep_out_names, limits.keep_outs, strict=True):
@@ -105,9 +105,9 @@ def joint_report(move: JointMove, context: StepContext) -> PlanReport:
 
 
 def first_inside(box: FloatArray, margin: float, start: FloatArray, target: FloatArray) -> float | None:
-    """Share of the line from ``start`` to ``target`` (n,) at which it enters ``box`` (n, 2), or None.
+    """Fraction of the line from ``start`` to ``target`` (n,) at which it enters ``box`` (n, 2), or None.
 
-    An arm that stands inside already may leave: the safety stage lets it move outwards only.
+    An arm that is inside already may leave: the safety stage lets it move outwards only.
     """
     enters, leaves = 0.0, 1.0
     for j in range(start.size):
@@ -123,7 +123,7 @@ def first_inside(box: FloatArray, margin: float, start: FloatArray, target: Floa
 
 
 def _seconds(move: JointMove, limits: LimitSettings, start: FloatArray) -> float:
-    """Time of the slowest joint at its speed and its braking."""
+    """Time of the slowest joint at its speed and its braking [s]."""
     distance = np.abs(move.target - start)
     speed = limits.velocity_max * (move.speed_scale * limits.speed_scale)
     brake = BRAKE_SHARE * limits.acceleration_max
@@ -154,7 +154,7 @@ def approach_velocity(
 ) -> FloatArray:
     """Joint velocity (n,) on the straight joint-space line to ``target``, slow enough to brake on it.
 
-    A joint whose encoder is coarse stays where it has arrived: it would hunt between two counts.
+    A joint with a coarse encoder does not move once it has arrived: it would hunt between two counts.
     """
     distance = target - q
     if any(settings.resolution):
@@ -171,7 +171,7 @@ def approach_velocity(
 
 
 def joints_ahead(context: StepContext) -> FloatArray:
-    """Where the joints (n,) will be when late drives have made what they were sent, less what friction takes of it."""
+    """Joint positions (n,) after late drives have executed what was sent to them, less the travel lost to friction."""
     block = context.state.block
     delays = block.delays
     if not delays.delay_s.any():
@@ -191,7 +191,7 @@ def farthest(q: FloatArray, target: FloatArray, settings: CoreSettings) -> int:
 
 
 def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
-    """One step of a joint move; it ends when it arrived and rested, or at its time limit."""
+    """One step of a joint move; it ends when the arm has arrived and rests, or at its time limit."""
     ahead = joints_ahead(context)
     still = arrived(context.q, move.target, context.settings) and arrived(
         ahead, move.target, context.settings
@@ -218,7 +218,7 @@ def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
 
 
 def joint_move_progress(source: JointMove, context: StepContext) -> tuple[float, float]:
-    """Share [0, 1] of the joint distance that is done, and the seconds left."""
+    """Completed fraction [0, 1] of the joint distance, and the remaining seconds."""
     limits = context.settings.limits
     whole, left = np.abs(source.target - source.start), np.abs(source.target - context.q)
     speed = limits.velocity_max * (source.speed_scale * limits.speed_scale)

@@ -53,13 +53,13 @@ from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 AIM = (
     "used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target",
 )  # fmt: skip
-"""Arrays of a goal that a law's kernel has in the workspace."""
+"""Arrays of a goal that are copied to the workspace for a law's kernel."""
 SELF_MOTION_RATE = 0.5
-"""[1/s], of a joint's half range: how fast self-motion takes it from a limit."""
+"""Rate [1/s], relative to a joint's half range, at which self-motion moves a joint away from a limit."""
 
 
 def by_kernel(source: ServoGoal, law: Law) -> bool:
-    """Whether the kernel of a ``law`` alone drives to a goal: one that stands, by predicted points."""
+    """Whether the kernel of a ``law`` alone drives to a goal: the goal is static and uses predicted points."""
     return (
         law.kernel is not None
         and source.stream is None
@@ -69,12 +69,12 @@ def by_kernel(source: ServoGoal, law: Law) -> bool:
 
 
 def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
-    """One step of a law: error, joint velocity, and whether the goal is reached or out of time; None where the velocity
-    is in the workspace.
+    """One step of a law: error, joint velocity, and whether the goal is reached or out of time; None if the velocity is
+    in the workspace.
     """
     law = context.derived.laws[source.law]
     if by_kernel(source, law) and context.weights is context.derived.room.weights:
-        return _kernel_step(source, context)  # the present is another where a camera's place is found
+        return _kernel_step(source, context)  # the estimate changes if a camera's pose is found
     waiting = wait_for_target(source, context)
     if waiting is not None:
         return waiting
@@ -89,7 +89,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     if ended is not None:
         return ended
     scene, task = choose(source, context, *scene_and_task(source, context, arrays, found))
-    if not law.components:  # laws in the images work in all cameras, whatever a face shows them
+    if not law.components:  # laws in the images use all cameras, whatever face they show
         scene = scene._replace(camera_centres=arrays.camera_centres)
     if law.planned:
         if source.plan is None and source.pose_known:
@@ -101,14 +101,14 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     try:
         step = law.step(scene, task, options(source, context, error_px, source.jacobian))
         velocity = velocity_of(step, len(context.q))
-    except Exception as error:  # whatever a third party's law raises ends its goal, never the loop
+    except Exception as error:  # an exception in a third party's law ends its goal, never the loop
         return _law_failed(source, context, error_px, error)
     expected: FloatArray | float = task.joint_rates if task.joint_rates.size else 0.0
     if streamed or source.followed is not None:
         expected = feed_forward(source, context, found.usable * source.wanted)
         velocity = velocity + expected
     velocity = damp(source, context, velocity, expected)
-    if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has kept off the limits itself
+    if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has already avoided the limits
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
         velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
@@ -117,7 +117,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
 
 
 def wait_for_target(source: Follower, context: StepContext) -> SourceOutput | None:
-    """Bring a goal that follows a target to where that is now; no motion where it is not seen."""
+    """Move a goal that follows a target to the target's current pose; no motion if the target is not seen."""
     waits = None if source.followed is None else follow_target(source, context)
     if waits is None:
         return None
@@ -125,15 +125,17 @@ def wait_for_target(source: Follower, context: StepContext) -> SourceOutput | No
 
 
 def may_end(source: Follower, context: StepContext) -> bool:
-    """Whether a goal may be reached for good: its target stands, where it follows one."""
+    """Whether a goal may be reached for good: it follows no target, or its target is static."""
     return source.followed is None or stands(context.state.target)
 
 
 def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
-    """`servo_step` by the kernel of a law; where the goal goes on its velocity is in the workspace, and None."""
+    """`servo_step` by the kernel of a law; returns None while the goal is active, with its velocity in
+    the workspace.
+    """
     room = context.derived.room
     work = room.numbers
-    if not work.followed:  # it has just begun, or the state was looked after before
+    if not work.followed:  # the goal has just started, or the state was examined before
         aim_at(room, source)
         follow_goal(context.state.block.record, room.record)
     found = Found(work.run_found, error_now(room), work.seen, work.markers_needed)
@@ -142,14 +144,16 @@ def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None
 
 
 def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
-    """Write the velocity of an active goal into the workspace by its law's kernel; returns None unless it fails."""
+    """Write the velocity of an active goal into the workspace by its law's kernel; returns None unless the kernel
+    fails.
+    """
     room, law = context.derived.room, context.derived.laws[source.law]
     if law.components:
         show_face(source, context)
     assert law.kernel is not None
     try:
         law.kernel(room.record)
-    except Exception as error:  # as any law: it ends its goal, never the loop
+    except Exception as error:  # as for any law: the exception ends its goal, never the loop
         return _law_failed(source, context, error_now(room), error)
     if source.damping != 0.0:
         room.velocity[:] = damp(source, context, room.velocity)
@@ -159,12 +163,12 @@ def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
 
 
 def error_now(room: Workspace) -> float | None:
-    """The error [px] of the goal in the workspace; None where none is measured."""
+    """The error [px] of the goal in the workspace; None if none is measured."""
     return room.numbers.error_px if room.numbers.measured else None
 
 
 def found_by_kernel(source: ServoGoal, context: StepContext) -> SourceOutput:
-    """What the kernel of the goal's law has found in this step."""
+    """The output of the goal's law kernel in this step."""
     room, law = context.derived.room, context.derived.laws[source.law]
     step = _found_step(room, len(law.components))
     return SourceOutput(
@@ -182,14 +186,18 @@ def found_by_kernel(source: ServoGoal, context: StepContext) -> SourceOutput:
 def damp(
     source: LawRun, context: StepContext, velocity: FloatArray, expected: FloatArray | float = 0.0
 ) -> FloatArray:
-    """``velocity`` (n,) with the damping that the goal asks for, where ``expected`` (n,) is no error's doing."""
+    """``velocity`` (n,) with the goal's damping. ``expected`` (n,): the part of the velocity that is not caused by an
+    error; it is not damped.
+    """
     if source.damping == 0.0:
         return velocity
     return damped_velocity(velocity, expected, context.state.block.velocities, source.damping)
 
 
 def aim_at(room: Workspace, goal: ServoGoal) -> None:
-    """The law works on a ``goal``, whose arrays are replaced where it moves, and not written into."""
+    """Copy a ``goal`` to the workspace for the law. A moving goal replaces its arrays and never writes into them, so
+    they are compared by identity.
+    """
     aim = (
         goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
         goal.centre_target, goal.pose_known, goal.gain_near, goal.gain_far, goal.gain_slope, goal.tolerance_px,
@@ -209,7 +217,9 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
 
 
 def show_face(goal: ServoGoal, context: StepContext) -> None:
-    """The face that a law with components works on for a ``goal``, into the workspace: by new images another one."""
+    """Write the face that a law with components uses for a ``goal`` into the workspace; new images may select another
+    face.
+    """
     room = context.derived.room
     if goal.pose_known and (room.numbers.frames_passed or goal.choice.cameras == 0):
         scene, task = choose(goal, context, room.scene, room.task)
@@ -220,14 +230,16 @@ def show_face(goal: ServoGoal, context: StepContext) -> None:
 
 
 def _face(room: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
-    """The law works on a face of three markers (3,), before cameras with these centres (k, 4): as in the ``choice``."""
+    """Write the face to the workspace: three markers (3,), and the centres (k, 4) of the cameras that see it, as in the
+    ``choice``.
+    """
     room.faced, given = choice, room.arrays
     given["face"][:], given["eyes"][: len(eyes)] = triple, eyes
     room.numbers.eye_count = len(eyes)
 
 
 def _found_step(room: Workspace, components: int) -> LawStep:
-    """What the law's kernel has found, of so many components."""
+    """The result of the law's kernel, with so many components."""
     given, velocity = room.arrays, room.velocity.copy()
     if components == 0:
         return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, room.numbers.conditioning)
@@ -237,9 +249,13 @@ def _found_step(room: Workspace, components: int) -> LawStep:
 
 
 class GoalError(NamedTuple):
-    """A goal and its body now: ``usable`` (c, m) weights of the cameras that it may use; the largest distance
-    ``error_px`` over markers and cameras, None where none is seen; how many of its markers are ``seen``. Of the joints
-    with their correction, the body's ``points`` (m, 4) and the ``centre`` (4,) of the goal.
+    """Error and body of a goal at present.
+
+    ``usable`` (c, m): weights of the observations in the cameras that the goal may use.
+    ``error_px``: largest distance over markers and cameras, None if none is seen.
+    ``seen``: number of its markers that are seen.
+    ``points`` (m, 4), ``centre`` (4,): the body's points and the goal's centre, from the joint readings plus their
+    correction.
     """
 
     usable: FloatArray
@@ -252,7 +268,7 @@ class GoalError(NamedTuple):
 def goal_error(
     source: ServoGoal, context: StepContext, arrays: ModelArrays, weights: FloatArray, pixels: FloatArray
 ) -> GoalError:
-    """Error and body of ``source`` with the present ``weights`` (c, m) and ``pixels`` (c, m, 2)."""
+    """Error and body of ``source`` with the current ``weights`` (c, m) and ``pixels`` (c, m, 2)."""
     usable = np.empty(weights.shape)
     aim = Aim(source.used, source.wanted, source.set_points)
     measured, error_px, seen = _measure(weights, pixels, aim, usable)
@@ -263,7 +279,9 @@ def goal_error(
 
 
 class Aim(NamedTuple):
-    """Of a goal: cameras ``used`` (c,), and ``set_points`` (c, m, 2) that are ``wanted`` (c, m)."""
+    """Set-points of a goal: cameras ``used`` (c,), and ``set_points`` (c, m, 2), which count where ``wanted`` (c, m) >
+    0.
+    """
 
     used: FloatArray
     wanted: FloatArray
@@ -274,8 +292,8 @@ class Aim(NamedTuple):
 def _measure(
     weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArray
 ) -> tuple[bool, float, int]:
-    """Whether an error was measured, the largest distance [px] over markers and cameras, and how many markers are seen;
-    into ``usable`` (c, m) the weights of the cameras that may be used.
+    """Returns whether an error was measured, the largest distance [px] over markers and cameras, and how many markers
+    are seen; writes the weights of the usable cameras to ``usable`` (c, m).
     """
     cameras, markers = weights.shape
     largest, measured, seen = 0.0, False, 0
@@ -297,8 +315,8 @@ def _measure(
 
 @kernel
 def follow_goal(block: Record, room: Record) -> bool:
-    """Whether the goal in the ``room`` stays active; its error and body, as in `GoalError`, the gain there, and what
-    `account_run` has found; at the end of what is observed in a step.
+    """Measure the progress of the goal in the workspace ``room``, as the last part of the observation; returns whether
+    the goal stays active. Writes its error and body, as in `GoalError`, the gain, and the result of `account_run`.
     """
     memory, work = block[0], room[0]
     n, c, m = work.joints, work.cameras, work.markers
@@ -325,7 +343,7 @@ def follow_goal(block: Record, room: Record) -> bool:
 
 
 def activate_run(source: LawRun, context: StepContext) -> None:
-    """Start the clock, the frame count and the lease of a law that begins now."""
+    """Start the clock, the frame count and the lease of a law that starts now."""
     source.started_ns = context.now_ns
     begin_run(context.state.block.record)
     source.renew_lease(context.now_ns)
@@ -334,12 +352,12 @@ def activate_run(source: LawRun, context: StepContext) -> None:
 
 
 def awaits_plan(source: ServoGoal, context: StepContext) -> bool:
-    """Whether a goal follows a plan that is still to be made."""
+    """Whether a goal needs a plan that is not available yet."""
     return context.derived.laws[source.law].planned and source.plan is None
 
 
 def away_from_limits(context: StepContext) -> FloatArray:
-    """Self-motion (n,) of a redundant arm that takes its joints from their limits; the body stays where it is."""
+    """Self-motion (n,) of a redundant arm that moves its joints away from their limits; the body does not move."""
     assert context.prediction is not None
     limits = context.settings.limits
     rows = np.ascontiguousarray(context.prediction.jacobian).reshape(-1, len(context.q))
@@ -352,10 +370,11 @@ def run_ended(
     source: LawRun, context: StepContext, error_px: float | None, seen: int, wanted: FloatArray | None = None, *,
     may_end: bool = True,
 ) -> SourceOutput | None:  # fmt: skip
-    """What a law's step comes to where it is out of time, sees too little, or is there; None: it goes on.
+    """The output of a law's step that is out of time, sees too few markers, or has reached the goal; None if the goal
+    stays active.
 
-    ``seen``: markers of the goal that are seen, of those ``wanted`` (c, m); None: of more than are needed. ``may_end``:
-    off for a goal that moves still.
+    ``seen``: number of the goal's markers that are seen, of those ``wanted`` (c, m); None: more than are needed.
+    ``may_end``: False for a goal that still moves.
     """
     needed = MIN_MARKERS if seen >= MIN_MARKERS or wanted is None else markers_needed(wanted)
     terms = RunTerms(source.tolerance_px, source.hold_frames, source.time_limit_s)
@@ -367,7 +386,9 @@ def run_ended(
 
 
 class Found(NamedTuple):
-    """Of a law's step: what `account_run` has found, the error [px], the markers seen, and how many are needed."""
+    """State of a law's step: the result of `account_run`, the error [px], the number of markers seen, and the number
+    needed.
+    """
 
     run: int
     error_px: float | None
@@ -378,7 +399,9 @@ class Found(NamedTuple):
 def _ended(
     source: LawRun, context: StepContext, found: Found, wanted: FloatArray | None, *, may_end: bool = True
 ) -> SourceOutput | None:
-    """What a step comes to that is out of time, sees too little, or is there; None: it goes on."""
+    """The output of a step that is out of time, sees too few markers, or has reached the goal; None if
+    it stays active.
+    """
     run, error_px, seen, needed = found
     if run == OUT_OF_TIME:
         return _out_of_time(source, context, error_px)
@@ -406,7 +429,7 @@ def _ended(
 def scene_and_task(
     source: ServoGoal, context: StepContext, arrays: ModelArrays, found: GoalError
 ) -> tuple[Scene, Task]:
-    """The present and the goal as laws take them."""
+    """The current scene and the goal's task, as laws take them."""
     prediction, pixels = context.prediction, context.pixels
     assert prediction is not None
     assert pixels is not None
@@ -429,15 +452,15 @@ def scene_and_task(
 
 
 def choose(source: ServoGoal, context: StepContext, scene: Scene, task: Task) -> tuple[Scene, Task]:
-    """The scene and the task on the face that the law works on now; a change of it is told."""
+    """The scene and the task on the face that the law uses now; a change of the face is reported."""
     assert context.arrays is not None
     if not source.pose_known:
         return scene, task
     before = source.choice
-    if before.cameras > 0 and not context.derived.room.numbers.frames_passed:  # nothing has been seen since
+    if before.cameras > 0 and not context.derived.room.numbers.frames_passed:  # no frame has arrived since
         return law_scene(scene, before), task
     choice = choose_face(source.faces, scene, task, before)
-    if choice.cameras == 0:  # nobody sees three markers of one face: on with the former, by the kinematics
+    if choice.cameras == 0:  # no camera sees three markers of one face: keep the previous face
         return scene, task
     source.choice = choice
     if choice.changed and before.cameras > 0 and choice.face != before.face:
@@ -452,11 +475,11 @@ def choose(source: ServoGoal, context: StepContext, scene: Scene, task: Task) ->
 
 
 SLOPE_UNIT_PX = 100.0
-"""Slopes are stated in 1/s per so many pixels."""
+"""Slopes of gains are stated in 1/s per so many pixels."""
 
 
 class GainCurve(NamedTuple):
-    """``near`` and ``far`` [1/s], ``slope`` > 0 [1/s per 100 px]: how fast the gain leaves ``near``."""
+    """``near`` and ``far`` [1/s], ``slope`` > 0 [1/s per 100 px]: how fast the gain departs from ``near``."""
 
     near: float
     far: float
@@ -466,7 +489,7 @@ class GainCurve(NamedTuple):
 def gain_at(curve: GainCurve, error_px: float | None) -> float:
     """The gain [1/s] at an error [px], the largest distance over markers and cameras; None: not measured.
 
-    What is not known, or no number, takes the smaller of the two gains.
+    If the error is unknown or not a number, the smaller of the two gains is used.
     """
     if curve.near == curve.far:
         return curve.near
@@ -475,7 +498,7 @@ def gain_at(curve: GainCurve, error_px: float | None) -> float:
 
 @kernel
 def adaptive_gain(near: float, far: float, slope: float, error_px: float) -> float:
-    """`gain_at` as a kernel; NaN: not measured. Equal gains are constant, a negative error counts as none."""
+    """`gain_at` as a kernel; NaN: not measured. Equal gains are constant, a negative error counts as zero."""
     if math.isnan(error_px):
         return min(near, far)
     span = abs(near - far)
@@ -488,7 +511,7 @@ def adaptive_gain(near: float, far: float, slope: float, error_px: float) -> flo
 def options(
     source: LawRun, context: StepContext, error_px: float | None, jacobian: int = int(JacobianChoice.CURRENT)
 ) -> Options:
-    """How the law goes there in this step."""
+    """The options of the law for this step."""
     return Options(gain_now(source, error_px), context.dt_s, jacobian)
 
 
@@ -500,7 +523,7 @@ def gain_now(source: LawRun, error_px: float | None) -> float:
 def velocity_of(step: LawStep, joints: int) -> FloatArray:
     """A copy (n,) of the velocity of a law's step, of the type that kernels are compiled for.
 
-    Raises ValueError where it is none of that many joints, TypeError where its numbers are not real.
+    Raises ValueError if it does not have that many joints, TypeError if its numbers are not real.
     """
     if step.velocity.shape != (joints,):
         raise ValueError(f"a velocity of shape {step.velocity.shape}; ({joints},) is needed")
@@ -542,14 +565,16 @@ def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -
 
 
 LARGEST_LAG_PX = 20.0
-"""Distance behind its way at which the body is waited for."""
+"""Distance behind its path [px] at which the plan waits for the body."""
 
 
 def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task: Task) -> Task:
-    """The task of law ``trajectory`` now: where the plan has set-points and joints, and how fast; its time goes on."""
+    """The task of law ``trajectory`` at present: the plan's set-points and joints, and their rates. Advances the plan's
+    time.
+    """
     plan = source.plan
     assert plan is not None
-    if source.plan_s > 0.0:  # cycles that the loop missed: the arm went on with the velocity of the last one
+    if source.plan_s > 0.0:  # cycles that the loop missed: the arm continued at its last velocity
         missed = round(context.derived.room.numbers.elapsed_s / context.dt_s) - 1
         source.plan_s = min(max(0.0, source.plan_s + missed * context.dt_s), float(plan.times[-1]))
     begin_s = source.plan_s
@@ -558,7 +583,7 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
     apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
     lag = float(np.where(scene.weights * wanted > 0.0, apart, 0.0).max()) / LARGEST_LAG_PX
     source.plan_s = advance(plan, source.plan_s, context.dt_s, lag)
-    # What the set-points move by in the step that begins: its mean is what a velocity held so long can do.
+    # Displacement of the set-points in the next step: its mean rate is feasible for a velocity held for a step.
     ahead, _ = _planned_set_points(source, scene)
     joints = planned_joints(plan, begin_s, source.plan_s, context.dt_s, context.q)
     return task._replace(
@@ -568,9 +593,10 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
 
 
 def _planned_set_points(source: ServoGoal, scene: Scene) -> tuple[FloatArray, float]:
-    """Where the plan has the set-points (c, m, 2) at its present time, and the share of this time in its length.
+    """The plan's set-points (c, m, 2) at its current time, and this time as a fraction of the plan's duration.
 
-    What the goal's set-points differ by from the body's projections is brought in along the way.
+    The difference between the goal's set-points and the projections of the body at the goal is added in proportion to
+    that fraction.
     """
     plan, start = source.plan, source.start_points
     assert plan is not None
@@ -588,7 +614,7 @@ Progress = tuple[float | None, float | None]
 
 
 def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
-    """Share [0, 1] of the goal's path that is done, and the seconds left; None where that is not known."""
+    """Completed fraction [0, 1] of the goal's path, and the remaining seconds; None if unknown."""
     if error_of_run(context.state.block) is None:
         return None, None
     if context.derived.laws[source.law].planned:
@@ -603,7 +629,7 @@ def servo_progress(source: ServoGoal, context: StepContext) -> Progress:
 
 
 def run_progress(source: LawRun, context: StepContext) -> Progress:
-    """The same of any law, by the exponential decay of its error."""
+    """The same for any law, from the exponential decay of its error."""
     record = context.state.block.record
     slow = 1.0 + source.damping
     known, done, left_s = decay_of_error(
@@ -613,7 +639,7 @@ def run_progress(source: LawRun, context: StepContext) -> Progress:
 
 
 def examine_servo(source: ServoGoal, context: StepContext, told: tuple[Reason, ...]) -> list[Reason]:
-    """The progress reasons of a goal in set-points, beside those ``told`` in this step."""
+    """The progress reasons of a goal in set-points, in addition to those already given (``told``) in this step."""
     return examine_progress(source, context, told, _servo_traits(source, context))
 
 

@@ -1,7 +1,7 @@
 """Measurement at joint positions, shared by calibration, model check and teaching: moves there, settles, and averages
 the raw pixels of every marker, with covariances.
 
-Pixels here are raw: no model is needed, and what is kept stays true when the lens becomes better known.
+Pixels here are raw: no model is needed, and the stored values remain valid when the lens model improves.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from stereoservo.ports.devices import CameraObservation
 
 
 def measurement_buffers(settings: CoreSettings) -> dict[str, Any]:
-    """Empty sums of pixel sights for every camera and every marker id of the cell."""
+    """Empty sums of pixel observations for every camera and every marker id of the cell."""
     c, m = len(settings.cameras), len(settings.marker_ids)
     return {
         "counts": np.zeros((c, m)),
@@ -39,7 +39,7 @@ def measurement_buffers(settings: CoreSettings) -> dict[str, Any]:
 
 @lru_cache(maxsize=4)
 def _sorted_ids(cameras: tuple[CameraSettings, ...]) -> IntArray:
-    """Every marker id that some of the ``cameras`` can report, ascending; not to be written to."""
+    """Every marker id that some of the ``cameras`` can report, ascending; read-only."""
     ids: IntArray = np.unique([i for camera in cameras for i in camera.marker_ids]).astype(np.int64)
     return ids
 
@@ -51,7 +51,9 @@ def add_observation(
     frames_wanted: int,
     after_ns: int,
 ) -> bool:
-    """Add one frame, when it is stamped after ``after_ns`` and its camera still lacks frames; whether it was."""
+    """Add one frame if it is stamped after ``after_ns`` and its camera needs more frames; returns
+    whether it was used.
+    """
     camera = next(i for i, c in enumerate(settings.cameras) if c.name == observation.camera)
     if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_wanted:
         return False
@@ -64,7 +66,8 @@ def add_observation(
     seen = found[rows]
     pixels = observation.pixels[rows]
     known = sums.counts[camera, seen] > 0
-    # The arm is never quite at rest: what all markers do together is motion, the remainder is the detector's noise.
+    # The arm is never quite at rest: the common displacement of all markers is motion, the remainder is the detector's
+    # noise.
     together = (pixels - sums.first[camera, seen])[known].mean(axis=0) if known.any() else np.zeros(2)
     sums.first[camera, seen[~known]] = pixels[~known] - together
     deviation = pixels - sums.first[camera, seen] - together
@@ -79,7 +82,7 @@ def add_observation(
 def averages(sums: ObservationStatistics, settings: CoreSettings) -> tuple[Sample, ...]:
     """Mean pixels with the covariance of the mean, of markers seen in at least half of the frames.
 
-    Of the detector's covariance the systematic part does not shrink with the number of frames.
+    The systematic part of the detector's covariance does not decrease with the number of frames.
     """
     samples = []
     ids = _sorted_ids(settings.cameras)
@@ -92,7 +95,7 @@ def averages(sums: ObservationStatistics, settings: CoreSettings) -> tuple[Sampl
         scatter = sums.square_sums[camera, seen] - (sums.deviation_sums[camera, seen] ** 2).sum(axis=-1) / n
         together = float(seen.sum()) / max(
             float(seen.sum()) - 1.0, 1.0
-        )  # one freedom in so many went with the motion
+        )  # the common motion uses one degree of freedom in so many
         samples.append(
             Sample(
                 description.name,
@@ -115,14 +118,14 @@ Phase = Literal["move", "settle", "collect", "return", "finish"]
 
 
 def trial_settings(settings: CoreSettings) -> TrialSettings:
-    """The cell's [calibration] section. Raises ValueError where it has none."""
+    """The cell's [calibration] section. Raises ValueError if there is none."""
     if settings.trials is None:
         raise ValueError("the cell has no [calibration] section")
     return settings.trials
 
 
 def first_visit(target: FloatArray, q: FloatArray, now_ns: int, settings: CoreSettings) -> dict[str, object]:
-    """Fields of a ``Visiting`` that sets out from ``q`` (n,) to ``target`` (n,)."""
+    """Fields of a ``Visiting`` that starts from ``q`` (n,) to ``target`` (n,)."""
     return {
         "phase": "move",
         "target": target.copy(),
@@ -134,7 +137,7 @@ def first_visit(target: FloatArray, q: FloatArray, now_ns: int, settings: CoreSe
 
 
 def enter(visit: PoseMeasurement, phase: Phase, context: StepContext) -> None:
-    """Begin a phase."""
+    """Start a phase."""
     visit.phase = phase
     visit.phase_ns = context.now_ns
     visit.start = context.q.copy()
@@ -155,13 +158,13 @@ def at_target(visit: PoseMeasurement, context: StepContext) -> bool:
 
 
 def continue_move(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> SourceOutput:
-    """Towards the target."""
+    """The velocity towards the target."""
     velocity = approach_velocity(joints_ahead(context), visit.target, context.settings, trial.speed_scale)
     return SourceOutput(velocity, speed_scale=trial.speed_scale)
 
 
 def too_slow(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> Reason | None:
-    """The stop is not reached in three times the time it takes."""
+    """The reason if the stop is not reached in three times the expected time."""
     elapsed_s = (context.now_ns - visit.phase_ns) * 1e-9
     speed = context.settings.limits.velocity_max * context.settings.limits.speed_scale
     limit_s = 5.0 + 3.0 * float((np.abs(visit.target - visit.start) / (speed * trial.speed_scale)).max())
@@ -177,13 +180,13 @@ def too_slow(visit: PoseMeasurement, context: StepContext, trial: TrialSettings)
 
 
 def _of_body(ids: IntArray, static: tuple[int, ...]) -> int:
-    """How many of ``ids`` are not ``static``, of the scene."""
+    """Number of ``ids`` that are not ``static`` points of the scene."""
     of_scene = set(static)
     return sum(marker not in of_scene for marker in ids.tolist())
 
 
 def markers_lost(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> bool:
-    """Some camera has seen too few markers for ``LOST_S``, whatever others saw meanwhile."""
+    """Whether some camera has seen too few markers for ``LOST_S``, whatever the other cameras saw meanwhile."""
     for observation in context.observations:
         if _of_body(observation.ids, context.settings.scene_ids) < trial.min_markers:
             if not visit.lost_ns:
@@ -199,7 +202,7 @@ def markers_lost(visit: PoseMeasurement, context: StepContext, trial: TrialSetti
 def collect_samples(
     visit: PoseMeasurement, context: StepContext, trial: TrialSettings
 ) -> tuple[Sample, ...] | None:
-    """Settle, then average frames; the samples once there are enough or waiting is over, else None."""
+    """Settle, then average frames; returns the samples once there are enough or the waiting time is over, else None."""
     if visit.phase == "settle":
         if (context.now_ns - visit.phase_ns) * 1e-9 >= trial.settle_s:
             enter(visit, "collect", context)
@@ -217,7 +220,7 @@ def collect_samples(
     silent = min(estimate.last_seq for estimate in context.state.cameras) < 0
     if silent:
         visit.silent_ns = context.now_ns
-    # A camera that has begun at last gets the whole of wait_s for its frames.
+    # A camera that has started late gets the whole of wait_s for its frames.
     begin_ns = visit.phase_ns if silent else max(visit.phase_ns, visit.silent_ns)
     waited_s = (context.now_ns - begin_ns) * 1e-9
     limit_s = max(trial.wait_s, FIRST_FRAME_S) if silent else trial.wait_s
@@ -227,7 +230,7 @@ def collect_samples(
 
 
 def mean_joints(visit: PoseMeasurement) -> FloatArray:
-    """Joints (n,) while it looked."""
+    """Mean joint positions (n,) during the measurement."""
     mean: FloatArray = visit.joint_sum / max(visit.joint_frames, 1)
     return mean
 
@@ -243,7 +246,7 @@ def too_few_seen(
 
 
 def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...] = ()) -> Reason:
-    """Why nothing can begin: the base shows too little; ``static`` points do not count."""
+    """Why the programme cannot start: too few markers are visible at the base; ``static`` points do not count."""
     seen = _of_body(poorest.ids, static)
     if poorest.frames == 0:
         return Reason(
@@ -266,10 +269,10 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...
 def blocked(
     target: FloatArray, moving: list[int], context: StepContext, back: FloatArray | None = None
 ) -> str:
-    """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty where it may.
+    """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty if it may.
 
-    The programme never leans on the safety stage: a keep-out blocks where it meets the box that the way from here
-    to the stop spans, and with it the way from anywhere there ``back`` (n,), where that is another one.
+    The programme does not rely on the safety stage: a keep-out blocks the stop if it intersects the box spanned by the
+    current position and the stop, and by the return position ``back`` (n,) if that is another one.
     """
     limits = context.settings.limits
     margin = limits.position_margin + 2.0 * context.settings.arrival

@@ -1,19 +1,20 @@
-"""The progress of a law's run: what every step adds to it, why it is slow or stuck, and whether the cameras agree with
-each other and with the joints where a goal ends, as far as the pictures' noise and the model's accuracy tell.
+"""The progress of a law's run: updates it in each step, finds out why the run is slow or stuck, and tests whether the
+cameras agree with each other and with the joints where a goal ends, as far as image noise and the model's accuracy
+allow.
 
-The law takes the arm along with a camera that creeps: where both pictures show the set-points the arm is beside the
-goal. A difference between observed and predicted pixels remains in that camera alone. It is too small for one round of
-frames (`monitors.fault_isolation`), and is seen in the mean over the frames in which the goal's error is inside its
-tolerance.
+The law makes the arm follow a camera that drifts slowly: when both images show the set-points, the arm is beside the
+goal. Only that camera has a difference between observed and predicted pixels. It is too small for one round of frames
+(`monitors.fault_isolation`), but visible in the mean over the frames in which the goal's error is inside its tolerance.
 
 These mean innovations ``d`` are Gaussian with the covariance ``C = Σ/N + S P Sᵀ + J_q S_q J_qᵀ`` of the detector's
-noise over N frames, the model's parameters and the errors that the model states of joint readings. For each camera the
-hypothesis that it was displaced, ``d = E ξ``, reduces the chi-square ``dᵀ C⁻¹ d`` by a chi-square of six freedoms where
-nothing was displaced: a healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each look,
-all cameras together. Displacements of less than `SHARE` of the goal's tolerance are tolerated. If the joints explain
-``d`` better than any one camera, the cameras agree: the goal is where they show it. Where a gain is in `DOUBT`, which
-noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: by the union bound a false alarm
-then has at most so many times `FALSE_ALARMS` for that goal.
+noise over N frames, the model's parameters and the errors of joint readings that the model states. For each camera the
+hypothesis that it was displaced, ``d = E ξ``, reduces the chi-square ``dᵀ C⁻¹ d``; if nothing was displaced, the
+reduction is a chi-square of six degrees of freedom.
+A healthy camera is called displaced with a probability of at most `FALSE_ALARMS` at each test, all cameras together.
+Displacements of less than `SHARE` of the goal's tolerance are tolerated. If the joints explain
+``d`` better than any one camera, the cameras agree: the goal is where they show it. If a gain is in `DOUBT`, which
+noise causes in one goal of a hundred, more frames are averaged, up to `MOST_FRAMES`: by the union bound the probability
+of a false alarm is then at most so many times `FALSE_ALARMS` for that goal.
 """
 
 from __future__ import annotations
@@ -48,22 +49,22 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import cholesky_solve, damped_least_squares, damped_solve, factor_solve
 
 AVERAGED_S = 0.5
-"""Time constant of the mean error that is looked at: noise alone shall not look like an advance."""
+"""Time constant of the mean error [s]: long enough that noise alone does not look like progress."""
 SMALLER = 0.95
-"""Of the least mean error so far, below which it counts as smaller."""
+"""Factor on the least mean error so far: below it the error counts as smaller."""
 GOES_ON, OUT_OF_TIME, SETTLED = range(3)
-"""What `account_run` has found."""
+"""Results of `account_run`."""
 
 
 def error_of_run(block: Block) -> float | None:
-    """The error [px] of the law at work in its last step; None where none was measured."""
+    """The error [px] of the active law in its last step; None if none was measured."""
     run = block.numbers.run
     return run.newest_px if run.measured else None
 
 
 @kernel
 def begin_run(block: Record) -> None:
-    """A law begins."""
+    """Reset the run for a law that starts."""
     memory = block[0]
     run, frames = memory.run, 0
     for c in range(memory.cameras):
@@ -75,8 +76,8 @@ def begin_run(block: Record) -> None:
 
 
 class RunTerms(NamedTuple):
-    """Of a run: the tolerance [px] in which it has to stay for so many frames, and the time [s] in which it has to get
-    there.
+    """Conditions of a run: the tolerance [px] in which the error has to stay for so many frames, and the time limit
+    [s].
     """
 
     tolerance_px: float
@@ -88,8 +89,9 @@ class RunTerms(NamedTuple):
 def account_run(
     block: Record, measured: bool, error_px: float, enough: bool, dt_s: float, terms: RunTerms
 ) -> int:
-    """Account for a step of ``dt_s`` with this error; whether the run is out of time, or, where ``enough`` markers are
-    seen, has stayed below its tolerance for its frames of every camera on average.
+    """Update the run by a step of ``dt_s`` with this error. Returns `OUT_OF_TIME`; `SETTLED` if ``enough`` markers are
+    seen and the error has stayed inside its tolerance for the required number of frames of every camera on average;
+    otherwise `GOES_ON`.
     """
     memory = block[0]
     run = memory.run
@@ -116,7 +118,7 @@ def account_run(
 
 @kernel
 def follow_error(block: Record, tolerance_px: float, dt_s: float) -> None:
-    """Take the error of this step into the means by which a run is judged."""
+    """Update the means by which a run is judged by the error of this step."""
     run = block[0].run
     if not run.measured:
         return
@@ -133,7 +135,7 @@ def follow_error(block: Record, tolerance_px: float, dt_s: float) -> None:
 def decay_of_error(
     block: Record, tolerance_px: float, gain_near: float, gain_far: float
 ) -> tuple[bool, float, float]:
-    """Whether there is an error, the share [0, 1] of its way that is done, and the seconds that are left, at the slower
+    """Whether there is an error, the completed fraction [0, 1] of its decay, and the remaining seconds at the smaller
     of the gains.
     """
     run = block[0].run
@@ -146,21 +148,21 @@ def decay_of_error(
 
 @kernel
 def _decay_s(error_px: float, tolerance_px: float, gain: float) -> float:
-    """Time in which an error decays to the tolerance."""
+    """Time [s] in which an error decays to the tolerance."""
     times = error_px / tolerance_px
     return math.log(1.0 if times < 1.0 else times) / gain
 
 
 STUCK_S = 3.0
-"""Time of motion without a smaller error after which a law is said to be stuck."""
+"""Time of motion without a smaller error [s] after which a law is reported as stuck."""
 NEAR_LIMIT = 0.087
-"""Room to a limit less its margin [rad or m] below which it is told: five degrees."""
+"""Clearance to a limit less its margin [rad or m] below which it is reported: five degrees."""
 NEAR_SINGULAR = 2.0 * ILL_CONDITIONED
 FEW_MARKERS = 4
 TAIL = 10.0
-"""Times its tolerance, below which an error decays in the gain's tail."""
+"""Factor on the tolerance: below it the error is in the slow end of the exponential decay (tail)."""
 TAIL_S = 2.0
-"""Least time that a tail takes to be told."""
+"""Shortest duration of a tail that is reported [s]."""
 NOISE_SIGMAS = 3.0
 
 CAUSES = (
@@ -168,12 +170,12 @@ CAUSES = (
     "FEATURES_STALE", "TOO_FEW_MARKERS", "VISIBILITY_BLOCKED", "VISIBILITY_WAIT", "JACOBIAN_ILL_CONDITIONED",
     "NEAR_SINGULAR", "VELOCITY_SCALED",
 )  # fmt: skip
-"""What may hold a law up, the most probable first."""
+"""Possible causes of a stuck law, the most probable first."""
 
 
 class Traits(NamedTuple):
-    """Of a run its ``gain`` now and the time ``left_s`` in which its error decays; of its goal the set-points that
-    count (c, m), whether they move, a law that may rest in a minimum.
+    """Properties of a run: its current ``gain`` and the time ``left_s`` in which its error decays; of its goal the
+    set-points that count (c, m), whether they move, and whether its law may get stuck in a local minimum.
     """
 
     gain: float
@@ -186,7 +188,7 @@ class Traits(NamedTuple):
 def examine_progress(
     source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
 ) -> list[Reason]:
-    """The reasons beside those that are ``told`` in this step, the gravest first."""
+    """The progress reasons in addition to those already given (``told``) in this step, the most serious first."""
     found = [*_near_limits(context), *_near_singular(source, context), *_few_markers(source, context, traits)]
     tail = _tail(source, context, traits)
     if tail is not None:
@@ -212,7 +214,9 @@ def _near_limits(context: StepContext) -> list[Reason]:
 
 
 def _near_singular(source: LawRun, context: StepContext) -> list[Reason]:
-    """By the pivots of the pixels' normal matrix: a small one is a motion that takes much and shows little."""
+    """From the pivots of the pixels' normal matrix: a small one is a motion that needs large joint travel and is hardly
+    visible.
+    """
     if context.prediction is None or context.weights is None:
         return []
     from_pivots = image_conditioning(context, source)
@@ -223,7 +227,9 @@ def _near_singular(source: LawRun, context: StepContext) -> list[Reason]:
 
 
 def image_conditioning(context: StepContext, source: LawRun) -> float:
-    """Smallest Cholesky pivot of the normal matrix of all seen pixels over its largest diagonal; 0: singular."""
+    """Smallest Cholesky pivot of the normal matrix of all seen pixels over its largest diagonal element;
+    0: singular.
+    """
     assert context.prediction is not None
     assert context.weights is not None
     n = len(context.q)
@@ -291,7 +297,7 @@ def _stall_reason(
 
 
 def _noise_px(source: LawRun, context: StepContext) -> float:
-    """Largest deviation [px] of one observation of a marker that is seen."""
+    """Largest standard deviation [px] of one observation of a marker that is seen."""
     if context.weights is None:
         return 0.0
     usable = context.weights * source.used[:, None]
@@ -301,26 +307,26 @@ def _noise_px(source: LawRun, context: StepContext) -> float:
 
 
 FALSE_ALARMS = 1e-6
-"""Probability, at most, that noise as stated calls any camera displaced at one look."""
+"""Largest probability that noise, as stated, makes any camera appear displaced in one test."""
 DOUBT = 1e-2
-"""Probability below which a gain is not taken for noise before more frames are averaged."""
+"""Probability below which a gain is not attributed to noise before more frames are averaged."""
 MOST_FRAMES = 50
-"""Of a camera that are averaged before what is still in doubt is taken for noise."""
+"""Frames of a camera that are averaged before a gain still in doubt is attributed to noise."""
 SHARE = 0.5
-"""Of a goal's tolerance: rms change of a camera's pixels up to which its displacement is tolerated."""
+"""Fraction of a goal's tolerance: rms change of a camera's pixels up to which its displacement is tolerated."""
 FREEDOMS = 6
-"""Of a displacement."""
+"""Degrees of freedom of a displacement."""
 BIAS_PX = 0.05
-"""Deviation of a marker's centre that is the same in all frames, by detector and light."""
+"""Standard deviation [px] of a marker's centre that is the same in all frames, caused by detector and light."""
 FEWEST = 3
-"""Markers in a camera's pictures by which it is judged, and may confirm the joints."""
+"""Least number of markers in a camera's images for the camera to be tested and to confirm the joints."""
 MOST_ROWS = 64
-"""Markers times cameras that are looked at: of more, evenly chosen ones."""
+"""Largest number of observations (markers times cameras) that are used: if there are more, evenly chosen ones."""
 DAMPING = 1e-9
 LENS_STEP = 1e-3
-"""Deviations of a lens parameter over which derivatives by it are taken."""
+"""Step of a lens parameter for derivatives by it, in standard deviations."""
 AGREED, DOUBTFUL, UNDECIDED, DISPLACED = range(4)
-"""What `decide` has found."""
+"""Results of `decide`."""
 
 
 # -- the mean innovations -----------------------------------------------------------------------------------
@@ -328,7 +334,7 @@ AGREED, DOUBTFUL, UNDECIDED, DISPLACED = range(4)
 
 @kernel
 def forget_frames(block: Record) -> None:
-    """Begin the means anew."""
+    """Reset the means."""
     memory = block[0]
     sights = memory.cameras * memory.markers
     memory.settled_innovation[: 2 * sights] = 0.0
@@ -379,7 +385,7 @@ class ModelParameters:
 
 
 def model_parameters(model: CellModel, cameras: tuple[str, ...]) -> ModelParameters | None:
-    """Parameters of a model in a cell with these ``cameras``; None where it states no covariance."""
+    """Parameters of a model in a cell with these ``cameras``; None if it states no covariance."""
     given = model.covariance
     if given is None:
         return None
@@ -408,11 +414,12 @@ def pixel_slopes(
     chain: tuple[FloatArray, KindArray, FloatArray, bool], q: FloatArray, marker_points: FloatArray,
     cameras: tuple[FloatArray, FloatArray], sights_of: tuple[IntArray, IntArray],
 ) -> FloatArray:  # fmt: skip
-    """Derivatives (2 k, p) of the innovations of k sights, in ideal pixels, by the ``parameters`` of a model, with the
-    joints at ``q`` (n,).
+    """Derivatives (2 k, p) of the innovations of k observations, in ideal pixels, by the ``parameters`` of a model,
+    with the joints at ``q`` (n,).
 
-    ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first. ``cameras``: matrices (c, 3, 4) and
-    lenses. ``sights_of``: the camera and the marker of each sight, (k,) each.
+    ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first.
+    ``cameras``: matrices (c, 3, 4) and lenses.
+    ``sights_of``: the camera and the marker of each observation, (k,) each.
     """
     (matrices, lenses), (camera_of, marker_of) = cameras, sights_of
     directions, part, index, covariance = parameters
@@ -516,8 +523,8 @@ def added_covariance(C: FloatArray, slopes: FloatArray, covariance: FloatArray) 
 def explained(
     d: FloatArray, C: FloatArray, columns: FloatArray, first: int, last: int, x: FloatArray
 ) -> float:
-    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A``
-    (r, k) has the ``columns`` in the rows from ``first`` to ``last``; by how much chi-square falls.
+    """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A`` (r,
+    k) has the ``columns`` in the rows from ``first`` to ``last``; returns the reduction of chi-square.
     """
     rows, count = d.size, columns.shape[1]
     weighted = np.empty((count, rows))
@@ -546,12 +553,13 @@ def compare_causes(
     d: FloatArray, C: FloatArray, displaced: FloatArray, jacobian: FloatArray, begins: IntArray,
     found: tuple[FloatArray, FloatArray],
 ) -> bool:  # fmt: skip
-    """Into the gains (c + 1,) of ``found`` the fall of the chi-square of ``d`` (2 k,) where each camera was displaced,
-    and where all joints stand elsewhere; into its effects (c,) the rms displacement of each camera's pixels then [px].
-    False where the covariance ``C`` (2 k, 2 k), which is overwritten, is not positive.
+    """Reduction of the chi-square of ``d`` (2 k,) under each hypothesis. Writes to the gains (c + 1,) of ``found`` the
+    reduction if each camera was displaced, and if the joints deviate from their readings; to its effects (c,) the rms
+    displacement of each camera's pixels in that case [px].
+    Returns False if the covariance ``C`` (2 k, 2 k), which is overwritten, is not positive definite.
 
-    ``displaced`` (2 k, 6), ``jacobian`` (2 k, n): derivatives of the pixels, which lie in the order of the cameras, of
-    which each ``begins`` (c + 1,) at a row.
+    ``displaced`` (2 k, 6), ``jacobian`` (2 k, n): derivatives of the pixels. These are ordered by camera; ``begins`` (c
+    + 1,) holds the first row of each.
     """
     gains, effects = found
     x = np.zeros(d.size)
@@ -578,7 +586,7 @@ def compare_causes(
 
 @lru_cache(maxsize=16)
 def significant_gain(cameras: int, probability: float = FALSE_ALARMS) -> float:
-    """Fall of chi-square that noise exceeds for one of so many cameras with this probability."""
+    """Reduction of chi-square that noise exceeds for one of so many cameras with this probability."""
     return chi2_quantile(probability / cameras, FREEDOMS)
 
 
@@ -586,11 +594,14 @@ def decide(
     gains: FloatArray, effects: FloatArray, measurements: int, freedoms: int, limit_px: float, judged: FloatArray,
     *, may_wait: bool = False,
 ) -> tuple[int, list[int]]:  # fmt: skip
-    """What the ``gains`` (c + 1,) and ``effects`` (c,) of `compare_causes` mean, and for which cameras.
+    """Interpret the ``gains`` (c + 1,) and ``effects`` (c,) of `compare_causes`; returns the result and the cameras
+    concerned.
 
-    `AGREED`: none of the cameras that are ``judged`` (c,) > 0 was displaced by more than ``limit_px``. `DISPLACED`: one
-    was. `UNDECIDED`: one of several, or the joints, all ``freedoms`` of them, explain as much (Schwarz). `DOUBTFUL`,
-    where it ``may_wait``: more frames tell whether it is noise.
+    `AGREED`: no camera that is ``judged`` (c,) > 0 was displaced by more than ``limit_px``.
+    `DISPLACED`: one was.
+    `UNDECIDED`: one of several cameras, or the joints with all ``freedoms``, explain the data equally well (Schwarz
+    criterion).
+    `DOUBTFUL`, only if it ``may_wait``: more frames show whether it is noise.
     """
     cameras = effects.size
     penalty = math.log(measurements)
@@ -614,10 +625,10 @@ def decide(
 
 
 def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None) -> Reason | None:
-    """Why a goal whose error is inside its tolerance is not reached: a camera that it uses, with set-points ``wanted``
-    (c, m) in it (None: in all), is at odds with the others and the joints; None where they agree.
+    """The reason why a goal whose error is inside its tolerance is not reached: a camera that it uses, with set-points
+    ``wanted`` (c, m) in it (None: in all), disagrees with the other cameras and the joints; None if they agree.
 
-    Models that state no covariance, cameras that may move and bodies that move by themselves are not judged.
+    Not tested: models that state no covariance, cameras that may move, and bodies that move independently of the arm.
     """
     state, arrays, model = context.state, context.derived.arrays, context.state.model
     if arrays is None or model is None or state.target is not None or any(state.mobile):
@@ -654,7 +665,7 @@ def _parameters(context: StepContext, model: CellModel) -> ModelParameters | Non
 
 
 def _chosen(count: FloatArray) -> IntArray:
-    """Cameras and markers (k, 2) of the sights that are looked at, of those that were counted (c, m)."""
+    """Cameras and markers (k, 2) of the observations that are used, chosen from those that were counted (c, m)."""
     cameras, markers = count.shape
     seen = np.flatnonzero((count > 0.0).any(axis=0))
     most = max(FEWEST + 1, MOST_ROWS // cameras)
@@ -668,8 +679,8 @@ def _chosen(count: FloatArray) -> IntArray:
 def _moment(
     context: StepContext, arrays: ModelArrays, parameters: ModelParameters, sights: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of ``sights`` (k, 2): mean innovations (2 k,), their covariance (2 k, 2 k), the derivatives of the pixels by a
-    displacement (2 k, 6) and by the joints (2 k, n).
+    """For the observations ``sights`` (k, 2): mean innovations (2 k,), their covariance (2 k, 2 k), and the derivatives
+    of the pixels by a displacement of the camera (2 k, 6) and by the joints (2 k, n).
     """
     block, q = context.state.block, context.q
     cameras, markers = np.ascontiguousarray(sights[:, 0]), np.ascontiguousarray(sights[:, 1])
@@ -700,7 +711,9 @@ def _moment(
 def _affine_motions(
     d: FloatArray, matrices: FloatArray, points: FloatArray, cameras: IntArray, markers: IntArray
 ) -> FloatArray:
-    """Derivatives (2 k, 6) of the pixels by an affine motion of a camera's image, where its displacement is unknown."""
+    """Derivatives (2 k, 6) of the pixels by an affine motion of a camera's image, used if the derivatives by its
+    displacement are unknown.
+    """
     images = np.einsum("kij,kj->ki", matrices[cameras], points[markers])
     places = images[:, :2] / images[:, 2:]
     middle, size = places.mean(axis=0), max(float(places.std()), 1.0)

@@ -1,8 +1,9 @@
 """Moving goals: set-points streamed by a client, filtered, extrapolated between messages, and fed forward to the
 control law as a joint velocity.
 
-The client's stamps order its messages and give the target's velocity (`control.filters`); between two messages, and for
-a short while after the last, the target goes on as it went. A target that cannot be is refused and the former one kept.
+The client's stamps order its messages and give the target's velocity (`control.filters`). Between two messages, and for
+a short time after the last, the target is extrapolated at this velocity. An impossible target is refused and the
+previous one kept.
 """
 
 from __future__ import annotations
@@ -39,18 +40,20 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.linear import damped_least_squares
 
 JUMP_SHARE = 0.1
-"""Of an image's width that a set-point may move by from one message to the next."""
+"""Largest motion of a set-point from one message to the next, as a fraction of the image's width."""
 QUIET_S = 0.5
-"""After such a silence of the client the goal stands, and may be reached."""
+"""Silence of the client [s] after which the goal is static, and may be reached."""
 FOLLOWING_REFINEMENTS = 3
 PIXELS_AT_ONCE = 512
-"""Pixels of markers above which a step makes one refinement with all markers, and those before with a `FEW`."""
+"""Number of marker pixels above which a step makes only one refinement with all markers, preceded by
+some with a `FEW`.
+"""
 FEW = 8
 FEED_FORWARD_DAMPING = 1e-6
 
 
 def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: BodyState, epoch: int) -> str:
-    """Move the active goal. Raises RefusalError; the goal is then where it was."""
+    """Move the active goal. Raises RefusalError; the goal is then unchanged."""
     if not LAWS[source.law].follows_streams:
         able = [repr(name) for name in LAWS.surest_first() if LAWS[name].follows_streams]
         raise RefusalError(
@@ -61,7 +64,7 @@ def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: 
         )
     of_this_model(command.target.model_epoch, epoch)
     set_points, wanted = _set_points(command.target, place)
-    wanted = wanted * source.wanted  # what the goal is judged by stays
+    wanted = wanted * source.wanted  # the set-points that count do not change
     shown = int((wanted.max(axis=0) > 0.0).sum())
     if shown < MIN_MARKERS:
         raise RefusalError(
@@ -90,7 +93,7 @@ def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: 
 
 
 def _set_points(target: FeatureTarget | PointTarget, place: BodyState) -> tuple[FloatArray, FloatArray]:
-    """(c, m, 2) ideal pixels and (c, m) 1 where the target says something."""
+    """The target's ideal pixels (c, m, 2), and (c, m) 1 where it states them."""
     if isinstance(target, FeatureTarget):
         return raw_set_points(target, place)
     points, given = given_points(target, place.arrays)
@@ -149,9 +152,9 @@ def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, wante
 
 
 def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool:
-    """Bring the goal to where it is now; False once the client has been silent for `QUIET_S`.
+    """Move the goal to its current set-points; returns False once the client has been silent for `QUIET_S`.
 
-    It then stands where the client last said.
+    The goal then stays at the last set-points that the client sent.
     """
     stream, prediction = source.stream, context.prediction
     assert stream is not None
@@ -177,7 +180,7 @@ def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool
 
 
 def feed_forward(source: ServoGoal, context: StepContext, active: FloatArray) -> FloatArray:
-    """Joint velocity (n,) that moves the markers as their set-points move."""
+    """Joint velocity (n,) that moves the markers at the velocity of their set-points."""
     prediction = context.prediction
     assert prediction is not None
     n = prediction.operators.shape[0]

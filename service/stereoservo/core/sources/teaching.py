@@ -14,12 +14,12 @@ from stereoservo.core.state import TeachingState
 from stereoservo.messages.goals import Request, Teach
 
 AT_REST = 1e-3
-"""[rad/s or m/s]"""
+"""Joint command below which the arm counts as at rest [rad/s or m/s]."""
 TEACH_TIMEOUT_S = 20.0
 
 
 def start_teaching(command: Teach, request: Request, context: StepContext) -> str:
-    """Begin to average. Raises RefusalError without a model, in motion, and while another goal is taught."""
+    """Start averaging. Raises RefusalError without a model, in motion, and while another goal is taught."""
     state = context.state
     if state.model is None:
         raise no_model(
@@ -46,7 +46,7 @@ def start_teaching(command: Teach, request: Request, context: StepContext) -> st
 
 
 def teach_step(context: StepContext) -> None:
-    """One step of what `start_teaching` began; it ends in event ``taught``, or in a warning."""
+    """One step of the averaging started by `start_teaching`; it ends with the event ``taught``, or with a warning."""
     state, settings = context.state, context.settings
     teaching = state.teaching
     if teaching is None:

@@ -1,7 +1,7 @@
-"""Goals that hold relative to a target that moves: their set-points now, and the velocities that are fed forward.
+"""Goals that hold relative to a moving target: their current set-points, and the velocities that are fed forward.
 
-With cameras on the arm the set-points stand in the images and the body moves; with cameras that stand the set-points
-go with the target. The features of incidences do likewise.
+With cameras on the arm the set-points are constant in the images and the body moves; with static cameras the set-points
+move with the target. The features of incidences are treated likewise.
 """
 
 from __future__ import annotations
@@ -35,13 +35,15 @@ from stereoservo.numerics.arrays import FloatArray
 Follower = ServoGoal | IncidenceGoal
 """Goals that may follow a target."""
 MISSED_FRAMES = 1.5
-"""Periods of the slowest camera by which frames may be newer than the last that showed the target, and still count."""
+"""Number of periods of the slowest camera by which the newest frame may be newer than the last one that showed the
+target.
+"""
 
 
 def require_followable(
     goal: Goal, follows_streams: bool, law: str, pose_known: bool, context: StepContext
 ) -> None:
-    """Raises RefusalError where a goal cannot follow the markers that it names."""
+    """Raises RefusalError if a goal cannot follow the markers that it names."""
     arrays = context.arrays
     assert arrays is not None
     ids = goal.follow_markers
@@ -93,8 +95,8 @@ def _carried(context: StepContext) -> bool:
 def _stated(
     goal: Goal, context: StepContext, arrays: ModelArrays
 ) -> tuple[np.ndarray, FloatArray, FloatArray, FloatArray]:
-    """Ids (k,) of the target's markers that the goal shows where it holds, their points (k, 4), ideal pixels (c, k, 2)
-    and which are given (c, k) 1 or 0. Raises RefusalError.
+    """Ids (k,) of the target's markers that the goal shows for the held pose, their points (k, 4), ideal pixels (c, k,
+    2) and which are given (c, k) 1 or 0. Raises RefusalError.
     """
     ids = np.array(sorted(goal.follow_markers), dtype=np.int64)
     cameras = len(context.settings.cameras)
@@ -120,7 +122,7 @@ def _stated(
 
 
 def start_following(source: Follower, context: StepContext) -> None:
-    """A goal that follows a target begins: the target is looked for, where it is not followed already."""
+    """Start a goal that follows a target: the target is searched, unless it is followed already."""
     arrays, state, goal = context.arrays, context.state, source.goal
     assert arrays is not None
     cameras, body = len(context.settings.cameras), state.target
@@ -153,15 +155,16 @@ def start_following(source: Follower, context: StepContext) -> None:
 
 
 def follow_target(source: Follower, context: StepContext) -> Reason | None:
-    """Bring a goal to where its target is now, with the velocities of its set-points; the reason where it cannot.
+    """Move a goal to the current pose of its target, with the velocities of its set-points; returns the reason if that
+    is impossible.
 
-    By events it tells when the target is seen, is lost, and is met while it moves.
+    Events report when the target is seen, lost, and reached while it moves.
     """
     waits = _brought(source, context)
     followed, run = source.followed, context.state.block.numbers.run
     assert followed is not None
     if waits is not None or _missed(context):
-        run.held = 0  # what was held, was held on a target that was seen
+        run.held = 0  # earlier frames inside the tolerance referred to a visible target
     if waits is not None:
         if followed.told in ("target_seen", "target_met"):
             _tell("target_unseen", f"{waits.hint}; the arm waits until it is there again", source, context)
@@ -174,7 +177,7 @@ def follow_target(source: Follower, context: StepContext) -> Reason | None:
 
 
 def _missed(context: StepContext) -> bool:
-    """Whether the cameras go on without the target: the error is then one to where it is expected."""
+    """Whether the cameras deliver frames without the target: the error is then relative to its predicted pose."""
     body, slowest_hz = context.state.target, min(camera.rate_hz for camera in context.settings.cameras)
     assert body is not None
     newest_ns = max(estimate.accepted_ns + estimate.offset_ns for estimate in context.state.cameras)
@@ -226,7 +229,7 @@ def _bring_features(source: IncidenceGoal, body: TargetBody, context: StepContex
 
 
 def _moved(followed: FollowedTarget, body: TargetBody, context: StepContext) -> FloatArray:
-    """What the target was displaced by (4, 4) since its reference."""
+    """Displacement (4, 4) of the target since its reference."""
     moved = np.empty((4, 4))
     multiply4_into(pose_at(body, context.now_ns)[0], invert4(followed.reference), moved)
     return moved
@@ -271,5 +274,5 @@ def _unseen(source: Follower, hint: str, value: float | None = None, limit: floa
 
 
 def stands(body: TargetBody | None) -> bool:
-    """Whether a goal's target stands, so that the goal may be reached for good."""
+    """Whether a goal's target is static, so that the goal may be reached for good."""
     return body is not None and body.t_ns > 0 and body.still

@@ -1,11 +1,12 @@
-"""The motion of a target, a rigid body that arm and cameras do not carry: pose, twist and rate of twist with their
-covariance, by a Kalman filter on the pixels of its markers.
+"""The motion of a target, a rigid body that is carried neither by the arm nor with the cameras: pose, twist and rate of
+twist with their covariance, by a Kalman filter on the pixels of its markers.
 
 The pose is a displacement ``D`` (4, 4) of its reference points in the model's frame, whatever that frame is. Twists are
-in a ``basis`` (6, 4, 4) of the displacements that is scaled so that a unit moves the markers by a pixel rms. Where the
-model is metric, targets accelerate alike in all directions, and what they do along the rays, which is seen ten times
-less, is followed more slowly; where it is not, they accelerate alike in the images. The rate of the twist is a
-Gauss-Markov process (Singer 1970): it is followed while images come, and fades when they do not.
+in a ``basis`` (6, 4, 4) of the displacements that is scaled so that a unit moves the markers by one pixel rms. If the
+model is metric, targets are assumed to accelerate equally in all directions, so motion along the rays, which is ten
+times less visible, is tracked more slowly. If it is not metric, they are assumed to accelerate equally in the images.
+The rate of the twist is a Gauss-Markov process (Singer 1970): it is estimated while images arrive, and decays when they
+do not.
 """
 
 from __future__ import annotations
@@ -33,35 +34,36 @@ from stereoservo.numerics.linear import damped_least_squares
 
 FREEDOMS = 6
 ACCELERATION_PX = 30.0
-"""[px/s²] rms of a target's markers, and the time constant [s] with which it changes."""
+"""Rms acceleration of a target's markers [px/s²], and the time constant [s] with which it changes."""
 TURNS = 0.0125
-"""Share of it by which turns of a target about its own middle move its markers."""
+"""Fraction of it by which rotations of a target about its own centroid move its markers."""
 ACCELERATION_S = 0.6
 SPEED_PX = 100.0
-"""[px/s] of a target that was just found."""
+"""Standard deviation of the speed of a target that was just found [px/s]."""
 FOUND_PX = 3.0
-"""Deviation of the pose of a target that was just found."""
+"""Standard deviation of the pose of a target that was just found [px]."""
 SIGHT_PX = 0.05
-"""Deviation of a sight besides its detector's: the body's shape is not exact."""
+"""Standard deviation of an observation in addition to its detector's [px]: the body's shape is not exact."""
 
 
 class TargetBody(msgspec.Struct, eq=False, kw_only=True):
-    """A target that moves, followed in the images.
+    """A moving target, tracked in the images.
 
     Markers ``ids`` (k,), ascending, at ``points`` (k, 4) of the model's frame when ``displacement`` (4, 4) is the
-    identity; ``carried``: the cameras are, and the target is the model's marker body, seen through the arm's joints.
+    identity; ``carried``: the arm carries the cameras, and the target is the model's marker body, seen through the
+    arm's joints.
     ``twist`` [1/s] and ``rate`` [1/s²] (6,) in the ``basis`` (6, 4, 4), ``covariance`` (18, 18) of pose, twist and
     rate, at ``t_ns``; 0: not found yet.
 
-    By camera: ``seen_ns`` (c,), the shutter of its last frame with enough markers, ``odd_ns`` (c,) of the last one that
-    the motion did not explain, 0 where a later one was explained; ``told`` (c,): whether its estimate began anew since
-    the target was found. ``drift`` (6, 6): how accelerations are spread over the basis. ``odd``: steps in a row with
-    such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): sights from which it is found,
-    where it is not yet; ``stated``: ``points`` are known before; ``rest_px``: what is left of them where none of its
-    poses explained these.
+    By camera: ``seen_ns`` (c,), the shutter time of its last frame with enough markers; ``odd_ns`` (c,), of the last
+    one that the motion did not explain, 0 if a later one was explained; ``told`` (c,): whether its estimate was reset
+    since the target was found. ``drift`` (6, 6): covariance of accelerations in the basis. ``odd``: consecutive steps
+    with such frames of all cameras. ``first`` (c, k, 2) [px] with ``first_seen`` (c, k): observations from which the
+    target is found, while it is not found yet; ``stated``: ``points`` are known in advance; ``rest_px``: the residual
+    of the best pose, if none explained these observations.
 
-    ``mark`` (4, 4): where it was at ``mark_ns``, ``farthest_px`` what its markers moved by since; ``still``: they did
-    not in the time before.
+    ``mark`` (4, 4): its pose at ``mark_ns``; ``farthest_px``: displacement of its markers since; ``still``: they did
+    not move in the interval before.
     """
 
     ids: IntArray
@@ -89,7 +91,7 @@ class TargetBody(msgspec.Struct, eq=False, kw_only=True):
 
 
 def target_body(ids: IntArray, points: FloatArray | None, cameras: int, *, carried: bool) -> TargetBody:
-    """A target that is not found yet; ``points`` (k, 4): its markers, None where they are not known before."""
+    """A target that is not found yet; ``points`` (k, 4): its markers, None if they are not known in advance."""
     k = len(ids)
     return TargetBody(
         ids=ids, points=np.zeros((k, 4)) if points is None else points.copy(), carried=carried,
@@ -103,9 +105,12 @@ def target_body(ids: IntArray, points: FloatArray | None, cameras: int, *, carri
 def begin(
     body: TargetBody, basis: FloatArray, metric: bool, matrices: FloatArray, carrier: FloatArray, t_ns: int
 ) -> bool:
-    """The target is where it is said to be at ``t_ns``, moving no one knows how; whether its markers tell of all six
-    freedoms. ``basis`` (6, 4, 4) of displacements: of a ``metric`` frame three translations and three turns about any
-    point, that move a body of its size alike; seen by ``matrices`` (c, 3, 4) through ``carrier`` (4, 4).
+    """Initialise the target at its ``displacement`` at ``t_ns``, with unknown motion; returns whether its markers
+    determine all six degrees of freedom.
+
+    ``basis`` (6, 4, 4): displacements; in a ``metric`` frame three translations and three rotations about any point,
+    that move a body of its size equally.
+    ``matrices`` (c, 3, 4): the cameras, which see it through ``carrier`` (4, 4).
     """
     here = transform_points(body.displacement, body.points)
     if metric:
@@ -123,7 +128,7 @@ def begin(
 
 
 def widen(body: TargetBody, pose_px: float) -> None:
-    """Its pose is known to ``pose_px``; of its motion nothing is."""
+    """Reset the uncertainty: the pose is known to ``pose_px``, the motion is unknown."""
     body.covariance[:] = 0.0
     for k, block in enumerate(
         (pose_px**2 * np.eye(FREEDOMS), SPEED_PX**2 * body.drift, ACCELERATION_PX**2 * body.drift)
@@ -132,8 +137,8 @@ def widen(body: TargetBody, pose_px: float) -> None:
 
 
 def variance_of_carried(body: TargetBody | None) -> float:
-    """How uncertain the markers of a body that is the target are in the images, for its motion since it was last seen
-    and followed [px²], of a coordinate; 0 where it is not the target.
+    """Uncertainty of a carried target's markers in the images, due to its motion since it was last seen and tracked:
+    variance [px²] of a coordinate; 0 if the body is not the target.
     """
     return (
         float(np.trace(body.covariance[:FREEDOMS, :FREEDOMS])) if body is not None and body.carried else 0.0
@@ -168,8 +173,8 @@ def solve_into(M: FloatArray, X: FloatArray) -> None:
 
 @kernel
 def turns_about(basis: FloatArray, points: FloatArray, share: float) -> FloatArray:
-    """The ``basis`` (6, 4, 4), translations and turns, with the turns about the middle of ``points`` (k, 4) of unit
-    height in place of wherever, and by a ``share``.
+    """The ``basis`` (6, 4, 4), translations and rotations, with its rotations replaced by ones about the centroid of
+    ``points`` (k, 4) of unit height, scaled by a ``share``.
     """
     middle, moved = np.zeros(4), np.zeros((FREEDOMS, 4))
     for i in range(points.shape[0]):
@@ -200,9 +205,9 @@ def turns_about(basis: FloatArray, points: FloatArray, share: float) -> FloatArr
 def scaled_basis(
     basis: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, bool]:
-    """The ``basis`` (6, 4, 4) in combinations of which each moves the pixels of ``points`` (k, 4) by 1 px rms,
-    independently of the others; the covariance (6, 6) in it of what is spread alike over the former, at 1 px rms; and
-    whether it could be.
+    """The ``basis`` (6, 4, 4) recombined so that each element moves the pixels of ``points`` (k, 4) by 1 px rms,
+    independently of the others. Also returns the covariance (6, 6) in the new basis of a motion distributed equally
+    over the old one, at 1 px rms; and whether the basis could be computed.
     """
     J = image_jacobian(seen_through(basis, carrier), matrices, transform_points(carrier, points)).reshape(
         (-1, FREEDOMS)
@@ -252,7 +257,7 @@ def scaled_basis(
 
 @kernel
 def seen_through(basis: FloatArray, carrier: FloatArray) -> FloatArray:
-    """Twists (6, 4, 4) as they are seen through a ``carrier`` C (4, 4): ``C Ĝ C⁻¹``."""
+    """Twists (6, 4, 4) as seen through a ``carrier`` C (4, 4): ``C Ĝ C⁻¹``."""
     inverse, half, out = invert4(carrier), np.empty((4, 4)), np.empty(basis.shape)
     for k in range(basis.shape[0]):
         multiply4_into(carrier, basis[k], half)
@@ -283,7 +288,7 @@ def displaced(D: FloatArray, basis: FloatArray, twist: FloatArray) -> FloatArray
 def after(
     D: FloatArray, basis: FloatArray, twist: FloatArray, rate: FloatArray, dt_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Pose (4, 4) and twist (6,) of a target ``dt_s`` later; the rate fades."""
+    """Pose (4, 4) and twist (6,) of a target ``dt_s`` later; the rate decays."""
     if dt_s < 0.0:  # a frame that was overtaken by another camera's
         return displaced(D, basis, dt_s * twist), twist.copy()
     fade = math.exp(-dt_s / ACCELERATION_S)
@@ -292,16 +297,17 @@ def after(
 
 
 Motion = tuple[FloatArray, FloatArray, FloatArray]
-"""Of a target: its twist and the rate of that (6,), and the covariance (18, 18) of pose, twist and rate."""
+"""Motion of a target: its twist and the rate of the twist (6,), and the covariance (18, 18) of pose, twist and rate."""
 View = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Of a frame: the camera's matrix (1, 3, 4), what is between it and the target's frame (4, 4), ideal pixels (k, 2) of
-the target's markers, and which of them are seen (k,) 1 or 0. Plain tuples: numba looks up a named one at every call.
+"""View of a frame: the camera's matrix (1, 3, 4), the transformation between the target's frame and the camera's (4,
+4), ideal pixels (k, 2) of the target's markers, and which of them are seen (k,) 1 or 0. Plain tuples, because numba
+resolves a named one at every call.
 """
 
 
 @kernel
 def elapse(D: FloatArray, basis: FloatArray, drift: FloatArray, motion: Motion, dt_s: float) -> None:
-    """The pose ``D`` (4, 4) and its ``motion`` ``dt_s`` later, in place."""
+    """Propagate the pose ``D`` (4, 4) and its ``motion`` by ``dt_s``, in place."""
     twist, rate, covariance = motion
     n = FREEDOMS
     fade = math.exp(-dt_s / ACCELERATION_S)
@@ -332,7 +338,7 @@ def elapse(D: FloatArray, basis: FloatArray, drift: FloatArray, motion: Motion, 
 def compare(
     basis: FloatArray, points: FloatArray, D: FloatArray, view: View
 ) -> tuple[FloatArray, FloatArray]:
-    """A frame against a pose ``D``: what it shows of the markers less the prediction (k, 2) [px], zeros where they are
+    """Residuals of a frame relative to a pose ``D``: observed minus predicted markers (k, 2) [px], zeros where they are
     not seen, and the Jacobian (k, 2, 6) by the basis.
     """
     matrix, carrier, sights, seen = view
@@ -353,8 +359,8 @@ def compare(
 def gate_sights(
     left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, pose: FloatArray, gate: float
 ) -> tuple[FloatArray, int, int]:
-    """Which of the markers ``seen`` (k,) are explained within a ``gate`` by the covariance ``pose`` (6, 6), how many
-    these are, and how many were seen.
+    """Which of the markers ``seen`` (k,) are explained within a ``gate`` by the covariance ``pose`` (6, 6), their
+    number, and the number of markers seen.
     """
     within, used, count = seen.copy(), 0, 0
     S = np.empty((2, 2))
@@ -382,8 +388,10 @@ def fold_frame(
     D: FloatArray, basis: FloatArray, motion: Motion, compared: tuple[FloatArray, FloatArray], variances: FloatArray,
     used: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Correct the pose ``D`` and its ``motion`` by a frame, in place: by what is left (k, 2) of the markers ``used``
-    (k,), and its Jacobian, as `compare` gives them; returns the twist (6,) by which the pose was corrected.
+    """Correct the pose ``D`` and its ``motion`` by a frame, in place; returns the twist (6,) of the correction.
+
+    ``compared``: residuals (k, 2) and Jacobian, from `compare`.
+    ``used`` (k,): markers to use.
     """
     (twist, rate, covariance), (left, J) = motion, compared
     n = FREEDOMS
@@ -429,15 +437,17 @@ def fold_frame(
 
 
 FITS = 40
-"""Rounds of least squares that find a target whose shape is known."""
+"""Least-squares iterations to find a target of known shape."""
 FOUND_REST_PX = 3.0
-"""What they may leave, rms."""
+"""Largest residual of a target that counts as found, rms [px]."""
 
 
 def find_stated(
     basis: FloatArray, arrays: ModelArrays, points: FloatArray, sights: FloatArray, seen: FloatArray
 ) -> tuple[FloatArray, float]:
-    """As `find_pose`, of a target that may have turned anyhow: in a metric frame from where cameras see it together."""
+    """`find_pose` for a target with any orientation: in a metric frame, from the points triangulated by several
+    cameras.
+    """
     start = np.eye(4)
     if arrays.to_euclidean is not None:
         there, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
@@ -447,7 +457,7 @@ def find_stated(
         before, now = before[both], now[both]
         try:
             start = np.linalg.inv(H) @ similarity_from_points(before, now, scaled=False) @ H
-        except GeometryError:  # too few by two cameras, or on a line: from where it was
+        except GeometryError:  # too few by two cameras, or on a line: from its previous pose
             start = np.eye(4)
     found: tuple[FloatArray, float] = find_pose(
         basis, arrays.matrices, np.ascontiguousarray(start), points, sights, seen
@@ -461,8 +471,9 @@ def find_pose(
     seen: FloatArray,
 ) -> tuple[FloatArray, float]:  # fmt: skip
     """The displacement (4, 4) of ``points`` (k, 4) that explains ``sights`` (c, k, 2), where ``seen`` (c, k), from a
-    ``start`` (4, 4) on, and what it leaves [px] rms. Least squares without a start nearby ends in a wrong one: of
-    points that turned by 60 degrees and more.
+    ``start`` (4, 4), and its residual [px] rms.
+
+    Least squares from a distant start converges to a wrong pose: for rotations of 60 degrees and more.
     """
     D = start.copy()
     weights = np.repeat(seen.copy().reshape(-1), 2)
@@ -487,8 +498,8 @@ def find_pose(
 def jumped(
     basis: FloatArray, points: FloatArray, D: FloatArray, view: View
 ) -> tuple[FloatArray, float, float]:
-    """The pose (4, 4) that explains a frame best, from ``D`` on; by how much [px] rms it moves the markers, and what
-    rms [px] it leaves. Arguments as of `compare`.
+    """The pose (4, 4) that explains a frame best, starting at ``D``; the displacement of the markers [px] rms, and the
+    residual [px] rms. Arguments as in `compare`.
     """
     matrix, carrier, sights, seen = view
     before = transform_points(carrier, transform_points(D, points))
@@ -515,7 +526,9 @@ def jumped(
 def pixel_rates(
     basis: FloatArray, twist: FloatArray, matrices: FloatArray, carrier: FloatArray, points: FloatArray
 ) -> FloatArray:
-    """Pixel velocities (c, k, 2) [px/s] of ``points`` (k, 4), where they are now, that move with a ``twist`` (6,)."""
+    """Pixel velocities (c, k, 2) [px/s] of ``points`` (k, 4), at their current positions, that move with a ``twist``
+    (6,).
+    """
     J = image_jacobian(seen_through(basis, carrier), matrices, transform_points(carrier, points))
     rates = np.zeros(J.shape[:3])
     for c in range(J.shape[0]):
@@ -530,8 +543,8 @@ def pixel_rates(
 def find_shape(
     matrices: FloatArray, sights: FloatArray, seen: FloatArray, plane: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that two cameras or more show, and which these
-    are (k,) 1 or 0.
+    """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that are seen by two or more cameras, and which
+    these are (k,) 1 or 0.
     """
     points, ok = triangulate(matrices, sights, seen, 5)
     known = np.zeros(points.shape[0])

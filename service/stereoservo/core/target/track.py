@@ -1,10 +1,10 @@
-"""The target body from frame to frame: found, followed, told apart from what else may have moved, and carried on
+"""Tracking of the target body from frame to frame: detection, tracking, distinction from other motions, and prediction
 through drop-outs.
 
-A frame is compared with the pose that the motion predicts at its shutter. What the motion does not explain in one
-camera, while another one agrees, is that camera's; what no camera explains is the target's own, where its speed can
-have brought it there, and else waits for the watch over the model: a joint zero or a marker that it names is not
-followed as a motion of the target.
+A frame is compared with the pose predicted by the motion at its shutter time. A deviation in one camera, while another
+one agrees, is attributed to that camera. A deviation in all cameras is attributed to the target, if its speed makes
+that possible; otherwise the decision is left to the model monitor: if it names a joint zero or a marker, the deviation
+is not tracked as a motion of the target.
 """
 
 from __future__ import annotations
@@ -47,36 +47,40 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.ports.devices import CameraObservation
 
 FEWEST = 3
-"""Markers of a frame that says something of the target."""
+"""Least number of markers for a frame to be used."""
 FEWEST_TO_FIND = 5
-"""Markers, two cameras together, by which a target beside the body is found."""
+"""Least number of markers, seen by two cameras together, to find a target that is not the model's body."""
 TOGETHER_NS = 2_000_000
-"""Between frames of several cameras that count as of one moment."""
+"""Largest time between frames of several cameras that count as simultaneous [ns]."""
 LONGEST_GAP_NS = 250_000_000
 FARTHEST_SHARE = 1.0
-"""Between two frames of a camera on whose way its sights at another moment are taken; of that gap, how far beyond."""
+"""Largest interval [ns] between two frames of a camera between which its observations are interpolated to another time;
+and the fraction of that interval by which they are extrapolated.
+"""
 RECENT_NS = 150_000_000
 ROUNDS = 4
-"""Of linearisation, for a frame that shows the target elsewhere than expected."""
+"""Iterations of linearisation, for a frame that shows the target elsewhere than predicted."""
 SMALL_PX = 0.5
-"""rms that needs no explanation: models are not exact."""
+"""Residual rms [px] that needs no explanation: models are not exact."""
 RIGID_PX = 1.0
-"""rms that a motion of the target may leave."""
+"""Largest residual rms [px] of a motion of the target."""
 FOUND_ANEW = 6
-"""Frames in a row that only a jump of the target explains, after which it is found anew."""
+"""Consecutive frames explained only by a jump of the target, after which it is found again."""
 OTHERS = ("joint_zero", "camera_moved", "marker_slipped")
-"""Verdicts of what else may have moved, which the target is not followed into."""
+"""Diagnoses of other motions, which are not tracked as motions of the target."""
 STILL_S, STILL_PX = 0.5, 0.5
-"""A target whose markers moved by less in that time stands."""
+"""A target whose markers moved by less [px] in that time [s] is static."""
 LONGEST_S = 1.0
-"""For so long a target that is not seen is carried on; then it is where that took it."""
+"""Longest time [s] for which the pose of an unseen target is extrapolated; then it is constant."""
 LOST_S = 0.5
-"""After so long it is found anew, wherever it is."""
+"""Time [s] after which it is searched everywhere."""
 IDENTITY = np.eye(4)
 
 
 def take_frame(camera: int, observation: CameraObservation, context: StepContext) -> None:
-    """Follow the target in a frame; a model's body that is the target is then where it was at the shutter."""
+    """Track the target in a frame; if the model's body is the target, its markers are then those at the
+    shutter time.
+    """
     state, arrays = context.state, context.derived.arrays
     body = state.target
     if body is None or arrays is None:
@@ -93,7 +97,7 @@ def take_frame(camera: int, observation: CameraObservation, context: StepContext
         if body.t_ns > 0 and int(frame[2].sum()) >= FEWEST:
             _follow(body, camera, t_ns, frame, carrier, context)
     if body.carried and body.t_ns > 0:
-        if not body.told[camera]:  # what it said before was of a target that stood
+        if not body.told[camera]:  # earlier estimates assumed a static target
             state.cameras[camera].seen_ns[:] = 0
             body.told[camera] = True
         context.derived.room.arrays["marker_points"][:] = _points(body, t_ns)
@@ -102,7 +106,7 @@ def take_frame(camera: int, observation: CameraObservation, context: StepContext
 def _frame_of(
     body: TargetBody, camera: int, observation: CameraObservation, context: StepContext
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What a frame shows of the target, as `target_sights` has it, without markers of a model's body that slipped."""
+    """The target's markers in a frame, as from `target_sights`, without slipped markers of the model's body."""
     arrays = context.derived.arrays
     assert arrays is not None
     sights, variances, seen = target_sights(
@@ -113,7 +117,7 @@ def _frame_of(
 
 
 def present_arrays(context: StepContext) -> ModelArrays | None:
-    """The model with the markers of a body that is the target where they are now."""
+    """The model with the markers of a body that is the target at their current positions."""
     arrays, body = context.derived.arrays, context.state.target
     if arrays is None or body is None or not body.carried or body.t_ns == 0:
         return arrays
@@ -125,7 +129,7 @@ def present_arrays(context: StepContext) -> ModelArrays | None:
 
 
 def pose_at(body: TargetBody, t_ns: int) -> tuple[FloatArray, FloatArray]:
-    """Its displacement (4, 4) and twist (6,) at ``t_ns``."""
+    """Displacement (4, 4) and twist (6,) of the target at ``t_ns``."""
     ahead_s = min((t_ns - body.t_ns) * 1e-9, LONGEST_S)
     found: tuple[FloatArray, FloatArray] = after(
         body.displacement, body.basis, body.twist, body.rate, ahead_s
@@ -139,7 +143,9 @@ def _points(body: TargetBody, t_ns: int) -> FloatArray:
 
 
 def _carrier(body: TargetBody, t_ns: int, state: CoreState, arrays: ModelArrays) -> FloatArray | None:
-    """What is between the target's frame and the cameras' at ``t_ns``; None where the joints then are not known."""
+    """The transformation between the target's frame and the cameras' at ``t_ns``; None if the joints are unknown at
+    that time.
+    """
     if not body.carried:
         return IDENTITY
     block, n = state.block, len(arrays.zero)
@@ -153,8 +159,9 @@ def _carrier(body: TargetBody, t_ns: int, state: CoreState, arrays: ModelArrays)
 def target_sights(
     wanted: IntArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, lens: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of the markers ``wanted`` (k,), what a frame of ``ids`` (s,), raw ``pixels`` (s, 2) with ``covariances``
-    (s, 2, 2) shows: ideal pixels (k, 2), variances of a coordinate (k,) [px²], and which are seen (k,) 1 or 0.
+    """The observations of the markers ``wanted`` (k,) in a frame of ``ids`` (s,), raw ``pixels`` (s, 2) with
+    ``covariances`` (s, 2, 2): ideal pixels (k, 2), variances of a coordinate (k,) [px²], and which are seen (k,) 1 or
+    0.
     """
     ideal, spread, possible = undistort_sights(lens, pixels, covariances)
     k = wanted.size
@@ -169,7 +176,7 @@ def target_sights(
 
 
 def displacements_of(arrays: ModelArrays) -> FloatArray | None:
-    """Twists (6, 4, 4) that span all displacements; None where neither model nor arm knows them."""
+    """Twists (6, 4, 4) that span all displacements; None if neither model nor arm determines them."""
     if arrays.metric_basis is not None:
         return arrays.metric_basis
     return arrays.generators if len(arrays.generators) == FREEDOMS else None
@@ -182,7 +189,7 @@ def _find(
     body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray, carrier: FloatArray,
     arrays: ModelArrays,
 ) -> None:  # fmt: skip
-    """Find the target by this frame, and those before of the other cameras."""
+    """Find the target from this frame, and the previous ones of the other cameras."""
     basis, metric = displacements_of(arrays), arrays.metric_basis is not None
     if basis is None:
         return
@@ -196,7 +203,7 @@ def _find(
     points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
     pixels, _ = project_points(arrays.matrices, points)
     apart = np.sqrt(((pixels - there) ** 2).sum(axis=-1)) * shown
-    # Rays that do not meet: markers that were swapped, or a reflection.
+    # Rays that do not intersect: swapped markers, or a reflection.
     wrong = (known > 0.0) & ~(apart.max(axis=0) <= FOUND_REST_PX)
     known[wrong], shown[:, wrong] = 0.0, 0.0
     if not body.stated:
@@ -218,8 +225,9 @@ def _find(
 def _at_one_moment(
     body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray
 ) -> tuple[int, FloatArray, FloatArray]:
-    """When another camera saw the target last, what the cameras show of it then (c, k, 2) and of which markers (c, k)
-    1 or 0: this one on its way from its frame before to this frame, since the target moves between their shutters.
+    """Time at which another camera saw the target last, the pixels (c, k, 2) of all cameras at that time, and which
+    markers they show (c, k) 1 or 0. Those of this camera are interpolated between its previous frame and this one, or
+    extrapolated, because the target moves between the shutter times.
     """
     there, shown = body.first.copy(), body.first_seen.copy()
     others = shown.max(axis=1) > 0.0
@@ -240,15 +248,15 @@ def _at_one_moment(
 
 
 def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], points: FloatArray) -> None:
-    """The target has these markers alone, at ``points`` (k, 4)."""
+    """Reduce the target to the ``known`` markers, at ``points`` (k, 4)."""
     body.ids, body.points = body.ids[known].copy(), np.ascontiguousarray(points[known])
     body.first, body.first_seen = body.first[:, known].copy(), body.first_seen[:, known].copy()
     body.stated = True
 
 
 def restart(state: CoreState, arrays: ModelArrays, settings: CoreSettings) -> None:
-    """A model is in use from here on: with its cameras found anew, what was followed is found anew, too, and a body
-    that is said to move is followed from the first frame.
+    """Adapt to a new model in use: a tracked target is found again with its cameras, and a body declared to move is
+    tracked from the first frame.
     """
     body = state.target
     if body is None or not state.pending_reanchored:
@@ -262,7 +270,7 @@ def restart(state: CoreState, arrays: ModelArrays, settings: CoreSettings) -> No
 
 
 def tell_untrackable(context: StepContext) -> None:
-    """Warn where the body is said to move, and the model that was taken tells no displacements."""
+    """Warn if the body is declared to move, and the new model determines no displacements."""
     model = context.state.model
     if model is None or context.state.target is not None or not context.settings.body_moves:
         return
@@ -299,7 +307,7 @@ def _follow(
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
     lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
-    if lost and not body.carried:  # one camera alone may take a flat one for its mirror image
+    if lost and not body.carried:  # one camera alone may confuse a flat one with its mirror image
         body.t_ns, body.seen_ns[:], body.odd_ns[:], body.first_seen[:] = 0, 0, 0, 0.0
         _find(body, camera, t_ns, sights, seen, carrier, arrays)
         return
@@ -313,7 +321,7 @@ def _follow(
             body.odd, body.told[:] = 0, False
         elif lost or not _jumps(body, camera, t_ns, (0.0 if stops else moved_px, rest_px), since_s, state):
             return
-        if stops:  # as it never went as fast as it seemed to
+        if stops:  # as its speed was overestimated
             body.twist[:], body.rate[:] = 0.0, 0.0
         body.displacement[:] = found
         left, J = compare(body.basis, body.points, found, view)
@@ -321,7 +329,7 @@ def _follow(
         if used is None:
             return
     if sudden and body.carried:
-        # What the other cameras' newest frames were compared with was not where it is.
+        # The other cameras' newest frames were compared with a wrong pose.
         for sighting in state.watching.sightings:
             sighting.t_ns = 0
     _fold(body, left, J, view, variances, used, ROUNDS if sudden else 1)
@@ -333,8 +341,9 @@ def _fold(
     body: TargetBody, left: FloatArray, J: FloatArray,
     view: View, variances: FloatArray, used: FloatArray, rounds: int,
 ) -> None:  # fmt: skip
-    """Correct the state by a frame, as of `fold_frame`, linearised anew about what comes of it (Bell and Cathey 1993):
-    one large step from far off leaves pixels that nothing explains, and a joint would be blamed for them.
+    """Correct the state by a frame, as in `fold_frame`, with repeated linearisation about the result (Bell and Cathey
+    1993):
+    one large step from far away leaves unexplained residuals, which would be attributed to a joint.
     """
     for _ in range(rounds - 1):
         D, motion = body.displacement.copy(), (body.twist.copy(), body.rate.copy(), body.covariance.copy())
@@ -348,7 +357,7 @@ def _fold(
 def _explained(
     body: TargetBody, left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, gate: float
 ) -> FloatArray | None:
-    """The markers (k,) 1 or 0 that the predicted motion explains; None where it does not explain most of them."""
+    """The markers (k,) 1 or 0 that the predicted motion explains; None if it does not explain most of them."""
     pose = np.ascontiguousarray(body.covariance[:FREEDOMS, :FREEDOMS])
     within, used, count = gate_sights(left, J, variances, seen, pose, gate)
     if used >= FEWEST and 2 * used > count:
@@ -361,14 +370,14 @@ def _explained(
 def _jumps(
     body: TargetBody, camera: int, t_ns: int, jump: tuple[float, float], since_s: float, state: CoreState
 ) -> bool:
-    """Whether a frame that the predicted motion does not explain, is that of a target which went otherwise: by so many
-    pixels, and what that leaves. It may be something else, or not decided yet.
+    """Whether a frame that the predicted motion does not explain shows a target that moved differently: ``jump`` holds
+    the displacement and its residual [px]. It may have another cause, or be undecided yet.
     """
     moved_px, rest_px = jump
     body.odd_ns[camera] = t_ns
     recent = np.maximum(body.seen_ns, body.odd_ns) > t_ns - RECENT_NS
     if bool((body.odd_ns[recent] == 0).any()):
-        return False  # the others agree: it is the camera
+        return False  # the others agree: the camera is the cause
     body.odd += 1
     if not rest_px <= RIGID_PX:
         return False
@@ -384,7 +393,7 @@ def _jumps(
 def _apart_px(
     body: TargetBody, one: FloatArray, other: FloatArray, matrix: FloatArray, carrier: FloatArray
 ) -> float:
-    """How far the images of its markers are apart at two displacements (4, 4), rms [px]."""
+    """Rms distance [px] of the images of its markers at two displacements (4, 4)."""
     here, there = (
         project_points(matrix, transform_points(carrier, transform_points(D, body.points)))[0]
         for D in (one, other)
@@ -402,11 +411,13 @@ def _look_whether_still(body: TargetBody, t_ns: int, matrix: FloatArray, carrier
         body.mark[:], body.mark_ns, body.farthest_px = body.displacement, t_ns, 0.0
 
 
-# -- the watch -------------------------------------------------------------------------------------------------
+# -- model monitor ---------------------------------------------------------------------------------------------
 
 
 def beside_target(verdict: ModelDiagnosis, state: CoreState) -> ModelDiagnosis:
-    """The verdict of a round, where the target that cameras on the arm look at may have moved as it says of them."""
+    """The diagnosis of a round, corrected if the motion that it reports may be one of the target seen by cameras on the
+    arm.
+    """
     body = state.target
     if body is None or not body.carried or body.t_ns == 0 or verdict.kind in ("ok", *OTHERS):
         return verdict
