@@ -65,11 +65,7 @@ def is_fast(path: Path) -> bool:
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """With ``-m fast`` no other test file is even imported."""
-    other = (
-        collection_path.name.startswith("test_")
-        and collection_path.is_file()
-        and not is_fast(collection_path)
-    )
+    other = collection_path.name.startswith("test_") and collection_path.is_file() and not is_fast(collection_path)
     return True if other and config.option.markexpr == "fast" else None
 
 
@@ -124,9 +120,7 @@ def pytest_configure(config: pytest.Config) -> None:
         return
     folder = tempfile.TemporaryDirectory(prefix="ssstalls")
     os.environ[STALLS] = str(Path(folder.name) / "stalls")
-    watch = subprocess.Popen(
-        [sys.executable, machine_stalls.__file__, os.environ[STALLS]], stdin=subprocess.PIPE
-    )
+    watch = subprocess.Popen([sys.executable, machine_stalls.__file__, os.environ[STALLS]], stdin=subprocess.PIPE)
 
     def end() -> None:
         watch.communicate(timeout=10.0)

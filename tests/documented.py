@@ -49,9 +49,7 @@ def directives() -> dict[str, list[Directive]]:
 
 def documented(page: Path) -> list[Documented]:
     """Commands of a page's blocks, in order; the parts of `a && b` one by one."""
-    return commands_of(
-        page.read_text(encoding="utf-8"), directives().get(page.relative_to(ROOT).as_posix(), [])
-    )
+    return commands_of(page.read_text(encoding="utf-8"), directives().get(page.relative_to(ROOT).as_posix(), []))
 
 
 def commands_of(text: str, stated: list[Directive]) -> list[Documented]:

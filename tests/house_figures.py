@@ -21,9 +21,7 @@ from types import FrameType, ModuleType
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-PRODUCT = tuple(
-    ROOT / part for part in ("service/stereoservo", "drivers/stereoservo_drivers", "sim/stereoservo_sim")
-)
+PRODUCT = tuple(ROOT / part for part in ("service/stereoservo", "drivers/stereoservo_drivers", "sim/stereoservo_sim"))
 SERVICE = PRODUCT[0]
 
 STEP_FILES, STEP_HOPS, ACCEPTING_FILES, IMAGE_FILES = 14, 40, 20, 24
@@ -296,9 +294,7 @@ def _goal_in_pictures(world: Any, law: str) -> Any:
     at = world.marker_positions(world.base + 0.1)
     pixels = {name: world.camera(name, 0.0).image_of(at)[0].tolist() for name in ("left", "right")}
     ids = world.body.ids.tolist()
-    target = FeatureTarget(
-        {name: dict(zip(ids, map(tuple, seen), strict=True)) for name, seen in pixels.items()}
-    )
+    target = FeatureTarget({name: dict(zip(ids, map(tuple, seen), strict=True)) for name, seen in pixels.items()})
     return Goal("00000000-0000-0000-0000-000000000001", target, law=law, gain=0.3)  # type: ignore[arg-type]
 
 
@@ -460,9 +456,7 @@ def _is_verb(path: Path, function: ast.FunctionDef | ast.AsyncFunctionDef) -> bo
         for node in ast.walk(one)
         if isinstance(node, ast.Attribute | ast.Name)
     ]
-    return bool({"cli", "commands"} & set(path.parts)) and any(
-        name.endswith(("Option", "Argument")) for name in names
-    )
+    return bool({"cli", "commands"} & set(path.parts)) and any(name.endswith(("Option", "Argument")) for name in names)
 
 
 def kernel_arguments() -> dict[str, list[str]]:
@@ -482,9 +476,7 @@ def _kernels(tree: ast.AST) -> Iterator[ast.FunctionDef]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef):
             continue
-        decorators = {
-            inner.id for one in node.decorator_list for inner in ast.walk(one) if isinstance(inner, ast.Name)
-        }
+        decorators = {inner.id for one in node.decorator_list for inner in ast.walk(one) if isinstance(inner, ast.Name)}
         if any(name.endswith("kernel") for name in decorators):
             yield node
 
@@ -556,9 +548,7 @@ def _imported_by(nodes: Iterable[ast.AST], known: set[str]) -> set[str]:
 
 def _module_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:
     for node in body:
-        if isinstance(node, ast.Try) or (
-            isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.dump(node.test)
-        ):
+        if isinstance(node, ast.Try) or (isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.dump(node.test)):
             yield from _module_level(node.body)
         else:
             yield node
@@ -600,9 +590,7 @@ def modules_with_law_names() -> list[str]:
     for path in sorted(SERVICE.rglob("*.py")):
         tree = ast.parse(path.read_text())
         texts = {
-            node.value
-            for node in ast.walk(tree)
-            if isinstance(node, ast.Constant) and isinstance(node.value, str)
+            node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
         }
         if any(LAW_NAMES.fullmatch(repr(text)) for text in texts):
             found.append(_name(path))

@@ -35,9 +35,7 @@ def write(folder, given, order):
     )
     if "files_mb" in order and hasattr(data.meta, "update_chunk_settings"):  # format 3.0
         size = order["files_mb"]
-        data.meta.update_chunk_settings(
-            chunks_size=2, data_files_size_in_mb=size, video_files_size_in_mb=size
-        )
+        data.meta.update_chunk_settings(chunks_size=2, data_files_size_in_mb=size, video_files_size_in_mb=size)
     columns = {f"observation.images.{camera}": given[camera] for camera in order["cameras"]}
     columns["observation.state"] = given["state"].astype(np.float32)
     row = 0

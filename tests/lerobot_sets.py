@@ -84,9 +84,7 @@ def rows(number: int, one: Episode, kind: str) -> dict[str, pa.Array]:
 
 def write_video(path: Path, pictures: np.ndarray, fps: float = FPS) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(
-        str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (pictures.shape[2], pictures.shape[1])
-    )
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (pictures.shape[2], pictures.shape[1]))
     for image in pictures:
         video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     video.release()
@@ -132,9 +130,7 @@ def write(folder: Path, version: str, episodes: list[Episode], kind: str = "vide
         about: dict[str, Any] = {"episode_index": np.arange(len(episodes))}
         for c, camera in enumerate(CAMERAS):
             key = f"observation.images.{camera}"
-            about |= {
-                f"videos/{key}/{part}_index": np.zeros(len(episodes), int) for part in ("chunk", "file")
-            }
+            about |= {f"videos/{key}/{part}_index": np.zeros(len(episodes), int) for part in ("chunk", "file")}
             about[f"videos/{key}/from_timestamp"] = begins
             pictures = np.concatenate([one.pictures[c] for one in episodes])
             if kind == "video":

@@ -197,9 +197,7 @@ def _add(
     parts: list[ast.AST],
 ) -> Definition:
     lines = (node.end_lineno or node.lineno) - node.lineno + 1
-    definition = Definition(
-        (module, name), path, node.lineno, lines, scope.mentions(parts), _registered(node)
-    )
+    definition = Definition((module, name), path, node.lineno, lines, scope.mentions(parts), _registered(node))
     product.definitions[definition.key] = definition
     return definition
 
@@ -208,9 +206,7 @@ def _add_class(product: Product, scope: Scope, module: str, path: str, node: ast
     methods = [part for part in node.body if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef)]
     called = [part for part in methods if part.name.startswith("__")]
     rest: list[ast.AST] = [part for part in node.body if part not in methods]
-    owner = _add(
-        product, scope, module, path, node.name, node, [*rest, *called, *node.bases, *node.decorator_list]
-    )
+    owner = _add(product, scope, module, path, node.name, node, [*rest, *called, *node.bases, *node.decorator_list])
     bases = [base for base in node.bases if _last_name(base) not in INTERNAL_BASES]
     own_packages = tuple(PACKAGES)
     owner.foreign_base = any(
@@ -255,9 +251,7 @@ def unreached(product: Product) -> list[Definition]:
         if definition.owner is None and (definition.registered or definition.key[0].startswith(PUBLIC)):
             used.definitions.add(definition.key)
     live: set[Key] = set()
-    while new := {
-        key for key, d in definitions.items() if key not in live and _is_live(d, product, used, live)
-    }:
+    while new := {key for key, d in definitions.items() if key not in live and _is_live(d, product, used, live)}:
         live |= new
         for key in new:
             used.add(definitions[key].mentions)

@@ -30,11 +30,7 @@ def commands(text: str) -> Iterator[tuple[str, bool]]:
     fenced = False
     for line in text.splitlines():
         fenced ^= line.lstrip().startswith("```")
-        block = (
-            re.match(r"(?: {4,})?(?=stereoservo |pip )(.*)", line)
-            if fenced or line.startswith("    ")
-            else None
-        )
+        block = re.match(r"(?: {4,})?(?=stereoservo |pip )(.*)", line) if fenced or line.startswith("    ") else None
         found = [block[1]] if block else re.findall(r"`((?:stereoservo|pip install) [^`]+)`", line)
         for command in found:
             for part in re.split(r"&&|(?<!\|)\|(?!\|)", re.sub(r"(?:\s#\s|\s{2,}#).*", "", command)):
@@ -44,9 +40,7 @@ def commands(text: str) -> Iterator[tuple[str, bool]]:
 
 def examined(command: str, whole: bool) -> str:
     """What is wrong with a command line of a document; empty where nothing is."""
-    words = [
-        word for word in shlex.split(re.sub(r"[\[\]]", "", command)[12:]) if word != "…" and "…" not in word
-    ]
+    words = [word for word in shlex.split(re.sub(r"[\[\]]", "", command)[12:]) if word != "…" and "…" not in word]
     if not words or PLACEHOLDER.fullmatch(words[0]) or words[0].startswith("--"):
         return ""
     group: Any = get_command(app)
@@ -55,9 +49,7 @@ def examined(command: str, whole: bool) -> str:
     if verb is None:
         return f"{command}: no command {words[0]!r}"
     known = {name for parameter in verb.params for name in (*parameter.opts, *parameter.secondary_opts)}
-    unknown = [
-        word for word in words if word.startswith("--") and word.partition("=")[0] not in {*known, "--help"}
-    ]
+    unknown = [word for word in words if word.startswith("--") and word.partition("=")[0] not in {*known, "--help"}]
     if unknown:
         return f"{command}: {words[0]} has no {', '.join(unknown)}"
     if not whole:
@@ -186,6 +178,4 @@ def test_the_site_can_be_built(tmp_path: Path) -> None:
         check=False, cwd=ROOT, capture_output=True, text=True, timeout=240,
     )  # fmt: skip
     assert built.returncode == 0, built.stderr
-    assert "Cell file" in (tmp_path / "site" / "reference" / "cell-file" / "index.html").read_text(
-        encoding="utf-8"
-    )
+    assert "Cell file" in (tmp_path / "site" / "reference" / "cell-file" / "index.html").read_text(encoding="utf-8")

@@ -24,9 +24,7 @@ from stereoservo.ports.devices import CameraDriver, Detector, DriverContext, Joi
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS, find_experiment
 
 PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
-SECTIONS = dict(
-    re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-)
+SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL))
 PLUGINS = {
     "A control law": Law,
     "A joint driver": JointDriver,
@@ -35,9 +33,7 @@ PLUGINS = {
     "A detector": Detector,
 }
 
-OPTIONS: dict[str, dict[str, Any]] = {
-    "A driver of servos on a serial line": {"servo": [{"name": "shoulder", "id": 1}]}
-}
+OPTIONS: dict[str, dict[str, Any]] = {"A driver of servos on a serial line": {"servo": [{"name": "shoulder", "id": 1}]}}
 
 
 def blocks(heading: str) -> list[tuple[str, str]]:

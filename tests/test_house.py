@@ -31,9 +31,7 @@ def test_few_modules_have_one_importer():
 
 def test_importers_are_counted_in_functions_and_as_entry_points(product_of, tmp_path):
     (tmp_path / "pyproject.toml").write_text('[project.entry-points."a"]\nb = "stereoservo.plugin:make"\n')
-    product_of(
-        "one/user.py", "def late():\n    from stereoservo.one import piece\nimport stereoservo.plugin\n"
-    )
+    product_of("one/user.py", "def late():\n    from stereoservo.one import piece\nimport stereoservo.plugin\n")
     product_of("one/piece.py", "")
     product_of("plugin.py", "from stereoservo import shared\n")
     product_of("shared.py", "")
@@ -82,9 +80,7 @@ def test_every_function_but_a_verb_has_its_parameters_counted(product_of):
         f"class One:\n    def few(self, {ten}): ...\n    async def many(self, z, {ten}): ...\n"
         f"def verb(z: TextOption, {ten}): ...\n",
     )
-    others, verbs = (
-        [item.partition(" ")[2] for item in figure.items] for figure in house.parameter_figures()
-    )
+    others, verbs = ([item.partition(" ")[2] for item in figure.items] for figure in house.parameter_figures())
     assert sorted(others) == ["by_name: 11", "many: 11", "many: 11"]
     assert verbs == ["verb: 11"]
 

@@ -61,9 +61,7 @@ def test_what_no_entry_point_reaches_is_found(tree):
 
 
 def test_a_row_keeps_what_it_names_and_a_row_for_nothing_is_found(tree):
-    kept(
-        tree, "| `helpers`, `laws:Law.never` | because | somebody |", "| `laws:chosen` | because | somebody |"
-    )
+    kept(tree, "| `helpers`, `laws:Law.never` | because | somebody |", "| `laws:chosen` | because | somebody |")
     stray, empty = report(tree)
     assert {definition.key[1] for definition in stray} == {"forgotten", "unchosen"}
     assert empty == ["laws:chosen"]

@@ -52,9 +52,7 @@ class CompiledFor(MetadataHookInterface):
 
     def update(self, metadata: dict[str, Any]) -> None:
         metadata["version"] = version("stereoservo")
-        metadata["dependencies"] = [
-            f"{name}=={version(name)}" for name in ("stereoservo", "numba", "llvmlite")
-        ]
+        metadata["dependencies"] = [f"{name}=={version(name)}" for name in ("stereoservo", "numba", "llvmlite")]
 
 
 class Kernels(BuildHookInterface):
@@ -79,18 +77,14 @@ class Kernels(BuildHookInterface):
             return done.stdout
 
         for processor in levels_here():
-            for record in cache.rglob(
-                "compiled-*"
-            ):  # of the level before: nothing is compiled yet for this one
+            for record in cache.rglob("compiled-*"):  # of the level before: nothing is compiled yet for this one
                 record.unlink()
             for command in RUNS:
                 run(processor, "-m", "stereoservo.cli.main", *command)
         packages, record = pickle.loads(run(processor, "-c", PACKED))
         for folder in cache.iterdir():
             if folder.name in packages:
-                shutil.copytree(
-                    folder, packed / packages[folder.name], ignore=shutil.ignore_patterns("compiled-*")
-                )
+                shutil.copytree(folder, packed / packages[folder.name], ignore=shutil.ignore_patterns("compiled-*"))
         (packed / "__init__.py").write_text('"""Compiled kernels of stereoservo."""\n')
         (packed / "compiled.pickle").write_bytes(pickle.dumps(record))
         build_data["force_include"][str(packed)] = "stereoservo_kernels"

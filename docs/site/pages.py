@@ -125,11 +125,7 @@ def _field_texts(struct: type) -> dict[str, str]:
     for node, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
             value = getattr(after, "value", None)
-            if (
-                isinstance(after, ast.Expr)
-                and isinstance(value, ast.Constant)
-                and isinstance(value.value, str)
-            ):
+            if isinstance(after, ast.Expr) and isinstance(value, ast.Constant) and isinstance(value.value, str):
                 texts[node.target.id] = _text(value.value).replace("\n", " ").replace("|", "\\|")
     return texts
 
@@ -172,11 +168,7 @@ def _type_text(kind: Any) -> str:
 def _bounds(kind: Any) -> str:
     """Limits of a number or text."""
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
-    found = [
-        f"{sign} {getattr(kind, key):g}"
-        for key, sign in signs.items()
-        if getattr(kind, key, None) is not None
-    ]
+    found = [f"{sign} {getattr(kind, key):g}" for key, sign in signs.items() if getattr(kind, key, None) is not None]
     if getattr(kind, "pattern", None):
         found.append(f"`{kind.pattern}`".replace("|", "\\|"))
     return f" ({', '.join(found)})" if found else ""
@@ -271,10 +263,7 @@ def codes_page() -> str:
             for code in re.findall(r"`([A-Z][A-Z0-9]*(?:_[A-Z0-9]+)+)`", row[0]):
                 what = " · ".join(cell.strip() for cell in row[1].split("|") if cell.strip())
                 found.append((code, re.sub(r"\]\((?=[a-z-]+\.md)", "](../", what), page.name))
-    lines += [
-        f"| `{code}` | {what} | [{page.removesuffix('.md')}](../{page}) |"
-        for code, what, page in sorted(found)
-    ]
+    lines += [f"| `{code}` | {what} | [{page.removesuffix('.md')}](../{page}) |" for code, what, page in sorted(found)]
     return "\n".join([*lines, ""])
 
 
@@ -323,9 +312,7 @@ def thesis_page() -> str:
     for chapter in sorted(named):
         lines += [f"## {chapter} {CHAPTERS[chapter]}", "", "| equation | code |", "| --- | --- |"]
         for number in sorted(named[chapter]):
-            places = ", ".join(
-                f"`{place.removeprefix('stereoservo.')}`" for place in sorted(named[chapter][number])
-            )
+            places = ", ".join(f"`{place.removeprefix('stereoservo.')}`" for place in sorted(named[chapter][number]))
             lines.append(f"| {chapter}.{number:g} | {places} |")
         lines.append("")
     return "\n".join(lines)

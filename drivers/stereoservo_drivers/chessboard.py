@@ -60,9 +60,7 @@ class ChessboardDetector:
 
     def describe(self) -> DetectorDescription:
         """The ids of all corners."""
-        return DetectorDescription(
-            "chessboard", tuple(range(self.options.columns * self.options.rows)), SIGMA_PX
-        )
+        return DetectorDescription("chessboard", tuple(range(self.options.columns * self.options.rows)), SIGMA_PX)
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
         """The corners in ``frame``; a prior is not used."""
@@ -84,9 +82,7 @@ def find_corners(image: ImageArray, columns: int, rows: int) -> FloatArray | Non
     nearest = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min()) for axis in (0, 1))
     half = int(np.clip(WINDOW_SHARE * nearest, 2, LARGEST_WINDOW))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, CONVERGED)
-    refined = cv2.cornerSubPix(
-        image, grid.reshape(-1, 1, 2).astype(np.float32), (half, half), (-1, -1), criteria
-    )
+    refined = cv2.cornerSubPix(image, grid.reshape(-1, 1, 2).astype(np.float32), (half, half), (-1, -1), criteria)
     grid = np.asarray(refined, dtype=np.float64).reshape(rows, columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if along[0] * down[1] - along[1] * down[0] < 0.0:

@@ -49,9 +49,7 @@ class PacedSuite(Paced):
         return self.make_context(tmp_path)
 
 
-def measure(
-    calls: int, call: Callable[[], Any], before: Callable[[], Any] = lambda: None
-) -> dict[str, float]:
+def measure(calls: int, call: Callable[[], Any], before: Callable[[], Any] = lambda: None) -> dict[str, float]:
     """Median, 99th percentile and maximum [us] of ``calls`` calls, each after an untimed ``before``."""
     times = call_times_us(calls, call, before)
     median, p99 = np.percentile(times, [50, 99])
@@ -104,9 +102,7 @@ class CameraDriverContract(PacedSuite):
         driver.activate()
         return driver
 
-    def collect(
-        self, driver: CameraDriver, context: DriverContext, count: int
-    ) -> list[Frame | CameraObservation]:
+    def collect(self, driver: CameraDriver, context: DriverContext, count: int) -> list[Frame | CameraObservation]:
         """Poll until ``count`` items arrived. Fails the test when they do not come in time."""
         period = 1.0 / driver.describe().rate_hz
         items: list[Frame | CameraObservation] = []
@@ -155,9 +151,7 @@ class CameraDriverContract(PacedSuite):
                 assert isinstance(item, CameraObservation)
                 check_observation(item, description.marker_ids, description.width, description.height)
 
-    def test_stamps_and_numbers_grow_and_are_in_order(
-        self, active: CameraDriver, context: DriverContext
-    ) -> None:
+    def test_stamps_and_numbers_grow_and_are_in_order(self, active: CameraDriver, context: DriverContext) -> None:
         items = self.collect(active, context, self.frames)
         for item in items:
             assert item.t_shutter_ns <= item.t_received_ns <= context.clock.now_ns()
@@ -231,9 +225,7 @@ class CameraDriverContract(PacedSuite):
         assert figures["median_us"] > 0
 
 
-def check_observation(
-    observation: CameraObservation, marker_ids: tuple[int, ...], width: int, height: int
-) -> None:
+def check_observation(observation: CameraObservation, marker_ids: tuple[int, ...], width: int, height: int) -> None:
     """Assert that an observation is well formed: shapes, known and unique ids, pixels inside, covariances
     positive.
     """

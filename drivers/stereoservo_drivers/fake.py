@@ -83,18 +83,12 @@ class FakeJointDriver(SimulatedArm):
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         decoded = decode_options(FakeJointOptions, options, self.driver)
         if decoded.joints and decoded.urdf:
-            raise DriverError(
-                "option", "driver 'fake': joints and urdf both say which arm it is; one is valid"
-            )
+            raise DriverError("option", "driver 'fake': joints and urdf both say which arm it is; one is valid")
         cell = cell_of_context(options, context, self.driver)
         joints, base, robot = cell.robot.joints, cell.base, cell.robot if not decoded.joints else None
         if decoded.joints:
-            joints = tuple(
-                JointSpec(j.name, j.kind, j.min, j.max, j.velocity, j.acceleration) for j in decoded.joints
-            )
-            base = np.clip(
-                np.zeros(len(joints)), [j.min for j in decoded.joints], [j.max for j in decoded.joints]
-            )
+            joints = tuple(JointSpec(j.name, j.kind, j.min, j.max, j.velocity, j.acceleration) for j in decoded.joints)
+            base = np.clip(np.zeros(len(joints)), [j.min for j in decoded.joints], [j.max for j in decoded.joints])
         super().__init__(decoded, context, joints, base, robot)
         self.faults = decoded.faults
         self._reads = 0
@@ -151,9 +145,7 @@ class FakeJointDriver(SimulatedArm):
         """Command velocities (n,). Raises DriverError."""
         self._writes += 1
         if _due(self.faults.fail_write, self._writes):
-            raise DriverError(
-                "connection_lost", f"fake arm: write {self._writes} fails as ordered", retry=True
-            )
+            raise DriverError("connection_lost", f"fake arm: write {self._writes} fails as ordered", retry=True)
         return super().write_velocity(qd)
 
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:

@@ -168,13 +168,7 @@ def _keys(wanted: Any) -> str:
 
 
 def _range(number: Any) -> str:
-    low = (
-        f"from {number.ge:g}"
-        if number.ge is not None
-        else f"above {number.gt:g}"
-        if number.gt is not None
-        else ""
-    )
+    low = f"from {number.ge:g}" if number.ge is not None else f"above {number.gt:g}" if number.gt is not None else ""
     if number.ge is not None and number.le is None:
         return f" of at least {number.ge:g}"
     if number.le is not None:

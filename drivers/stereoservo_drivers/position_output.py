@@ -73,9 +73,7 @@ class PositionOutput:
         self._last = positions.copy()
         return self.orders
 
-    def step(
-        self, velocities: FloatArray, positions: FloatArray, low: FloatArray, high: FloatArray
-    ) -> FloatArray:
+    def step(self, velocities: FloatArray, positions: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
         """Orders after one period at ``velocities`` (n,), of joints at ``positions`` (n,).
 
         ``low``, ``high`` (n,): limits; a joint beyond one is led no further outward.
@@ -110,9 +108,7 @@ class PositionOutput:
         self.offsets = np.where(pushes, np.clip(learnt, low, high), learnt)
         self.offsets = np.clip(self.offsets, -self._largest_offset, self._largest_offset)
 
-    def _release(
-        self, velocities: FloatArray, positions: FloatArray, standing: BoolArray, moves: BoolArray
-    ) -> None:
+    def _release(self, velocities: FloatArray, positions: FloatArray, standing: BoolArray, moves: BoolArray) -> None:
         """Let go of what blocks a joint: what a joint that presses stands off its order is no load.
 
         Not before its load is known: one that sinks under a new load would be let go, too.

@@ -173,9 +173,7 @@ class SimulatedArm:
                 "shape", f"write_velocity() got shape {asked.shape}; this arm takes ({len(self._joints)},)"
             )
         if not np.all(np.isfinite(asked)):
-            raise DriverError(
-                "not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite"
-            )
+            raise DriverError("not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite")
         bank = self._advance()
         now_ns = self._context.clock.now_ns()
         sent, reasons = self.send(bank, now_ns, asked)
@@ -233,9 +231,7 @@ class SimulatedArm:
         timeout_ns = round(self._options.command_timeout_s * 1e9)
         if self._options.drives == "velocity":
             return DriveBank(self._joints, plant, now_ns=now_ns, step_ns=self.step_ns, timeout_ns=timeout_ns)
-        low, high, fastest = np.array(
-            [(j.position_min, j.position_max, j.velocity_max) for j in self._joints]
-        ).T
+        low, high, fastest = np.array([(j.position_min, j.position_max, j.velocity_max) for j in self._joints]).T
         period_ns = round(1e9 / self._options.rate_hz)
         largest = np.array([LOAD_OFFSET[joint.kind] for joint in self._joints])
         output = PositionOutput(LEAD_S * fastest, largest, fastest, period_ns * 1e-9)
@@ -264,15 +260,11 @@ class SimulatedArm:
         shared = self._context.services.get("world")
         if shared is not None:
             if not isinstance(shared, TrueJointHistory) or shared.joints != len(self._joints):
-                raise DriverError(
-                    "world", f"services['world'] must be a JointHistory of {len(self._joints)} joints"
-                )
+                raise DriverError("world", f"services['world'] must be a JointHistory of {len(self._joints)} joints")
             return shared
         path = self._context.runtime_dir / FILE_NAME
         try:
-            return TrueJointHistory.create(
-                path, len(self._joints), now_ns=now_ns, capacity=self._options.history
-            )
+            return TrueJointHistory.create(path, len(self._joints), now_ns=now_ns, capacity=self._options.history)
         except HistoryError as error:
             raise DriverError("history", str(error), path=str(path)) from error
 
@@ -285,16 +277,12 @@ def cell_of_context(arm: Mapping[str, Any], context: DriverContext, driver: str)
         raise DriverError("option", f"driver {driver!r}: {error}") from error
 
 
-def _start(
-    driver: str, joints: tuple[JointSpec, ...], base: FloatArray, start: Mapping[str, Any]
-) -> FloatArray:
+def _start(driver: str, joints: tuple[JointSpec, ...], base: FloatArray, start: Mapping[str, Any]) -> FloatArray:
     names = [joint.name for joint in joints]
     positions = base.copy()
     for name, value in start.items():
         if name not in names:
-            raise DriverError(
-                "option", f"driver {driver!r}: start: no joint {name!r}; joints: {', '.join(names)}"
-            )
+            raise DriverError("option", f"driver {driver!r}: start: no joint {name!r}; joints: {', '.join(names)}")
         positions[names.index(name)] = value
     for joint, value in zip(joints, positions, strict=True):
         if not joint.position_min <= value <= joint.position_max:

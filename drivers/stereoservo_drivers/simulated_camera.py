@@ -108,9 +108,7 @@ class SimulatedCamera:
         try:
             self.camera = self.cell.camera(view, options.k1, options.moved)
         except KeyError as error:
-            raise DriverError(
-                "option", f"driver {self.driver!r}: view: {error.args[0]}", view=view
-            ) from error
+            raise DriverError("option", f"driver {self.driver!r}: view: {error.args[0]}", view=view) from error
         except ValueError as error:
             raise DriverError("option", f"driver {self.driver!r}: moved: {error}") from error
         self._place = self._given = options.moved
@@ -192,9 +190,7 @@ class SimulatedCamera:
 
     def configure(self) -> None:
         """Set up the camera, also after :meth:`close`; the arm may start later. Raises DriverError."""
-        self._life.require(
-            "configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED
-        )
+        self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED)
         self._life.state = LifecycleState.CONFIGURED
 
     def activate(self) -> None:

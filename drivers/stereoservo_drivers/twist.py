@@ -82,9 +82,7 @@ class _Posture(NamedTuple):
 class SimulatedController:
     """A :class:`CartesianArm` over a simulated arm. What it tells is the kinematics of its encoders' readings."""
 
-    def __init__(
-        self, options: TwistOptions, inner: SimulatedArm, robot: Robot, context: DriverContext
-    ) -> None:
+    def __init__(self, options: TwistOptions, inner: SimulatedArm, robot: Robot, context: DriverContext) -> None:
         self._inner, self._robot, self._clock = inner, robot, context.clock
         self._tool = options.tool.matrix
         self._frame, self._speeds = options.frame, options.speeds
@@ -179,9 +177,7 @@ class SimulatedController:
             self._protect("near a singularity of the arm")
             return 0.0
         rates = vt.T @ ((u.T @ self._at) / values)
-        beyond = ((q > self._high - LIMIT_MARGIN) & (rates > 0)) | (
-            (q < self._low + LIMIT_MARGIN) & (rates < 0)
-        )
+        beyond = ((q > self._high - LIMIT_MARGIN) & (rates > 0)) | ((q < self._low + LIMIT_MARGIN) & (rates < 0))
         if beyond.any():
             self._protect(f"joint {self._robot.joint_names[int(np.argmax(beyond))]} of the arm at its limit")
             return 0.0
@@ -225,12 +221,8 @@ class TwistJointDriver(CartesianJointDriver):
             self.driver, limits_of(decoded, cell), rate_hz=decoded.rate_hz, timeout_s=decoded.command_timeout_s,
             budget_us=inner.call_budget_us + CONTROLLER_US, home=tuple(home.tolist()), simulated=True,
         )  # fmt: skip
-        description = msgspec.structs.replace(
-            description, auxiliary=decoded.auxiliary, notes=cell.robot.notes
-        )
-        super().__init__(
-            SimulatedController(decoded, inner, cell.robot, context), description, attitude, decoded.frame
-        )
+        description = msgspec.structs.replace(description, auxiliary=decoded.auxiliary, notes=cell.robot.notes)
+        super().__init__(SimulatedController(decoded, inner, cell.robot, context), description, attitude, decoded.frame)
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
         """Order auxiliary joints and outputs, as `SimulatedArm`."""

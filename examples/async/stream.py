@@ -28,9 +28,7 @@ def look(cell: Client) -> Seen:
 
 
 def moved(seen: Seen, shift: float) -> FeatureTarget:
-    return FeatureTarget(
-        {c: {m: (u + shift, v) for m, (u, v) in markers.items()} for c, markers in seen.items()}
-    )
+    return FeatureTarget({c: {m: (u + shift, v) for m, (u, v) in markers.items()} for c, markers in seen.items()})
 
 
 async def main() -> None:

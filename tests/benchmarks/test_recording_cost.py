@@ -82,9 +82,7 @@ def test_rounding_states_no_less_noise_and_keeps_covariances_definite() -> None:
     scales = 10.0 ** rng.uniform(-4, 1, (k, 1, 1))
     roots: FloatArray = rng.normal(size=(k, 2, 2)) * scales
     covariances = roots @ roots.transpose(0, 2, 1)
-    observation = CameraObservation(
-        "left", 1, 2, 3, np.arange(k), rng.uniform(-10, 4000, (k, 2)), covariances
-    )
+    observation = CameraObservation("left", 1, 2, 3, np.arange(k), rng.uniform(-10, 4000, (k, 2)), covariances)
     found = rounded(observation)
     assert np.abs(found.pixels - observation.pixels).max() <= 2.0**-13
     variances = covariances[:, (0, 1), (0, 1)]

@@ -59,9 +59,7 @@ def measured(cell, positions, rng, sigma=0.1, lost=0.2):
     keep = rng.random(exact.shape[:3]) >= lost
     camera, stop, marker = np.nonzero(keep)
     pixels = exact[keep] + rng.normal(0, sigma, (len(camera), 2))
-    return Measurements(
-        positions - cell.home, camera, stop, marker, pixels, np.full(len(camera), sigma)
-    ), exact[keep]
+    return Measurements(positions - cell.home, camera, stop, marker, pixels, np.full(len(camera), sigma)), exact[keep]
 
 
 def random_frame(stratum, rng):
@@ -87,9 +85,7 @@ def test_prediction_is_the_euclidean_truth_in_any_frame(arms, name, seed):
 
 
 @pytest.mark.parametrize("stratum", ["projective", "affine", "metric"])
-@pytest.mark.parametrize(
-    ("name", "lenses"), [("rx90", "radial_centre"), ("mixed", "none"), ("mixed", "radial")]
-)
+@pytest.mark.parametrize(("name", "lenses"), [("rx90", "radial_centre"), ("mixed", "none"), ("mixed", "radial")])
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=4, deadline=None)
 def test_jacobian_is_the_derivative(arms, name, lenses, stratum, seed):
@@ -106,9 +102,9 @@ def test_jacobian_is_the_derivative(arms, name, lenses, stratum, seed):
         h = 1e-6
         step = np.zeros(charts.size)
         step[k] = h
-        numeric = (
-            residuals(rig_at(rig, charts, x + step), data) - residuals(rig_at(rig, charts, x - step), data)
-        ) / (2 * h)
+        numeric = (residuals(rig_at(rig, charts, x + step), data) - residuals(rig_at(rig, charts, x - step), data)) / (
+            2 * h
+        )
         assert np.abs(analytic[:, k] - numeric).max() < 2e-6 * max(1.0, np.abs(numeric).max())
 
 
@@ -160,16 +156,12 @@ def test_blocks_and_chunks_add_up_to_the_whole_jacobian(arms, stratum):
     factor = arrow_factor(rig, charts, data)
     assert np.allclose(leverages(rig, charts, data, factor), (hat**2).sum(axis=(1, 2)), rtol=1e-6)
     # Columns beside, and columns left out: what is then left of the rest is its part across the others.
-    more = np.vstack(
-        [rng.normal(size=(2 * len(data.pixels), 2)), np.zeros((len(dense) - 2 * len(data.pixels), 2))]
-    )
+    more = np.vstack([rng.normal(size=(2 * len(data.pixels), 2)), np.zeros((len(dense) - 2 * len(data.pixels), 2))])
     other = np.column_stack([more, dense[:, -1]])
     q, _ = np.linalg.qr(dense[:, :-1] / sizes[:-1])
     across = other - q @ (q.T @ other)
     last = arrow_factor(rig, charts, data, more[: 2 * len(data.pixels)]).core[-3:, -3:]
-    assert np.allclose(
-        last.T @ last, across.T @ across, rtol=1e-9, atol=1e-9 * np.abs(across.T @ across).max()
-    )
+    assert np.allclose(last.T @ last, across.T @ across, rtol=1e-9, atol=1e-9 * np.abs(across.T @ across).max())
     lenses = charts.start(2) + np.arange(9)
     kept = np.delete(dense, lenses, axis=1)
     fixed = factor.without(lenses).dense()

@@ -110,9 +110,7 @@ def test_tails_of_chi_square_are_scipys(freedom):
 def test_noise_raises_no_more_alarms_than_stated():
     """At a chance of 2 % a decision, the alarms of 200 are binomial."""
     cell = rx90()
-    limits = alarm_thresholds(
-        false_alarms_per_hour=72.0, decisions_per_hour=3600.0, cameras=2, markers=14, joints=6
-    )
+    limits = alarm_thresholds(false_alarms_per_hour=72.0, decisions_per_hour=3600.0, cameras=2, markers=14, joints=6)
     alarms = sum(told(cell, seed, limits).kind != "nothing" for seed in range(200))
     assert alarms <= binom.isf(1e-4, 200, 0.02)
 
@@ -159,9 +157,7 @@ def test_a_slipped_marker_is_named():
 
 def _signal(cell, seed, seen_cell):
     """Chi-square of the change itself."""
-    (_, _, innovation, weights), *_ = moment(
-        cell, np.random.default_rng(seed), seen_cell=seen_cell, sigma=0.0
-    )
+    (_, _, innovation, weights), *_ = moment(cell, np.random.default_rng(seed), seen_cell=seen_cell, sigma=0.0)
     return float(((weights[..., None] * innovation) ** 2).sum())
 
 
@@ -212,9 +208,7 @@ def test_a_camera_whose_static_points_stand_has_not_moved():
         assert told(only_left, seed, drift=drift, static=True).kind == "joints"
         moved = bumped(only_left, [0], 5.0, 0.03, rng)
         assert told(only_left, seed, seen_cell=moved, static=True).kind == "camera"
-    assert told(
-        cell, 1, seen_cell=bumped(cell, [0], 5.0, 0.03, np.random.default_rng(1)), mask=mask
-    ).kind in (
+    assert told(cell, 1, seen_cell=bumped(cell, [0], 5.0, 0.03, np.random.default_rng(1)), mask=mask).kind in (
         "camera",
         "joints",
     )
@@ -225,9 +219,7 @@ def test_few_markers_show_a_shift_of_the_image():
     mask = np.zeros((2, 14))
     mask[0, :6], mask[1, 2:5] = 1.0, 1.0
     for seed in range(20):
-        found = told(
-            cell, seed, mask=mask, seen_cell=bumped(cell, [1], 5.0, 0.0, np.random.default_rng(seed))
-        )
+        found = told(cell, seed, mask=mask, seen_cell=bumped(cell, [1], 5.0, 0.0, np.random.default_rng(seed)))
         assert found.kind in ("camera", "unexplained")
         assert (found.cause.kind, found.cause.index, found.cause.size) == ("camera", 1, 2)
 

@@ -122,9 +122,7 @@ def rotation(rng: np.random.Generator, angle: float, shift: float) -> np.ndarray
     return pose
 
 
-def injected(
-    cell: SyntheticCell, cause: str, rng: np.random.Generator
-) -> tuple[SyntheticCell, str, np.ndarray, str]:
+def injected(cell: SyntheticCell, cause: str, rng: np.random.Generator) -> tuple[SyntheticCell, str, np.ndarray, str]:
     """A cell changed by a cause of random size and place; its subject, drift of the joints, kind."""
     n = len(cell.kinds)
     drift = np.zeros(n)
@@ -159,9 +157,7 @@ def checked(
     model = cell.model(seed)
     changed, subject, drift, kind = injected(cell.cell, cause, rng)
     stops = cell.stops()
-    data: TrialData = changed.trials(
-        noise, rng, positions=(stops + drift, np.full(len(stops), -1)), stated=SIGMA
-    )
+    data: TrialData = changed.trials(noise, rng, positions=(stops + drift, np.full(len(stops), -1)), stated=SIGMA)
     data = msgspec.structs.replace(data, positions=stops)
     for _ in range(gross):
         where = rng.integers(2), rng.integers(len(stops)), rng.integers(len(model.marker_ids))
@@ -221,9 +217,7 @@ def test_nothing_injected_raises_no_alarm(seeds: int) -> None:
     assert len(alarms) <= binom.isf(0.01, seeds, 0.01), alarms
     # The chi-square is one: its mean over the seeds within 4 deviations.
     count = reports[0].measurements
-    assert np.mean([r.chi2 for r in reports]) == pytest.approx(
-        count, abs=4 * np.sqrt(2 * count / len(reports))
-    )
+    assert np.mean([r.chi2 for r in reports]) == pytest.approx(count, abs=4 * np.sqrt(2 * count / len(reports)))
     assert all("model holds" in report.message for report in reports if report.status == "holds")
 
 
@@ -264,9 +258,7 @@ def test_two_causes_are_both_named() -> None:
     drift = np.array([0, 0, 0.01, 0, 0, 0])
     stops = cell.stops()
     data = slipped.trials(SIGMA, rng, positions=(stops + drift, np.full(7, -1)))
-    report = check_model_holds(
-        cell.model(3), msgspec.structs.replace(data, positions=stops), made_from=cell.made_from
-    )
+    report = check_model_holds(cell.model(3), msgspec.structs.replace(data, positions=stops), made_from=cell.made_from)
     assert {(c.kind, c.subject) for c in report.causes} == {("marker", marker), ("joint", "j3")}
     assert report.status == "recalibrate"
 
@@ -277,9 +269,7 @@ def test_a_small_significant_change_drifts_and_is_not_yet_a_reason() -> None:
     drift = np.array([0, 0, 2e-4, 0, 0, 0])
     stops = cell.stops()
     data = cell.cell.trials(SIGMA, rng, positions=(stops + drift, np.full(7, -1)))
-    report = check_model_holds(
-        cell.model(3), msgspec.structs.replace(data, positions=stops), made_from=cell.made_from
-    )
+    report = check_model_holds(cell.model(3), msgspec.structs.replace(data, positions=stops), made_from=cell.made_from)
     assert report.status == "drifting"
     assert "below the limit of 0.25 px" in report.message
 

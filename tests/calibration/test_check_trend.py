@@ -19,9 +19,7 @@ PX_PER_RAD = 400.0
 
 
 def report(day: float, x: dict[str, float], sigma: float, epoch: int = 1) -> CheckReport:
-    drifts = tuple(
-        Drift("joint", name, (value,), (sigma**-2,), abs(value) * PX_PER_RAD) for name, value in x.items()
-    )
+    drifts = tuple(Drift("joint", name, (value,), (sigma**-2,), abs(value) * PX_PER_RAD) for name, value in x.items())
     return CheckReport(
         "holds", "", epoch, 7, 400, 400.0, 400.0, 1.0, 0.05, 0.25, {}, {}, {}, (), drifts, 0,
         (START + timedelta(days=day)).isoformat(),
@@ -31,9 +29,7 @@ def report(day: float, x: dict[str, float], sigma: float, epoch: int = 1) -> Che
 def checks(speed: float, sigma: float, seed: int, count: int = 8, every: float = 15.0) -> list[CheckReport]:
     rng = np.random.default_rng(seed)
     return [
-        report(
-            every * k, {f"j{j}": (j == 2) * speed * every * k + rng.normal(0, sigma) for j in range(6)}, sigma
-        )
+        report(every * k, {f"j{j}": (j == 2) * speed * every * k + rng.normal(0, sigma) for j in range(6)}, sigma)
         for k in range(count)
     ]
 

@@ -90,9 +90,7 @@ def assert_efficient(found, share=0.01):
     low, high = chi2_distribution.ppf([share / 2, 1 - share / 2], freedom)
     for key in ("squares", "bound"):
         total = sum(fit[key] for fit in found)
-        print(
-            f"{key}: {total / freedom:.4f} of {freedom} freedoms, {low / freedom:.4f} to {high / freedom:.4f}"
-        )
+        print(f"{key}: {total / freedom:.4f} of {freedom} freedoms, {low / freedom:.4f} to {high / freedom:.4f}")
         assert low < total < high, (key, total / freedom)
     for key in ("total", "joints", "cameras"):
         z = np.concatenate([np.atleast_1d(fit[key]) for fit in found])
@@ -116,9 +114,7 @@ def test_estimates_are_efficient_over_200_seeds():
     for name, group in [(name, found[k::7]) for k, name in enumerate(ARMS)]:
         ratio = sum(fit["squares"] for fit in group) / sum(fit["freedom"] for fit in group)
         lenses = sum(fit["lens"] != "none" for fit in group)
-        print(
-            f"{name}: {ratio:.4f}, lenses in {lenses} of {len(group)}, {sorted({f['stratum'] for f in group})}"
-        )
+        print(f"{name}: {ratio:.4f}, lenses in {lenses} of {len(group)}, {sorted({f['stratum'] for f in group})}")
     assert_efficient(found)
 
 

@@ -61,9 +61,7 @@ def test_sizes_that_lie_are_refused_before_anything_is_allocated(size: int) -> N
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         header = io.BytesIO()
-        np.lib.format.write_array_header_1_0(
-            header, {"descr": "<f8", "fortran_order": False, "shape": (size,)}
-        )
+        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (size,)})
         archive.writestr("a.npy", header.getvalue() + b"\0" * 8)
     with pytest.raises(ValueError, match="is said to have shape"):
         read_archive(buffer.getvalue(), 1 << 30)

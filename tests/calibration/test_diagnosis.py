@@ -208,9 +208,7 @@ def test_sign_and_common_prismatic_scale_are_absorbed():
     positions = trials.positions * [2.0, -1.0, 1.0, 1.0]
     result = fit_model(changed(trials, positions=positions), epoch=1)
     held_out = cell.held_out(rng, 30)
-    expected = expected_pixels(
-        projective_rig(result.model), held_out * [2.0, -1.0, 1.0, 1.0] - result.model.zero
-    )
+    expected = expected_pixels(projective_rig(result.model), held_out * [2.0, -1.0, 1.0, 1.0] - result.model.zero)
     assert np.sqrt(np.mean((expected - cell.pixels(held_out)) ** 2)) < 0.6 * SIGMA
 
 
@@ -264,17 +262,13 @@ def test_pure_translation_along_the_optical_axis_works():
 def test_no_baseline(baseline, body):
     K, poses = synthetic.stereo_pair()
     poses = np.array([synthetic.rotation("y", -4), synthetic.rotation("y", 4) @ translation(-baseline, 0, 0)])
-    cell = replace(
-        arm("rx90", flat_plate() if body else None), intrinsics=K, poses=poses, ranges=np.full(6, 0.15)
-    )
+    cell = replace(arm("rx90", flat_plate() if body else None), intrinsics=K, poses=poses, ranges=np.full(6, 0.15))
     error = refusal(cell.trials(SIGMA, np.random.default_rng(11)))
     assert error.code == "no_baseline", error.message
     assert error.data["parallax_sigmas"] < 5
 
 
-@pytest.mark.parametrize(
-    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_two_robots_left_and_right(seed):
     one, other = arm("rx90"), arm("offset_wrist")
     rng = np.random.default_rng(20 + seed)
@@ -384,9 +378,7 @@ def test_a_stop_reported_late_is_an_outlier_with_a_name(name, seed):
     assert_true(result, cell, rng)
 
 
-@pytest.mark.parametrize(
-    ("joint", "kind"), [(0, "revolute"), pytest.param(2, "prismatic", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("joint", "kind"), [(0, "revolute"), pytest.param(2, "prismatic", marks=pytest.mark.slow)])
 def test_wrong_kind_is_named(joint, kind):
     _, trials, _ = cell_and_trials("mixed", 15)
     kinds = (*trials.joint_kinds[:joint], kind, *trials.joint_kinds[joint + 1 :])

@@ -46,9 +46,7 @@ def test_six_revolute_joints_at_the_noise_floor(arms, sigma):
     rng = np.random.default_rng(11)
     cell = arms["rx90"]()
     stages = []
-    result = fit_model(
-        cell.trials(sigma, rng), epoch=7, created="today", progress=lambda name, f: stages.append(f)
-    )
+    result = fit_model(cell.trials(sigma, rng), epoch=7, created="today", progress=lambda name, f: stages.append(f))
     model, report = result.model, result.report
     assert model.stratum == "metric"
     assert model.statistics.parameters == 81
@@ -72,9 +70,7 @@ def test_model_in_the_canonical_frame(arms):
     model = fit_model(trials, epoch=1).model
     check_model(model)
     normaliser = np.array([[1 / 320, 0, -319.5 / 320], [0, 1 / 320, -239.5 / 320], [0, 0, 1]])
-    assert np.allclose(
-        model.cameras[0].matrix, np.hstack([np.linalg.inv(normaliser), np.zeros((3, 1))]), atol=1e-9
-    )
+    assert np.allclose(model.cameras[0].matrix, np.hstack([np.linalg.inv(normaliser), np.zeros((3, 1))]), atol=1e-9)
     assert np.allclose(model.marker_points @ model.plane_at_infinity, 1.0, atol=1e-12)
     assert (model.marker_points[:, 2] > 0).all()
     assert all((model.marker_points @ camera.matrix[2] > 0).all() for camera in model.cameras)

@@ -113,10 +113,7 @@ def test_joint_columns_are_derivatives(linearised):
     for joint in (0, 5):
         shift = np.zeros(6)
         shift[joint] = step
-        ends = [
-            residuals(linearised.rig, replace(data, offsets=data.offsets + sign * shift))
-            for sign in (1.0, -1.0)
-        ]
+        ends = [residuals(linearised.rig, replace(data, offsets=data.offsets + sign * shift)) for sign in (1.0, -1.0)]
         expected = (ends[0] - ends[1]) / (2.0 * step)
         assert np.allclose(joint_columns(linearised.rig, data)[:, joint], expected, rtol=1e-5, atol=1e-3)
 
@@ -219,9 +216,7 @@ def test_the_presets_calibrate_and_are_checked(name):
     exact = msgspec.structs.replace(result.model, joint_accuracy=None)
     assert check_model_holds(exact, check).status == "recalibrate"
     drift = 0.02 * (np.arange(6) == 2)
-    drifted = check_model_holds(
-        result.model, msgspec.structs.replace(check, positions=check.positions + drift)
-    )
+    drifted = check_model_holds(result.model, msgspec.structs.replace(check, positions=check.positions + drift))
     assert [(cause.kind, cause.subject) for cause in drifted.causes] == [("joint", "j3")]
 
 

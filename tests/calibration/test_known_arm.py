@@ -57,9 +57,7 @@ def trials_at(poses, pixels, sigma=SIGMA):
 def disturbed(poses, rng, turn=2e-3, shift=3e-4):
     """Poses as they are where these are reported: a robot's own errors, about its hand."""
     there = poses.copy()
-    there[:, :3, :3] = (
-        Rotation.from_rotvec(rng.normal(0, turn, (len(poses), 3))).as_matrix() @ poses[:, :3, :3]
-    )
+    there[:, :3, :3] = Rotation.from_rotvec(rng.normal(0, turn, (len(poses), 3))).as_matrix() @ poses[:, :3, :3]
     there[:, :3, 3] += rng.normal(0, shift, (len(poses), 3))
     return there
 

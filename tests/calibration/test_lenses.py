@@ -220,19 +220,14 @@ def test_global_search_finds_each_cameras_lens():
     pixels[wrong] += rng.uniform(-40, 40, (int(wrong.sum()), 2))
     found = epipolar_lenses(msgspec.structs.replace(trials, pixels=pixels))
     assert np.abs(found[:, 0] - cell.lenses[:, 0]).max() < 0.005
-    assert np.array_equal(
-        epipolar_lenses(wide_angle(0.0).trials(0.05, np.random.default_rng(58)))[:, 0], [0, 0]
-    )
+    assert np.array_equal(epipolar_lenses(wide_angle(0.0).trials(0.05, np.random.default_rng(58)))[:, 0], [0, 0])
 
 
 def test_undistorted_trials_are_what_pinholes_see():
     cell = wide_angle(-0.3)
     trials = cell.trials(0.0, np.random.default_rng(0), stops=3, stated=0.1)
     ideal = undistorted(trials, cell.lenses)
-    assert (
-        np.abs(ideal.pixels - replace(cell, lenses=straight_lenses(trials)).pixels(trials.positions)).max()
-        < 1e-8
-    )
+    assert np.abs(ideal.pixels - replace(cell, lenses=straight_lenses(trials)).pixels(trials.positions)).max() < 1e-8
     # Half a pixel to all sides: the area that a raw pixel covers.
     corner = trials.pixels[0, 0, 0]
     around = np.array([undistorted_pixel(cell.lenses[0], corner + d) for d in ((1e-3, 0), (0, 1e-3), (0, 0))])
@@ -264,9 +259,7 @@ def test_straight_lines_as_priors():
     }
     alone, helped = fit_model(trials, epoch=1), fit_model(trials, epoch=1, lens_priors=priors)
     assert_at_the_floor(helped)
-    for before, after, prior in zip(
-        alone.report.cameras, helped.report.cameras, priors.values(), strict=True
-    ):
+    for before, after, prior in zip(alone.report.cameras, helped.report.cameras, priors.values(), strict=True):
         assert (np.array(after.lens_std) < np.array(before.lens_std)).all()
         assert (np.array(after.lens_std) < np.sqrt(np.diag(prior.covariance))).all()
     values, covariance = propagated(helped.model, camera_angles)

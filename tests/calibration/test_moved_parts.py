@@ -122,8 +122,6 @@ def test_a_calibration_tells_no_false_cause(kind, seeds):
     cell = synthetic.rx90()
     for seed in range(seeds):
         rng = np.random.default_rng([seed, 3])
-        trials, camera, stop = bumped_trials(
-            cell, cell.trials(SIGMA, rng, int(rng.integers(7, 11))), kind, rng
-        )
+        trials, camera, stop = bumped_trials(cell, cell.trials(SIGMA, rng, int(rng.integers(7, 11))), kind, rng)
         told = refusal_of(trials)
         assert told is None or not false_cause(told.code, told.data, kind, camera), (seed, stop, told.message)

@@ -90,9 +90,7 @@ def in_random_frame(model, rng):
     return msgspec.structs.replace(
         model,
         generators=frame @ model.generators @ back,
-        cameras=tuple(
-            msgspec.structs.replace(camera, matrix=camera.matrix @ back) for camera in model.cameras
-        ),
+        cameras=tuple(msgspec.structs.replace(camera, matrix=camera.matrix @ back) for camera in model.cameras),
         marker_points=points / (points @ plane)[:, None],
         plane_at_infinity=plane,
         projective_to_euclidean=None if upgrade is None else upgrade @ back,
@@ -151,9 +149,7 @@ def test_the_covariance_of_a_displacement_is_the_bound_of_cramer_and_rao():
     squares = []
     for seed in range(30):
         rng = np.random.default_rng(100 + seed)
-        found = relocalize(
-            model, sights(moved, joints, rng), ("cam1",), epoch=2, workspace=there, limit_px=9.0
-        )
+        found = relocalize(model, sights(moved, joints, rng), ("cam1",), epoch=2, workspace=there, limit_px=9.0)
         squares.append((errors(found.model, moved, 1, there)[0] ** 2).sum())
         stated = found.predicted_px
     # predicted_px is the largest over axes, markers and configurations: an upper bound of this one's deviation.
@@ -252,9 +248,7 @@ def test_a_rig_that_moved_rigidly_and_cameras_that_moved_each():
         )  # fmt: skip
         assert one.cameras["cam0"].how == "moved_with_rig"
         both = bumped(bumped(cell, [0], 5.0, 0.03, rng), [1], 8.0, 0.02, rng)
-        each = relocalize(
-            exact_model(cell), sights(both, joints, rng), ("cam0", "cam1"), epoch=2, workspace=workspace
-        )
+        each = relocalize(exact_model(cell), sights(both, joints, rng), ("cam0", "cam1"), epoch=2, workspace=workspace)
         for found, truth in ((one, rig), (each, both)):
             for c in (0, 1):
                 assert np.abs(errors(found.model, truth, c, workspace)).max() < 5.0 * found.predicted_px
@@ -269,9 +263,7 @@ def test_without_a_metric_a_camera_is_resected_from_several_poses(stratum):
         model = in_random_frame(exact_model(cell, stratum=stratum), rng)
         moved = bumped(cell, [1], 5.0, 0.03, rng)
         joints = cell.held_out(rng, 4, 0.5)
-        found = relocalize(
-            model, sights(moved, joints, rng), ("cam1",), epoch=2, workspace=joints, limit_px=2.0
-        )
+        found = relocalize(model, sights(moved, joints, rng), ("cam1",), epoch=2, workspace=joints, limit_px=2.0)
         assert found.cameras["cam1"].how == "resected"
         assert np.abs(errors(found.model, moved, 1, joints)).max() < 5.0 * found.predicted_px
         rig = bumped(cell, [1, 0], 5.0, 0.03, rng, together=True)
@@ -321,16 +313,12 @@ def test_what_cannot_be_re_anchored_is_refused_with_what_is_missing():
     assert (few.code, few.data["points"], few.data["minimum"]) == ("too_few_points", 3, 4)
     none = refusal(model, RestObservations(()), ("cam1",))
     assert (none.code, none.data["points"]) == ("too_few_points", 0)
-    vague = refusal(
-        model, sights(moved, joints, rng, change=first(4)), ("cam1",), workspace=cell.held_out(rng, 20)
-    )
+    vague = refusal(model, sights(moved, joints, rng, change=first(4)), ("cam1",), workspace=cell.held_out(rng, 20))
     assert vague.code == "too_uncertain"
     assert vague.data["predicted_px"] > vague.data["limit_px"] == 1.0
     assert "other poses" in vague.message
     flat = rx90(flat_plate())
-    alike = refusal(
-        exact_model(flat, stratum="projective"), sights(flat, joints, rng), ("cam1",), workspace=joints
-    )
+    alike = refusal(exact_model(flat, stratum="projective"), sights(flat, joints, rng), ("cam1",), workspace=joints)
     assert alike.code == "too_few_points"
     resected = refusal(
         exact_model(cell, stratum="projective"),

@@ -92,9 +92,7 @@ def test_a_coarse_model_comes_to_the_truth_by_what_its_covariance_predicts() -> 
     predicted = rms([b for _, b in told]) / rms([a for a, _ in told])
     assert predicted < 0.6
     for k in range(2):  # in the images, and in space
-        assert rms([one[k] for one in after]) / rms([one[k] for one in before]) == pytest.approx(
-            predicted, rel=0.3
-        )
+        assert rms([one[k] for one in after]) / rms([one[k] for one in before]) == pytest.approx(predicted, rel=0.3)
     assert rms([one[0] for one in after]) == pytest.approx(rms([b for _, b in told]), rel=0.25)
 
 
@@ -164,9 +162,7 @@ def test_play_and_ripple_do_not_spoil_a_model(play: bool) -> None:
 
 
 CHANGES: dict[str, Callable[[SyntheticCell], SyntheticCell]] = {
-    "camera": lambda cell: replace(
-        cell, poses=np.array([cell.poses[0], rotation("y", 0.07) @ cell.poses[1]])
-    ),
+    "camera": lambda cell: replace(cell, poses=np.array([cell.poses[0], rotation("y", 0.07) @ cell.poses[1]])),
     "marker": lambda cell: cell.with_body(cell.body + np.eye(len(cell.body))[:, [2]] * (0.002, 0.0, 0.0)),
     "zero": lambda cell: replace(
         cell, links=tuple(rotation("z", 0.2) @ one if k == 2 else one for k, one in enumerate(cell.links))

@@ -88,10 +88,7 @@ def test_points_that_cannot_be_had_are_named():
         "belong together" in notes[1],
     ] == [True] * 4
     riding = msgspec.structs.replace(model, mount="eye_in_hand")
-    assert (
-        with_static_points(riding, StaticObservations((52,), pixels[:, 2:], np.full((2, 1), SIGMA)))[0]
-        is riding
-    )
+    assert with_static_points(riding, StaticObservations((52,), pixels[:, 2:], np.full((2, 1), SIGMA)))[0] is riding
 
 
 def test_trials_carry_static_sights_through_files_and_refuse_bad_ones():

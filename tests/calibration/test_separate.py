@@ -155,16 +155,12 @@ def test_too_few_stops_say_why():
     positions = trials.positions.copy()
     positions[2:9, 4] += np.linspace(0.1, 0.7, 7)
     with pytest.raises(CalibrationError) as caught:
-        trial_stops(
-            msgspec.structs.replace(trials, positions=positions), initial_reconstruction(trials)[1], 0
-        )
+        trial_stops(msgspec.structs.replace(trials, positions=positions), initial_reconstruction(trials)[1], 0)
     assert caught.value.code == "too_few_stops"
     assert caught.value.data["strayed"] >= 5
 
 
-@pytest.mark.parametrize(
-    ("name", "half", "stratum"), [("gantry", 0.003, "affine"), ("mixed", 0.009, "metric")]
-)
+@pytest.mark.parametrize(("name", "half", "stratum"), [("gantry", 0.003, "affine"), ("mixed", 0.009, "metric")])
 def test_strokes_of_millimetres_calibrate_where_the_images_show_them(name, half, stratum):
     cell = getattr(synthetic, name)()
     ranges = np.where([kind == "prismatic" for kind in cell.kinds], half, cell.ranges)
@@ -179,9 +175,7 @@ def test_small_turns_in_noise_calibrate_and_the_text_says_what_helps(seed):
     fit = fit_model(cell.trials(0.5, np.random.default_rng(seed), 9), epoch=1)
     said = assess_fit(fit.model, fit.report)
     assert said.grade == "usable"
-    measure = (
-        r"known to (\d+)% only, 10% needed: larger motions, or (many more|\d+ times as many) stops or frames"
-    )
+    measure = r"known to (\d+)% only, 10% needed: larger motions, or (many more|\d+ times as many) stops or frames"
     loose = re.findall(measure, said.text)
     assert loose
     for percent, more in loose:

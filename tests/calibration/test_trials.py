@@ -32,9 +32,7 @@ def test_round_trip_bit_for_bit(trials, tmp_path):
     save_trials(trials, tmp_path / "trials.npz")
     again = load_trials(tmp_path / "trials.npz")
     for field in ("positions", "trials", "pixels", "sigmas"):
-        assert np.array_equal(
-            getattr(again, field), getattr(trials, field), equal_nan=field in ("pixels", "sigmas")
-        )
+        assert np.array_equal(getattr(again, field), getattr(trials, field), equal_nan=field in ("pixels", "sigmas"))
     for field in ("joint_names", "joint_kinds", "cameras", "marker_ids", "images"):
         assert getattr(again, field) == getattr(trials, field)
     assert not again.visible[0, 3, 2]

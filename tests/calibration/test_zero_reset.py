@@ -126,9 +126,7 @@ def test_a_wrist_that_is_turned_over_does_not_stand_in_for_lost_zeros() -> None:
 
 @pytest.mark.parametrize("make", [rx90, pan_tilt])
 @pytest.mark.parametrize("seeds", [10, pytest.param(25, marks=pytest.mark.slow)])
-def test_drifts_and_predictions_have_their_stated_covariance(
-    make: Callable[[], SyntheticCell], seeds: int
-) -> None:
+def test_drifts_and_predictions_have_their_stated_covariance(make: Callable[[], SyntheticCell], seeds: int) -> None:
     """Models that are off as they say, zeros that drift: normalised squared errors over seeds, at 0.1 %."""
     exact, cell = truth(make), make()
     stops, n = stops_of(cell), len(cell.kinds)

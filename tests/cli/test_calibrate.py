@@ -81,9 +81,7 @@ def test_while_a_daemon_runs_no_model_is_put_beside_its_own(run: Run, tmp_path: 
     assert run("bench", "--trials", trials)[0] == 0
 
 
-def test_the_seconds_of_the_fit_are_measured(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_seconds_of_the_fit_are_measured(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trials = stored(tmp_path / "t.npz", rx90())
     clock = iter([100.0, 101.25])
     monkeypatch.setattr(stored_trials, "time", SimpleNamespace(monotonic=lambda: next(clock)))

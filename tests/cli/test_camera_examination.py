@@ -128,9 +128,7 @@ def test_it_is_told_why_a_detector_reports_no_markers(tmp_path: Path) -> None:
     """The detector of edges, before a picture without its part; then of single vertices, by reason."""
     part = shipped_cell_path("edges").parent
     context = DriverContext(MonotonicClock(), "c", tmp_path, part, camera="left")
-    camera = WatchedCamera(
-        CameraRecord(DESCRIPTION), StillCamera(), EdgeDetector({"part": "wedge.part"}, context)
-    )
+    camera = WatchedCamera(CameraRecord(DESCRIPTION), StillCamera(), EdgeDetector({"part": "wedge.part"}, context))
     for _ in range(3):
         camera.poll()
     camera.finish()

@@ -52,14 +52,9 @@ def observation(
     return CameraObservation(name, seq, shutter, shutter + round(latency_ms * 1e6), ids, pixels, covariances)
 
 
-def record(
-    name: str, pixels: np.ndarray, *, seed: int = 1, frames: int = 60, phase_ms: float = 0.0
-) -> CameraRecord:
+def record(name: str, pixels: np.ndarray, *, seed: int = 1, frames: int = 60, phase_ms: float = 0.0) -> CameraRecord:
     rng = np.random.default_rng(seed)
-    seen = [
-        observation(name, k, pixels + rng.normal(0, 0.05, pixels.shape), phase_ms=phase_ms)
-        for k in range(frames)
-    ]
+    seen = [observation(name, k, pixels + rng.normal(0, 0.05, pixels.shape), phase_ms=phase_ms) for k in range(frames)]
     return CameraRecord(description(name), seen)
 
 

@@ -78,9 +78,7 @@ def test_init_writes_a_file_that_loads_with_every_joint_limited(tmp_path: Path, 
     assert tomllib.loads(path.read_text())["schema"] == 1
 
 
-def test_init_does_not_overwrite_and_refuses_names_that_cannot_be_cells(
-    tmp_path: Path, run: Run, cell: Path
-) -> None:
+def test_init_does_not_overwrite_and_refuses_names_that_cannot_be_cells(tmp_path: Path, run: Run, cell: Path) -> None:
     before = cell.read_text()
     code, result, _ = run("init", str(cell))
     assert (code, result["error"]["code"]) == (1, "exists")
@@ -94,9 +92,7 @@ def test_init_does_not_overwrite_and_refuses_names_that_cannot_be_cells(
 def test_init_passes_options_on_to_the_driver_and_into_the_file(tmp_path: Path, run: Run) -> None:
     path = tmp_path / "x.toml"
     joints = 'joints=[{name="pan"}, {name="tilt", max=1.0}]'
-    code, _, _ = run(
-        "init", str(path), "--option", joints, "--option", "rate_hz=100.0", "--option", "mechanics=none"
-    )
+    code, _, _ = run("init", str(path), "--option", joints, "--option", "rate_hz=100.0", "--option", "mechanics=none")
     assert code == 0
     loaded = load_cell_file(path)
     assert loaded.joints.options["rate_hz"] == 100.0
@@ -189,9 +185,7 @@ def test_a_joint_without_limits_is_named(run: Run, cell: Path) -> None:
     code, result, _ = run("doctor", edited(cell, 'joint = "j3"', 'joint = "j33"'))
     assert code == 1
     assert "j3" in result["error"]["message"]
-    assert (
-        "no [[safety.limit]]" in result["error"]["message"] or "has no limits" in result["error"]["message"]
-    )
+    assert "no [[safety.limit]]" in result["error"]["message"] or "has no limits" in result["error"]["message"]
 
 
 def test_a_cell_that_would_listen_to_everybody_fails_its_check(run: Run, cell: Path) -> None:
@@ -296,9 +290,7 @@ def test_a_stop_is_raised_before_any_library_is_imported(written: str, tmp_path:
     assert slot.count == 1
 
 
-def test_a_stop_on_its_host_asks_nobody_but_the_servo_process(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_on_its_host_asks_nobody_but_the_servo_process(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def asked(*_: object, **__: object) -> None:
         raise AssertionError("the gateway is asked")
 
@@ -332,9 +324,7 @@ def test_a_stop_for_another_host_leaves_the_cell_of_this_name_here_alone(run: Ru
         (("jog", "nowhere", "j1=fast"), "NAME=NUMBER"),
     ],
 )
-def test_arguments_are_checked_before_anything_is_asked(
-    arguments: tuple[str, ...], text: str, run: Run
-) -> None:
+def test_arguments_are_checked_before_anything_is_asked(arguments: tuple[str, ...], text: str, run: Run) -> None:
     code, result, _ = run(*arguments)
     assert code == 1
     assert text in result["error"]["message"]
@@ -361,9 +351,7 @@ def test_a_broken_command_is_listed_and_fails_alone(
     info = tmp_path / "acme-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[stereoservo.commands]\nacme-dance = acme_commands_broken:dance\n"
-    )
+    (info / "entry_points.txt").write_text("[stereoservo.commands]\nacme-dance = acme_commands_broken:dance\n")
     (tmp_path / "acme_commands_broken.py").write_text("raise RuntimeError('two left feet')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert cli.invoke(["--help"]) == 0
@@ -439,9 +427,7 @@ def test_warmup_of_a_cell_makes_its_detectors_too(
     assert "hil-video" in capfd.readouterr().out
 
 
-def test_warmup_tells_how_far_it_is_once_it_is_farther(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_warmup_tells_how_far_it_is_once_it_is_farther(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     class Compiling:
         """A process that compiles in steps, and ends well."""
 

@@ -45,9 +45,7 @@ def write_folder(folder: Path, views: RecordedViews) -> None:
     for k in range(len(views.camera)):
         name = views.cameras[views.camera[k]].name
         seen = np.flatnonzero(views.seen[k])
-        rows += [
-            [name, views.times[k], views.marker_ids[i], *views.pixels[k, i], views.sigmas[k, i]] for i in seen
-        ]
+        rows += [[name, views.times[k], views.marker_ids[i], *views.pixels[k, i], views.sigmas[k, i]] for i in seen]
         if not len(seen):
             rows.append([name, views.times[k], "", "", "", ""])
     write_table(folder / "markers.csv", ["camera", "t", "marker", "u", "v", "sigma"], rows)
@@ -160,9 +158,7 @@ def test_real_pictures_of_an_arm_whose_poses_are_known(
     assert source is not None
     poses = (source / "ee_poses.csv").read_text().splitlines()[1:]
     (tmp_path / "poses.csv").write_text("\n".join(["index,x,y,z,qx,qy,qz,qw", *poses]))
-    (tmp_path / "detector.toml").write_text(
-        'detector = "aruco"\n[options]\ntags = [9]\ndictionary = "4x4_50"\n'
-    )
+    (tmp_path / "detector.toml").write_text('detector = "aruco"\n[options]\ntags = [9]\ndictionary = "4x4_50"\n')
     rows = []
     for path in sorted(source.glob("pose*.jpg")):
         pose, camera = path.stem.split("_")

@@ -296,7 +296,5 @@ def test_two_features_of_one_name_are_two_cameras() -> None:
     names = {keys[0]: keys[0], keys[1]: keys[1], "side": keys[2], "image": keys[3]}
     assert camera_features(info, Path("set")) == names
     assert camera_features(info, Path("set"), ["side", keys[1]]) == {"side": keys[2], keys[1]: keys[1]}
-    with pytest.raises(
-        DataSetError, match=r"no camera 'up'; the cameras are observation\.image\.up, observation"
-    ):
+    with pytest.raises(DataSetError, match=r"no camera 'up'; the cameras are observation\.image\.up, observation"):
         camera_features(info, Path("set"), ["up"])

@@ -117,9 +117,7 @@ def test_an_adaptive_gain_is_two_or_three_numbers() -> None:
 
 def test_a_stream_in_a_file_is_paced_by_its_stamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "way.jsonl"
-    path.write_text(
-        "\n".join(json.dumps({"stamp_s": 7.0 + 0.5 * k, "set_points": SEEN}) for k in range(3)) + "\n\n"
-    )
+    path.write_text("\n".join(json.dumps({"stamp_s": 7.0 + 0.5 * k, "set_points": SEEN}) for k in range(3)) + "\n\n")
     now, slept = 50.0, []
 
     def sleep(seconds: float) -> None:

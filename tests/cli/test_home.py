@@ -91,9 +91,7 @@ def test_the_motion_that_is_named_tells_postures_apart(name: str) -> None:
         assert (np.abs(after.offset) <= home.AGREES * after.deviations).all()
 
 
-@pytest.mark.parametrize(
-    "off", [np.zeros(6), np.array([0.06, -0.04, 0.05, -0.2, 0.1, 0.3])], ids=["right", "off"]
-)
+@pytest.mark.parametrize("off", [np.zeros(6), np.array([0.06, -0.04, 0.05, -0.2, 0.1, 0.3])], ids=["right", "off"])
 @pytest.mark.parametrize("name", CELLS)
 def test_looks_after_motions_decide(
     name: str, off: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

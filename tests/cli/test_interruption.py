@@ -47,9 +47,7 @@ def test_a_reader_that_goes_away_ends_a_command_by_an_exit_code_and_no_signal() 
 
 
 def test_an_interrupt_that_a_destructor_swallowed_is_remembered() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SWALLOWS], capture_output=True, text=True, timeout=240, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", SWALLOWS], capture_output=True, text=True, timeout=240, check=False)
     assert done.stdout.split() == ["lost", "remembered"], done.stderr
     assert "KeyboardInterrupt" in done.stderr
 
@@ -101,9 +99,7 @@ def test_the_page_ends_by_an_interrupt_whatever_hangs(name: str) -> None:
     start, close, code, told = SERVED[name]
     limit = "2.0" if told == "in close" else "100.0"
     script = SERVES.replace("START", start).replace("CLOSE", close).replace("LIMIT", limit)
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == code, done.stderr
     assert told in done.stderr
     assert '"url"' in done.stdout

@@ -42,9 +42,7 @@ def daemon(directories: CellDirectories) -> Iterator[CellDirectories]:
         yield directories
 
 
-def beat(
-    directories: CellDirectories, age_s: float, limit_s: float = SERVO_HANG_S, of: str = "servo"
-) -> None:
+def beat(directories: CellDirectories, age_s: float, limit_s: float = SERVO_HANG_S, of: str = "servo") -> None:
     """A process's newest heartbeat."""
     with SlotWriter(directories.heartbeat_slot(of), HEARTBEAT_BYTES, HEARTBEAT_LAYOUT) as slot:
         slot.write(struct.pack("=qd", time.monotonic_ns() - round(age_s * 1e9), limit_s))
@@ -56,9 +54,7 @@ def status(capfd: pytest.CaptureFixture[str]) -> tuple[int, dict[str, Any]]:
     return code, json.loads(out)["error"]
 
 
-def test_a_servo_process_that_is_silent_is_an_error(
-    daemon: CellDirectories, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_servo_process_that_is_silent_is_an_error(daemon: CellDirectories, capfd: pytest.CaptureFixture[str]) -> None:
     beat(daemon, 40.0)
     code, error = status(capfd)
     assert (code, error["code"]) == (1, "servo_silent")
@@ -90,9 +86,7 @@ def test_a_gateway_that_hangs_is_not_waited_for(
     assert "`stereoservo stop` works" in error["message"]
 
 
-def test_a_daemon_that_died_leaves_its_cause(
-    directories: CellDirectories, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_daemon_that_died_leaves_its_cause(directories: CellDirectories, capfd: pytest.CaptureFixture[str]) -> None:
     begin_run(directories, "a", 7)
     assert "(process 7) was killed (signal 9)" in status(capfd)[1]["message"]
     end_run(directories, "the servo process hung: no sign of life", "See its log")

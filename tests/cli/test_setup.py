@@ -205,9 +205,7 @@ def test_cameras_are_found_by_the_kernels_files_under_the_name_that_stays(tmp_pa
         (kernel / f"video{number}" / "name").write_text(f"{name}\n")
         (devices / f"video{number}").touch()
     (links / "usb-Maker_UVC_Camera_0042-video-index0").symlink_to(devices / "video2")
-    found = found_cameras(
-        kernel, links, devices, lambda path: None if path.name == "video3" else ((640, 480, 30.0),)
-    )
+    found = found_cameras(kernel, links, devices, lambda path: None if path.name == "video3" else ((640, 480, 30.0),))
     assert [camera.name for camera in found] == [
         f"UVC Camera ({devices / 'video2'})", f"Grabber ({devices / 'video10'})"
     ]  # fmt: skip
@@ -252,15 +250,11 @@ def test_a_measured_rate_is_the_usual_one_next_to_it() -> None:
 
 
 def drive(address: int, limits: tuple[int, int] | None = None) -> FoundDrive:
-    return FoundDrive(
-        address, f"node {address}", {"vendor_id": 7, "serial_number": address}, limits, 65536 * 5
-    )
+    return FoundDrive(address, f"node {address}", {"vendor_id": 7, "serial_number": address}, limits, 65536 * 5)
 
 
 def joint(address: int, limits: tuple[int, int] | None = None) -> JointChoice:
-    return JointChoice(
-        f"j{address}", drive(address, limits), "revolute", 65536.0, 100.0, None, -1.0, 1.0, 0.5
-    )
+    return JointChoice(f"j{address}", drive(address, limits), "revolute", 65536.0, 100.0, None, -1.0, 1.0, 0.5)
 
 
 def test_addresses_of_cameras_are_taken_whole_and_told_without_passwords(
@@ -303,9 +297,7 @@ def test_answers_that_cannot_be_are_refused_with_what_can() -> None:
         chosen_order("1 3", drives)
     limited = joint(1, (-65536 * 25, 65536 * 25))
     assert joint_position(limited) == pytest.approx(math.radians(18.0))
-    assert chosen_ranges("-80:80", [limited]) == [
-        (pytest.approx(math.radians(-80)), pytest.approx(math.radians(80)))
-    ]
+    assert chosen_ranges("-80:80", [limited]) == [(pytest.approx(math.radians(-80)), pytest.approx(math.radians(80)))]
     for text, why in (
         ("-100:80", "beyond the drive's own"),
         ("-80:20", "stands at 18.0"),
@@ -338,8 +330,6 @@ def test_a_cell_that_is_run_is_a_file_or_a_shipped_one() -> None:
         shipped_or_path("nowhere")
 
 
-def test_setup_without_a_terminal_or_answers_says_so(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_setup_without_a_terminal_or_answers_says_so(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.invoke(["setup", str(tmp_path / "mine.toml"), "--json"]) == 1
     assert "--answers" in capfd.readouterr().out

@@ -67,9 +67,7 @@ def test_what_is_shown_carries_its_age_and_is_unknown_without_a_source() -> None
     ages = {"left": 0.021, "right": 3.21, "up": None}
     told = said(joints_age_s=0.004, visible={"left": 14}, camera_age_s=ages)
     assert "  joints  j1 +0.1000 (+5.7°) (4 ms old)" in told
-    assert (
-        "  markers left 14 (21 ms old)  right unknown (no frame for 3.2 s)  up unknown (no frame yet)" in told
-    )
+    assert "  markers left 14 (21 ms old)  right unknown (no frame for 3.2 s)  up unknown (no frame yet)" in told
     assert "  joints  unknown: no sample for 3.0 s" in said(joints={}, joints_age_s=3.0)
     assert "  joints  unknown: no sample yet" in said(joints={})
     told = said(health=Health("unknown", text="no camera delivers frames"))
@@ -88,19 +86,13 @@ def test_who_stopped_the_arm_is_told() -> None:
 
 def test_messages_that_could_not_be_taken_are_counted() -> None:
     assert not any("refused" in line for line in said())
-    assert "  refused 17000 messages that could not be taken since the gateway's start" in said(
-        refused_messages=17000
-    )
-    assert (
-        decode(encode(msgspec.structs.replace(STATE, refused_messages=3)), StateMessage).refused_messages == 3
-    )
+    assert "  refused 17000 messages that could not be taken since the gateway's start" in said(refused_messages=17000)
+    assert decode(encode(msgspec.structs.replace(STATE, refused_messages=3)), StateMessage).refused_messages == 3
 
 
 def test_how_far_the_refinement_is_and_how_it_is_undone() -> None:
     assert not any("refine" in line for line in said())
-    assert "  refine  5 rest poses, a model is estimated from 16 on" in said(
-        refinement=RefinementState(5, 16)
-    )
+    assert "  refine  5 rest poses, a model is estimated from 16 on" in said(refinement=RefinementState(5, 16))
     (line,) = (one for one in said(refinement=RefinementState(130, None, refined_from=3)) if "refine" in one)
     assert "no model is estimated before the next calibration or start" in line
     assert "refined from epoch 3 (`calibrate CELL --undo-refinement`" in line

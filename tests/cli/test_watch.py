@@ -11,9 +11,7 @@ import pytest
 from stereoservo.messages.wire import EventMessage, FeaturesMessage
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed"
-)
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed")
 def test_rerun_is_given_every_value_with_its_time_and_the_names_of_joints(tmp_path: Path) -> None:
     from stereoservo.cli.watch.rerun_viewer import RerunViewer
 
@@ -21,9 +19,7 @@ def test_rerun_is_given_every_value_with_its_time_and_the_names_of_joints(tmp_pa
     with RerunViewer("cell", file) as viewer:
         for k in range(40):
             viewer._add_series("joints", 1000.0 + 0.05 * k, {"shoulder": float(k), "elbow": -0.5})
-            viewer.show(
-                FeaturesMessage("left", k, 0, 0, 1000.0 + 0.05 * k, (3, 7), ((k, 2.0), (5.0, k)), (0.1, 0.1))
-            )
+            viewer.show(FeaturesMessage("left", k, 0, 0, 1000.0 + 0.05 * k, (3, 7), ((k, 2.0), (5.0, k)), (0.1, 0.1)))
             viewer.show(FeaturesMessage("right", k, 0, 0, 1000.0 + 0.05 * k, (), (), ()))
         viewer.show(EventMessage(1, "boot", 0, 1002.0, "stopped", "by hand"))
     told = subprocess.run(

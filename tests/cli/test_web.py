@@ -57,9 +57,7 @@ def test_loopback_is_served_without_tls(address: str) -> None:
     assert command._tls_context(address, None) is None
 
 
-@pytest.mark.parametrize(
-    "address", ["0.0.0.0", "::", "192.168.1.5", "cell.example", "127.0.0.1.evil.example", ""]
-)
+@pytest.mark.parametrize("address", ["0.0.0.0", "::", "192.168.1.5", "cell.example", "127.0.0.1.evil.example", ""])
 def test_no_other_address_is_served_without_tls_whatever_the_cell(address: str) -> None:
     with pytest.raises(CommandError, match="without --tls") as refused:
         command.web("a cell that need not be there", address=address, port=0, tls=None)

@@ -92,9 +92,7 @@ def test_a_refusal_in_the_place_of_a_state_is_still_a_refusal(endpoint: str) -> 
     [("events", 1, 2), ("events", 2, 2), ("hold", 1, 1)],
     ids=["a reading is repeated", "not without end", "a command is not repeated"],
 )
-def test_a_reading_whose_reply_is_lost_is_asked_for_again(
-    endpoint: str, name: str, lost: int, asked: int
-) -> None:
+def test_a_reading_whose_reply_is_lost_is_asked_for_again(endpoint: str, name: str, lost: int, asked: int) -> None:
     session, heard = open_session(client_config(endpoint)), []
 
     def answer(query: Any) -> None:
@@ -172,7 +170,5 @@ def test_a_page_of_events_that_were_not_asked_for_is_the_clients_own_error(
     monkeypatch.setattr(Client, "events", lambda self, first=1: pages.pop(0) if len(pages) > 1 else pages[0])
     with Client("demo", endpoint=endpoint) as client, EventWatch(client) as watch:
         for number in (1, 9):
-            with pytest.raises(
-                InvalidReplyError, match=rf"events \[{number}\] in reply to a query from 8 on"
-            ):
+            with pytest.raises(InvalidReplyError, match=rf"events \[{number}\] in reply to a query from 8 on"):
                 watch._fill([], 20)

@@ -98,9 +98,7 @@ def test_a_goal_that_a_fault_ended_tells_the_fault(parts: tuple[GoalHandle, Any,
         Reason("NOT_ACTIVE", "hold", hint="the cell became fault"),
         Reason("X", "fault", hint="no TPDO1 of node 4"),
     )
-    watch.events.append(
-        EventMessage(1, "b", 0, 0.0, "goal_aborted", "the cell became fault", id=ID, reasons=reasons)
-    )
+    watch.events.append(EventMessage(1, "b", 0, 0.0, "goal_aborted", "the cell became fault", id=ID, reasons=reasons))
     handle.stream([(None, TARGET)])
     with pytest.raises(ClientError, match="was aborted: the cell became fault: no TPDO1 of node 4"):
         handle.reached()

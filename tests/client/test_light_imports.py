@@ -38,9 +38,7 @@ def test_the_client_needs_zenoh_and_msgspec_only() -> None:
 
 
 def test_messages_need_msgspec_only() -> None:
-    names = [
-        f"stereoservo.messages.{found.name}" for found in pkgutil.iter_modules(stereoservo.messages.__path__)
-    ]
+    names = [f"stereoservo.messages.{found.name}" for found in pkgutil.iter_modules(stereoservo.messages.__path__)]
     assert "stereoservo.messages.wire" in names
     modules = modules_after(f"import {', '.join(names)}")
     assert not (HEAVY | {"zenoh"}) & modules

@@ -193,9 +193,7 @@ def test_a_wait_finds_its_events_in_any_order(name: str, monkeypatch: pytest.Mon
     call, steps, result = WAITS[name]
     for order in permutations(steps):
         for script in batches(list(order)):
-            told = [
-                [step if isinstance(step, StateMessage) else step.kind for step in batch] for batch in script
-            ]
+            told = [[step if isinstance(step, StateMessage) else step.kind for step in batch] for batch in script]
             made = ScriptedClient(script)
             if name in BEFORE:
                 made.state = msgspec.structs.replace(STATE, lifecycle=BEFORE[name])
@@ -208,9 +206,7 @@ def test_a_wait_finds_its_events_in_any_order(name: str, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     "order", list(permutations([CALIBRATED, REPORT, event("fit_progress", id="mine", progress=0.5)]))
 )
-def test_each_event_of_a_calibration_is_shown_once(
-    order: tuple[Step, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_event_of_a_calibration_is_shown_once(order: tuple[Step, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     for script in batches(list(order)):
         made, shown = ScriptedClient(script), list[EventMessage]()
         monkeypatch.setattr(events, "time", made)

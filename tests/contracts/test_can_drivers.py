@@ -41,16 +41,12 @@ CIA_402: dict[str, Any] = PATIENT | {
     "joint": [
         can_joint(1),
         can_joint(2, direction=-1, velocity_units_per_rev_s=60_000.0, offset_rad=0.3),
-        can_joint(
-            3, kind="prismatic", gear_ratio=200.0, max_velocity=0.3, position_min=-0.5, position_max=0.5
-        ),
+        can_joint(3, kind="prismatic", gear_ratio=200.0, max_velocity=0.3, position_min=-0.5, position_max=0.5),
     ],
 }
 ODRIVE: dict[str, Any] = PATIENT | {
     "protocol": "odrive",
-    "joint": [
-        can_joint(k, counts_per_rev=1, gear_ratio=8.0, direction=sign) for k, sign in ((1, 1), (2, -1))
-    ],
+    "joint": [can_joint(k, counts_per_rev=1, gear_ratio=8.0, direction=sign) for k, sign in ((1, 1), (2, -1))],
 }
 
 
@@ -63,9 +59,7 @@ def emulator(request: pytest.FixtureRequest) -> Iterator[None]:
     channel = name if suite.interface == "virtual" else endpoint.channel
     suite.given = {"interface": suite.interface, "channel": channel} | suite.options
     options = decode_options(CanOptions, suite.given, "canopen")
-    drives = make_bus_emulator(
-        options, DrivesSettings(plant="ideal", brake_ms=10.0), t_ns=time.monotonic_ns()
-    )
+    drives = make_bus_emulator(options, DrivesSettings(plant="ideal", brake_ms=10.0), t_ns=time.monotonic_ns())
     with BusServer(drives, endpoint) as suite.server:
         yield
 

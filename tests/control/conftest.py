@@ -37,11 +37,7 @@ def screw(axis, point=None):
 
 def exponential(G, amount):
     """Rodrigues, or a translation."""
-    return (
-        np.eye(4) + np.sin(amount) * G + (1 - np.cos(amount)) * G @ G
-        if G[:3, :3].any()
-        else np.eye(4) + amount * G
-    )
+    return np.eye(4) + np.sin(amount) * G + (1 - np.cos(amount)) * G @ G if G[:3, :3].any() else np.eye(4) + amount * G
 
 
 def dh_screws(rows):
@@ -126,9 +122,7 @@ def random_frame(rng):
 
 def free_arm(rng, T0):
     """Three prismatic and three revolute joints, through the middle of the plate at its start ``T0``."""
-    generators = np.array(
-        [screw(axis) for axis in np.eye(3)] + [screw(axis, T0[:3, 3]) for axis in np.eye(3)]
-    )
+    generators = np.array([screw(axis) for axis in np.eye(3)] + [screw(axis, T0[:3, 3]) for axis in np.eye(3)])
     return World(generators, T0, random_frame(rng), np.zeros(6))
 
 

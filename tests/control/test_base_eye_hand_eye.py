@@ -183,9 +183,7 @@ def commanded(virtual):
     def in_base(X):
         return np.linalg.inv(rig_from_base) @ X
 
-    return SimpleNamespace(
-        world=world, hand=hand, plate=plate, in_base=in_base, T0=T0, T_star=T_star, link=link
-    )
+    return SimpleNamespace(world=world, hand=hand, plate=plate, in_base=in_base, T0=T0, T_star=T_star, link=link)
 
 
 @pytest.mark.parametrize("law", ["stereo", "cartesian3"])
@@ -214,9 +212,7 @@ def test_a_robot_commanded_by_twists_is_an_arm_of_simultaneous_joints(virtual, c
     if law == "cartesian3":
         gone, way = np.array(middles) - middles[0], middles[-1] - middles[0]
         deviation = np.linalg.norm(np.cross(gone, way), axis=1) / np.linalg.norm(way)
-        assert deviation.max() < 2e-5, (
-            "at 25 Hz the middle stays on its line where the composition is the true one"
-        )
+        assert deviation.max() < 2e-5, "at 25 Hz the middle stays on its line where the composition is the true one"
     # what was learnt as the tool's point is the first marker, in metres
     np.testing.assert_allclose((start @ T_HL)[:3, 3], commanded.in_base(corner)[:3], atol=1e-4)
 
@@ -237,6 +233,4 @@ def test_joint_velocities_said_as_cartesian_ones_make_the_same_motion(virtual):
     np.testing.assert_allclose(joint_velocity(own, screw_operator(base)), q_dot, atol=1e-9)
     T_HB = np.linalg.inv(virtual.pose(Rotation.from_euler("x", 50, degrees=True), [0.1, 0.2, 0.6]))
     hand = cartesian_velocity(world.operators(), q_dot, T_HB @ H_base)
-    np.testing.assert_allclose(
-        joint_velocity(hand_from_base(T_HB, own), screw_operator(hand)), q_dot, atol=1e-9
-    )
+    np.testing.assert_allclose(joint_velocity(hand_from_base(T_HB, own), screw_operator(hand)), q_dot, atol=1e-9)

@@ -30,9 +30,7 @@ def inputs(virtual, world, composition, T0, T_star, single, gain=1.0, dt_s=0.0, 
     )  # fmt: skip
 
 
-def kernel(
-    operators, composition, points, targets, centre, centre_target, eyes, gains, dt_s, turn, speed, single
-):
+def kernel(operators, composition, points, targets, centre, centre_target, eyes, gains, dt_s, turn, speed, single):
     task, pace = FaceTask(points, targets, centre, centre_target), Pace(gains, dt_s, turn, speed)
     return cartesian_step(operators, int(composition), task, eyes, pace, single)
 
@@ -54,9 +52,7 @@ def test_the_kernel_is_the_reference(virtual, seed, single):
     T0, T_star = virtual.random_task(rng, rng.uniform(0.5, 178), rng.uniform(0.01, 0.5))
     world, composition = (virtual.rx90(rng, T0=T0), SERIAL) if seed % 2 else (virtual.free_arm(rng, T0), FREE)
     for dt_s, rates in ((0.0, (inf, inf)), (PERIOD, (inf, inf)), (PERIOD, (0.5, 0.2))):
-        step = assert_same(
-            inputs(virtual, world, composition, T0, T_star, single, 2.0, dt_s, rates, eyes=seed % 5 > 0)
-        )
+        step = assert_same(inputs(virtual, world, composition, T0, T_star, single, 2.0, dt_s, rates, eyes=seed % 5 > 0))
         assert len(step.task_error) == (2 if single else 3)
     arguments = inputs(virtual, world, composition, T0, T_star, single)
     noisy = arguments[0] + 1e-6 * rng.normal(size=arguments[0].shape)
@@ -98,9 +94,7 @@ def drive(virtual, world, composition, T_star, law, options, *, noise=0.0, seed=
         seen = pixels + noise * rng.normal(size=pixels.shape)
         points = world.triangulated(seen)
         operators = np.ascontiguousarray(world.operators(q))
-        scene = Scene(
-            operators, int(composition), world.matrices, world.camera_centres, points, seen, np.ones((2, 4))
-        )
+        scene = Scene(operators, int(composition), world.matrices, world.camera_centres, points, seen, np.ones((2, 4)))
         task = Task(
             set_points, np.ones((2, 4)), np.zeros((2, 4, 2)), targets, np.ones(4), points.mean(axis=0),
             targets.mean(axis=0), np.arange(3),
@@ -122,9 +116,7 @@ def test_the_centre_stays_on_its_line_whatever_the_gain(virtual, law, seed):
     rng = np.random.default_rng(seed)
     T0, T_star = virtual.random_task(rng, rng.uniform(30, 150), rng.uniform(0.05, 0.4))
     world = virtual.free_arm(rng, T0)
-    error, deviation, sight, history = drive(
-        virtual, world, FREE, T_star, law, Options(5.0, PERIOD), tolerance=0.05
-    )
+    error, deviation, sight, history = drive(virtual, world, FREE, T_star, law, Options(5.0, PERIOD), tolerance=0.05)
     assert error < 0.05
     assert deviation < 1e-9
     assert sight > 0
@@ -207,9 +199,7 @@ def test_half_a_turn_of_roll(virtual, law, tilt):
     T0 = virtual.pose(Rotation.from_euler("z", 180, degrees=True) * face, [0, 0, 1.0])
     world = virtual.free_arm(np.random.default_rng(1), T0)
     for noise in (0.0, 0.1):
-        error, deviation, sight, history = drive(
-            virtual, world, FREE, T_star, law, Options(1.0, PERIOD), noise=noise
-        )
+        error, deviation, sight, history = drive(virtual, world, FREE, T_star, law, Options(1.0, PERIOD), noise=noise)
         assert error < 0.5
         assert sight > 0.2
         assert deviation < (1e-3 if noise else 1e-9)
@@ -249,17 +239,13 @@ def test_degenerate_tasks_have_an_answer(virtual, single):
     arguments[4] = np.full(4, np.nan)
     nowhere = assert_same(tuple(arguments))
     np.testing.assert_array_equal(nowhere.velocity, np.zeros(6))
-    assert {int(s) for s in (*flat.status, *unknown.status, *nowhere.status)} == {
-        int(ComponentStatus.NO_FACE)
-    }
+    assert {int(s) for s in (*flat.status, *unknown.status, *nowhere.status)} == {int(ComponentStatus.NO_FACE)}
 
 
 def test_an_arm_without_the_tilt_turns_what_it_can_and_says_so(virtual):
     T0 = virtual.pose(Rotation.identity(), [0.05, 0, 1.0])
     T_star = virtual.pose(Rotation.from_euler("zy", [30, 25], degrees=True), [0.1, 0.1, 1.2])
-    generators = np.array(
-        [virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])]
-    )
+    generators = np.array([virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])])
     world = virtual.World(generators, T0, virtual.random_frame(np.random.default_rng(9)), np.zeros(4))
     step = assert_same(inputs(virtual, world, SERIAL, T0, T_star, True, dt_s=PERIOD))
     assert step.status[1] == ComponentStatus.NOT_REACHABLE

@@ -72,9 +72,7 @@ def test_the_kernel_is_the_reference_in_special_cases(virtual):
 def test_reasons_name_the_component(virtual):
     T0 = virtual.pose(Rotation.identity(), [0.05, 0, 1.0])
     T_star = virtual.pose(Rotation.from_euler("zy", [30, 25], degrees=True), [0.1, 0.1, 1.2])
-    generators = np.array(
-        [virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])]
-    )
+    generators = np.array([virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])])
     world = virtual.World(generators, T0, virtual.random_frame(np.random.default_rng(9)), np.zeros(4))
     step = assert_same(inputs(virtual, world, T0, T_star))
     (reason,) = cartesian3_reasons(LawStep(*step, 1.0))
@@ -137,8 +135,7 @@ def close_the_loop(virtual, world, T_star, law, *, gain, noise=0.0, seed=0, tole
             history.append(e)
         else:
             J = 0.5 * (
-                image_jacobian(operators, world.matrices, points)
-                + image_jacobian(operators, world.matrices, targets)
+                image_jacobian(operators, world.matrices, points) + image_jacobian(operators, world.matrices, targets)
             )
             velocity = stereo_step(J, seen, set_points, np.ones((2, 4)), gain, 1e-8)[0]
         q = q + PERIOD * velocity
@@ -226,9 +223,7 @@ def test_the_face_stays_in_sight_where_components_must_wait(virtual):
     T_star = virtual.pose(Rotation.from_euler("y", 100, degrees=True), [0.9, 0, 1.0])
     world = virtual.free_arm(np.random.default_rng(2), T0)
     assert world.front_facing(T0).min() > 0.2
-    error, deviation, least_sight, e = close_the_loop(
-        virtual, world, T_star, "cartesian3", gain=1.0, limit=1500
-    )
+    error, deviation, least_sight, e = close_the_loop(virtual, world, T_star, "cartesian3", gain=1.0, limit=1500)
     assert error < 0.5
     assert least_sight > 0
     assert deviation < 0.002
@@ -243,9 +238,7 @@ def test_the_stereo_law_reaches_goals_at_small_and_medium_distance(virtual, seed
     else:
         T0, T_star = virtual.random_task(rng, rng.uniform(5, 60), rng.uniform(0.02, 0.15))
         world = virtual.free_arm(rng, T0)
-    error, _, least_sight, _ = close_the_loop(
-        virtual, world, T_star, "stereo", gain=1.0, noise=0.1, seed=seed
-    )
+    error, _, least_sight, _ = close_the_loop(virtual, world, T_star, "stereo", gain=1.0, noise=0.1, seed=seed)
     assert error < 0.5
     assert least_sight > 0
 

@@ -150,9 +150,7 @@ def drive(body, faces, T, T_star, rng, noise, tolerance):
     goal, world = task_of(body, T_star), body.world
     choice, choices, q = NOT_CHOSEN, [], np.zeros(6)
     for _ in range(600):
-        scene = scene_of(body, world.displacement(q) @ T, rng, noise=noise)._replace(
-            operators=world.operators(q)
-        )
+        scene = scene_of(body, world.displacement(q) @ T, rng, noise=noise)._replace(operators=world.operators(q))
         choice = choose_face(faces, scene, goal, choice)
         assert choice.cameras == 2, "at every pose of these ways two cameras have a face"
         choices.append(choice)
@@ -249,9 +247,7 @@ def test_many_markers_of_a_face_are_tried_by_those_that_are_spread_out(virtual):
         assert len(set(tried.tolist())) == min(count, MOST_TRIED)
         assert (np.diff(tried) > 0).all()
         members, none = np.ones((1, count)), np.zeros(3, np.int64)
-        _, triple, cameras = choose_triangle(
-            members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none)
-        )
+        _, triple, cameras = choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none))
         assert cameras == 2
         _, area = triangle_sight(*triple, pixels, weights)
         sides = rng.integers(0, count, (3, 20_000))
@@ -260,7 +256,5 @@ def test_many_markers_of_a_face_are_tried_by_those_that_are_spread_out(virtual):
         weights[:, triple[0]] = 0.0
         assert (
             triple[0]
-            not in choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none))[
-                1
-            ]
+            not in choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none))[1]
         )

@@ -122,9 +122,7 @@ def test_off_plane_is_standard_normal_for_coplanar_markers(virtual):
         points = world.triangulated(exact + SIGMA * rng.normal(size=exact.shape))
         information = marker_information(points, world.matrices, SIGMA)
         covariances = marker_covariances(points, information)
-        samples.append(
-            (off_plane(points, covariances, 0, 1, 2)[3], off_plane(points, covariances, 0, 1, 4)[2])
-        )
+        samples.append((off_plane(points, covariances, 0, 1, 2)[3], off_plane(points, covariances, 0, 1, 4)[2]))
     flat, off = np.array(samples).T
     # 400 samples: the variance is within 4 sqrt(2 / 400) of 1, the mean within 4 / 20 of 0
     assert abs(flat.var() - 1.0) < 4 * np.sqrt(2 / 400)
@@ -271,6 +269,4 @@ def test_faces_of_256_markers(virtual):
     # of 174 million fours some are in one plane by chance
     assert len({tuple(range(4 * k, 4 * k + 4)) for k in range(64)} & set(faces.markers())) >= 62
     plates = [len({k // 4 for k in face}) == 1 for face in faces.markers()]
-    assert outward_is_right(
-        body, faces._replace(triples=faces.triples[plates], members=faces.members[plates]), T
-    )
+    assert outward_is_right(body, faces._replace(triples=faces.triples[plates], members=faces.members[plates]), T)

@@ -142,9 +142,7 @@ def test_units_of_joints_do_not_matter(virtual):
     scene = scene_of(world)
     scale = np.array([1.0, 3, 1, 0.5, 2, 1])
     step = incidence_step(scene, task, Options(2.0))
-    other = incidence_step(
-        scene._replace(operators=scene.operators / scale[:, None, None]), task, Options(2.0)
-    )
+    other = incidence_step(scene._replace(operators=scene.operators / scale[:, None, None]), task, Options(2.0))
     np.testing.assert_allclose(other.velocity / scale, step.velocity, rtol=0, atol=1e-9)
 
 
@@ -244,9 +242,7 @@ def test_contradiction_is_told_from_noise(virtual, gap):
         noisy = world.triangulated(scene.pixels + rng.normal(0, 0.1, scene.pixels.shape))
         step = incidence_step(scene._replace(points=noisy), task, Options(2.0, DT))
         named.append((step.status[:2] == IncidenceStatus.CONTRADICTS).all())
-        speeds.append(
-            np.abs(image_jacobian(scene.operators, scene.matrices, scene.points) @ step.velocity).max()
-        )
+        speeds.append(np.abs(image_jacobian(scene.operators, scene.matrices, scene.points) @ step.velocity).max())
         world.q = world.q + DT * step.velocity
     assert np.mean(named) > 0.9
     # pixels a second: the gain times five standard deviations of a pixel, nothing of the gap
@@ -302,9 +298,7 @@ def test_freedoms_that_are_left_drive_from_the_limits(virtual):
     lower, upper = world.q - 1.5, world.q + 1.5
     lower[1], upper[1] = world.q[1] - 0.02, world.q[1] + 1.0
     lower[5], upper[5] = -np.inf, np.inf
-    _, errors = drive(
-        world, task, 5.0, 6.0, until=-1.0, second=lambda scene: limits_task(world.q, lower, upper, 0.5)
-    )
+    _, errors = drive(world, task, 5.0, 6.0, until=-1.0, second=lambda scene: limits_task(world.q, lower, upper, 0.5))
     assert errors.max() < 0.2
     share = (world.q - lower)[:5] / (upper - lower)[:5]
     assert share.min() > 0.1  # 0.02 at the start

@@ -31,9 +31,7 @@ def test_the_turn_that_slides_lack_is_named(virtual, known, axis, anywhere):
     K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
     rotation = np.linalg.inv(K) @ world.euclidean[0][:, :3]
     T0 = virtual.pose(Rotation.from_matrix(rotation.T), eye[:3] + 1.1 * rotation[2])
-    gantry = virtual.World(
-        virtual.free_arm(rng, T0).generators[:3], T0, virtual.random_frame(rng), np.zeros(3)
-    )
+    gantry = virtual.World(virtual.free_arm(rng, T0).generators[:3], T0, virtual.random_frame(rng), np.zeros(3))
     turned = T0 @ virtual.pose(Rotation.from_euler("xyz"[axis], 15, degrees=True), [0.02, 0.01, 0.03])
     goal = gantry.hidden(virtual.PLATE @ turned.T)
     kind, own = ("line-on-line", [0, 1]) if axis == 2 else ("plane-on-plane", [0, 1, 2])
@@ -63,9 +61,7 @@ def test_what_is_lost_at_a_singularity_is_not_lost_anywhere(virtual):
         task = incidence_task(["point-on-point"], [[0]], [target], world.infinity, 0.1)
         (here,) = incidence_freedoms(scene_of(world), task, world.infinity, np.linalg.inv(world.frame))
         assert here is not None
-        (ever,) = incidence_freedoms(
-            scene_of(world), task, world.infinity, np.linalg.inv(world.frame), anywhere=True
-        )
+        (ever,) = incidence_freedoms(scene_of(world), task, world.infinity, np.linalg.inv(world.frame), anywhere=True)
         assert here.name.startswith(lacks or "translation")
         assert (ever is None) == (lacks is not None)
 

@@ -84,9 +84,7 @@ def test_image_task_is_the_image_law(virtual):
     weights = np.array([[1.0, 0, 2, 1], [1, 1, 0, 1]])
     task = image_task(scene.operators, scene.matrices, scene.points, set_points, weights, 3.0)
     seen = np.repeat(weights.ravel(), 2) > 0
-    np.testing.assert_allclose(
-        task.rates[seen], -3.0 * (scene.pixels - set_points).reshape(-1)[seen], rtol=1e-9
-    )
+    np.testing.assert_allclose(task.rates[seen], -3.0 * (scene.pixels - set_points).reshape(-1)[seen], rtol=1e-9)
     assert not task.rates[~seen].any()
     h = 1e-6
     for j in range(6):

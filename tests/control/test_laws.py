@@ -81,9 +81,7 @@ def test_every_name_of_the_wire_has_its_law(virtual):
         step = law.step(scene, task, Options(1.0))
         assert isinstance(step, LawStep)
         assert step.velocity.shape == (6,)
-        assert (
-            len(law.components) == len(law.units) == len(step.error) == len(step.allowed) == len(step.status)
-        )
+        assert len(law.components) == len(law.units) == len(step.error) == len(step.allowed) == len(step.status)
         assert law.reasons(step) == ()
 
 
@@ -159,9 +157,7 @@ def test_no_law_depends_on_the_projective_frame(virtual, seed, dt_s):
                     step = CLASSICAL[name] if law is None else law.step
                     velocities.append(step(scene, task, Options(1.0, dt_s, choice, 0.0)).velocity)
                 scale = np.abs(velocities[0]).max()
-                np.testing.assert_allclose(
-                    velocities[0], velocities[1], rtol=0, atol=1e-8 * scale, err_msg=name
-                )
+                np.testing.assert_allclose(velocities[0], velocities[1], rtol=0, atol=1e-8 * scale, err_msg=name)
 
 
 def test_fixed_depth_is_the_present_pixel_at_the_depth_of_the_goal(virtual):
@@ -204,9 +200,7 @@ def test_the_error_of_a_law_held_for_a_step_decays_as_its_gain_says(virtual):
             task = task_of(virtual, world, scene, T_star)
             velocity = law.step(scene, task, Options(gain, PERIOD)).velocity
             T = displacement(world.generators, FREE, PERIOD * velocity) @ T0
-            before, after = (
-                np.abs(world.pixels(virtual.PLATE @ M.T) - task.set_points).max() for M in (T0, T)
-            )
+            before, after = (np.abs(world.pixels(virtual.PLATE @ M.T) - task.set_points).max() for M in (T0, T))
             assert after / before == pytest.approx(np.exp(-gain * PERIOD), abs=0.03), name
 
 
@@ -217,11 +211,7 @@ def test_no_law_turns_or_moves_the_body_faster_than_it_may(virtual, name):
         scene = scene_of(virtual, world, composition, T0)
         task = task_of(virtual, world, scene, T_star)
         free = LAWS[name].step(scene, task, Options(3.0, PERIOD)).velocity
-        velocity = (
-            LAWS[name]
-            .step(scene, task, Options(3.0, PERIOD, rotation_rate=0.2, translation_rate=0.05))
-            .velocity
-        )
+        velocity = LAWS[name].step(scene, task, Options(3.0, PERIOD, rotation_rate=0.2, translation_rate=0.05)).velocity
         twist = np.tensordot(velocity, scene.operators, axes=1)
         # each of the two rotations of cartesian3 may turn at the rate; of second order in the step, joints turn more
         assert np.sqrt(-0.5 * np.trace(twist @ twist)) < 0.2 * np.sqrt(2.0) * 1.02
@@ -255,9 +245,7 @@ def test_one_camera_is_enough_once_the_points_are_known(virtual, law, camera):
     T0, T_star = virtual.random_task(rng, 40, 0.15)
     weights = np.zeros((2, 4))
     weights[camera] = 1.0
-    error, *_ = follow(
-        virtual, virtual.free_arm(rng, T0), T0, T_star, law, Options(1.0, PERIOD), weights=weights
-    )
+    error, *_ = follow(virtual, virtual.free_arm(rng, T0), T0, T_star, law, Options(1.0, PERIOD), weights=weights)
     assert error < 0.5
 
 
@@ -310,15 +298,11 @@ def test_euclidean_points_are_the_pseudo_inverse_in_metres(virtual, seed):
     for world, composition in both:
         scene = scene_of(virtual, world, composition, T0)
         task = task_of(virtual, world, scene, T_star)
-        step = euclidean_points(np.linalg.inv(world.frame))(
-            scene, task, Options(0.7, 0.0, JacobianChoice.CURRENT, 0.0)
-        )
+        step = euclidean_points(np.linalg.inv(world.frame))(scene, task, Options(0.7, 0.0, JacobianChoice.CURRENT, 0.0))
         X, Y = virtual.PLATE @ T0.T, virtual.PLATE @ T_star.T
         operators = np.linalg.inv(world.frame) @ scene.operators @ world.frame
         J = np.einsum("nij,mj->min", operators, X)[:, :3].reshape(-1, 6)
-        np.testing.assert_allclose(
-            step.velocity, 0.7 * np.linalg.pinv(J) @ (Y - X)[:, :3].reshape(-1), atol=1e-8
-        )
+        np.testing.assert_allclose(step.velocity, 0.7 * np.linalg.pinv(J) @ (Y - X)[:, :3].reshape(-1), atol=1e-8)
 
 
 def test_after_the_warm_up_no_law_has_anything_to_compile(virtual):

@@ -35,9 +35,7 @@ def arm(virtual, rng, screws):
 
 
 def scara(virtual, rng):
-    return arm(
-        virtual, rng, [virtual.screw(UP, np.array(p)) for p in (BASE, ELBOW, WRIST)] + [virtual.screw(UP)]
-    )
+    return arm(virtual, rng, [virtual.screw(UP, np.array(p)) for p in (BASE, ELBOW, WRIST)] + [virtual.screw(UP)])
 
 
 def planar(virtual, rng, joints):
@@ -94,9 +92,7 @@ def test_regular_six_joints_drive_all(virtual, known):
     assert found.block == ()
     assert found.self_motions.shape == (6, 0)
     assert min(freedom.share for freedom in found.freedoms) > 1 - 1e-9
-    assert [freedom.name for freedom in found.freedoms] == [
-        f"{name} of the first camera" for name in FREEDOMS
-    ]
+    assert [freedom.name for freedom in found.freedoms] == [f"{name} of the first camera" for name in FREEDOMS]
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -173,9 +169,7 @@ def test_small_errors_of_the_operators_change_nothing(virtual, build):
     for _ in range(5):
         estimated = []
         for X in operators:
-            D = virtual.pose(
-                Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=3)), 1e-4 * rng.normal(size=3)
-            )
+            D = virtual.pose(Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=3)), 1e-4 * rng.normal(size=3))
             D = world.frame @ D @ np.linalg.inv(world.frame)
             estimated.append(D @ X @ np.linalg.inv(D))
         found = mobility(np.array(estimated), *rest)
@@ -237,9 +231,7 @@ def test_self_motion_of_seven_joints_leaves_the_images(virtual):
     before = world.pixels(world.markers())
     start = world.q.copy()
     rate, dt = 1.0, 0.002
-    half = np.array(
-        [0.5 * (u - v) if np.isfinite(u - v) and u > v else 1.0 for u, v in zip(upper, lower, strict=True)]
-    )
+    half = np.array([0.5 * (u - v) if np.isfinite(u - v) and u > v else 1.0 for u, v in zip(upper, lower, strict=True)])
     for _ in range(1500):
         velocity = self_motion_from_limits(rows_of(world, form), world.q, lower, upper, rate)
         assert (np.abs(velocity) <= rate * half * (1 + 1e-12)).all()
@@ -253,18 +245,14 @@ def test_self_motion_of_seven_joints_leaves_the_images(virtual):
     for step in (0.02, 0.01):
         world.q = start.copy()
         for _ in range(round(0.4 / step)):
-            world.q = world.q + step * self_motion_from_limits(
-                rows_of(world, form), world.q, lower, upper, rate
-            )
+            world.q = world.q + step * self_motion_from_limits(rows_of(world, form), world.q, lower, upper, rate)
         errors.append(np.abs(world.pixels(world.markers()) - before).max())
     assert errors[1] == pytest.approx(0.5 * errors[0], rel=0.15)
 
 
 def test_arm_without_self_motions_rests_at_its_limits(virtual):
     world = virtual.rx90(np.random.default_rng(8))
-    velocity = self_motion_from_limits(
-        rows_of(world, form_of(world)), world.q, world.q - 0.01, world.q + 3.0, 1.0
-    )
+    velocity = self_motion_from_limits(rows_of(world, form_of(world)), world.q, world.q - 0.01, world.q + 3.0, 1.0)
     assert not velocity.any()
     broken = np.full((12, 6), np.nan)
     assert not self_motion_from_limits(broken, world.q, world.q - 0.01, world.q + 3.0, 1.0).any()
@@ -277,9 +265,7 @@ def test_wanted_motions_are_refused_in_words_where_they_are_not_the_arms(virtual
     inverse = np.linalg.inv(world.frame)
 
     def asked(G, cell=world, known=True):
-        return missing_freedom(
-            *seen(cell, known)[:4], cell.frame @ G @ np.linalg.inv(cell.frame), seen(cell, known)[4]
-        )
+        return missing_freedom(*seen(cell, known)[:4], cell.frame @ G @ np.linalg.inv(cell.frame), seen(cell, known)[4])
 
     assert asked(virtual.screw(UP, middle)) is None
     assert asked(0.3 * virtual.screw(UP, np.array(ELBOW)) - 2 * virtual.screw([1, 0, 0])) is None
@@ -314,9 +300,7 @@ def test_wanted_motions_are_refused_in_words_where_they_are_not_the_arms(virtual
         motion = J @ np.concatenate([G[:3, 3], w])
         refused = asked(G, stuck)
         assert refused is not None
-        assert refused.share == pytest.approx(
-            np.linalg.norm(made.T @ motion) / np.linalg.norm(motion), abs=1e-9
-        )
+        assert refused.share == pytest.approx(np.linalg.norm(made.T @ motion) / np.linalg.norm(motion), abs=1e-9)
     joint_five = inverse_of(stuck) @ stuck.operators()[4] @ stuck.frame
     assert asked(joint_five, stuck) is None
 
@@ -340,9 +324,7 @@ def test_degenerate_input(virtual):
     none = mobility(np.zeros((2, 4, 4)), matrices, points, infinity, upgrade)
     assert none.rank == 0
     assert len(none.missing) == 6
-    assert (
-        missing_freedom(np.zeros((1, 4, 4)), matrices, points, infinity, operators[0], upgrade).share == 0.0
-    )
+    assert missing_freedom(np.zeros((1, 4, 4)), matrices, points, infinity, operators[0], upgrade).share == 0.0
 
 
 def test_body_frame_is_right_angled_and_faces_the_camera(virtual):

@@ -20,9 +20,7 @@ HELD = LAG + 0.5 * DT
 """A velocity held for a step is late by half of it."""
 
 
-def tracking_error(
-    omega: float, gain: float, lag_s: float, damping: float = 0.0, feed_forward: bool = True
-) -> float:
+def tracking_error(omega: float, gain: float, lag_s: float, damping: float = 0.0, feed_forward: bool = True) -> float:
     """Amplitude of the tracking error over that of a target in sinusoidal motion, by the transfer functions."""
     p = 1j * omega
     characteristic = lag_s * p**2 + (1.0 + damping) * p + gain

@@ -59,9 +59,7 @@ def safety_stage(inputs, limits):
         inputs.raw, inputs.positions, inputs.previous, inputs.brake, inputs.dt_s, inputs.joint_age_s,
         inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
     )  # fmt: skip
-    told, found = limit_velocity(
-        wanted, Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted
-    )
+    told, found = limit_velocity(wanted, Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted)
     return explained(inputs, limits, limited, found, acted) if told else SafetyResult(inputs.raw, limited)
 
 
@@ -89,9 +87,7 @@ def test_any_input_gives_a_finite_command_within_velocity_and_acceleration(
     limits = make_limits(keep_outs=[[[0.2, 0.4], [-0.3, 0.3], [-np.inf, np.inf]]])
     previous = np.clip(previous, -limits.velocity_max, limits.velocity_max)
     result = safety_stage(
-        SafetyInputs(
-            np.array(raw), np.array(positions), previous, DT, joint_age, feature_age, needs, scale, brake
-        ),
+        SafetyInputs(np.array(raw), np.array(positions), previous, DT, joint_age, feature_age, needs, scale, brake),
         limits,
     )
     assert np.isfinite(result.limited).all()
@@ -118,10 +114,7 @@ def test_the_direction_is_kept_unless_positions_or_acceleration_act(raw, previou
         change = result.limited - previous
         if stage.JOINT_LIMIT not in codes(result):  # a share of the way to a multiple of raw
             factor = 1.0 if not raw.any() else None
-            assert (
-                factor == 1.0
-                or np.linalg.matrix_rank(np.stack([raw, previous, previous + change]), tol=1e-9) <= 2
-            )
+            assert factor == 1.0 or np.linalg.matrix_rank(np.stack([raw, previous, previous + change]), tol=1e-9) <= 2
         return
     size = np.abs(raw).max()
     multiple = 0.0 if size == 0.0 else result.limited[np.abs(raw).argmax()] / raw[np.abs(raw).argmax()]
@@ -398,9 +391,7 @@ def drawn(rng):
         ),
         feature_age_s=float(rng.choice([0.0, 0.15, 0.3, 0.5, 0.7, -0.1, np.nan])),
         needs_features=bool(rng.random() < 0.3),
-        speed_scale=float(
-            rng.choice([1.0, 0.3, 0.0, 1.5, -1.0, np.nan], p=[0.6, 0.2, 0.05, 0.05, 0.05, 0.05])
-        ),
+        speed_scale=float(rng.choice([1.0, 0.3, 0.0, 1.5, -1.0, np.nan], p=[0.6, 0.2, 0.05, 0.05, 0.05, 0.05])),
         brake=bool(rng.random() < 0.1),
     )
 
@@ -417,9 +408,7 @@ def test_the_stage_answers_as_its_plain_description_does():
         told = [(r.code, r.level, r.subject, r.value, r.threshold) for r in result.reasons]
         assert [t[:3] for t in told] == [r[:3] for r in wanted.reasons], where
         for reason, (*_, value, threshold, words) in zip(result.reasons, wanted.reasons, strict=True):
-            assert reason.value == (None if value is None else pytest.approx(value, rel=1e-9, abs=1e-10)), (
-                where
-            )
+            assert reason.value == (None if value is None else pytest.approx(value, rel=1e-9, abs=1e-10)), where
             assert reason.threshold == (None if threshold is None else pytest.approx(threshold)), where
             assert words in reason.hint, where
         seen |= codes(result)
@@ -434,9 +423,7 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
         now_ns, source, cell = 10**12 + int(rng.integers(10**9)), *rng.uniform(0.2, 1.0, 2)
         ages_ns = [int(age * 1e9) for age in rng.uniform(0.0, 0.8, 3)]
         accepted = ages_ns[: rng.integers(3)]
-        late = bool(
-            rng.integers(2)
-        )  # drives that are late: where they will be counts, and not where they are
+        late = bool(rng.integers(2))  # drives that are late: where they will be counts, and not where they are
         block, record = Block(counts), np.zeros(1, WORKSPACE)
         work, arrays = Numbers.from_buffer(record.view(np.uint8).data), views(record, ARRAYS, counts)
         for estimate, age_ns in zip(block.estimates, accepted, strict=False):
@@ -453,9 +440,7 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
                 step.positions + block.delay_under_way,
                 np.where(step.raw != 0.0, step.raw, step.previous),
             )
-            outermost = np.where(
-                towards > 0.0, np.maximum(step.positions, ahead), np.minimum(step.positions, ahead)
-            )
+            outermost = np.where(towards > 0.0, np.maximum(step.positions, ahead), np.minimum(step.positions, ahead))
         command(block.record, record, limits.keep_outs)
         context = SimpleNamespace(
             derived=SimpleNamespace(room=SimpleNamespace(numbers=work, arrays=arrays)),

@@ -10,9 +10,7 @@ from stereoservo.control.laws.cartesian3 import way_in_sight as kernel
 
 def problem(virtual, rng, angle=None):
     """A face, a turn about its middle, a way, cameras; in a random frame. Whether it is seen, Euclidean."""
-    T0, T_star = virtual.random_task(
-        rng, rng.uniform(100, 180) if angle is None else angle, rng.uniform(0, 1.5)
-    )
+    T0, T_star = virtual.random_task(rng, rng.uniform(100, 180) if angle is None else angle, rng.uniform(0, 1.5))
     world = virtual.free_arm(rng, T0)
     turn = Rotation.from_matrix(T_star[:3, :3] @ T0[:3, :3].T).as_rotvec()
     theta = float(np.linalg.norm(turn))
@@ -80,9 +78,7 @@ def test_translation_waits_for_the_turn_and_the_turn_for_the_translation(virtual
         normal = np.array([np.sin(phi), 0, -np.cos(phi)])
         face = np.append(normal, -normal @ [x, 0, 1.0])
         turn = np.angle(np.exp(1j * (phi - to_phi)))
-        return way_in_sight(
-            face, virtual.screw([0, 1.0, 0], [x, 0, 1.0]), np.array([to_x - x, 0, 0, 0]), eye, turn
-        )
+        return way_in_sight(face, virtual.screw([0, 1.0, 0], [x, 0, 1.0]), np.array([to_x - x, 0, 0, 0]), eye, turn)
 
     far = np.radians(120.0)
     assert way(-1.0, 0.0, 1.0, 0.0) == (0.0, 1.0, 0.0, True)

@@ -15,9 +15,7 @@ def arm(virtual, rng, joints=6):
     """Operators of joints of all kinds in a random projective frame."""
     generators = np.array(
         [
-            virtual.screw(rng.normal(size=3))
-            if j % 3 == 2
-            else virtual.screw(_unit(rng), rng.uniform(-0.5, 0.5, 3))
+            virtual.screw(rng.normal(size=3)) if j % 3 == 2 else virtual.screw(_unit(rng), rng.uniform(-0.5, 0.5, 3))
             for j in range(joints)
         ]
     )
@@ -41,9 +39,7 @@ def test_the_step_makes_the_displacement_and_the_kernel_finds_it_too(virtual, co
     rough = truth + rng.uniform(-0.05, 0.05, 6)
     step = reference.corrected_step(operators, composition, points, wanted, rough)
     np.testing.assert_allclose(step, truth, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(
-        points @ displacement(operators, composition, step).T, wanted, rtol=0, atol=1e-11
-    )
+    np.testing.assert_allclose(points @ displacement(operators, composition, step).T, wanted, rtol=0, atol=1e-11)
     found = kernels.corrected_step(operators, int(composition), points, wanted, rough)
     np.testing.assert_allclose(found, step, rtol=0, atol=1e-9)
 
@@ -96,9 +92,7 @@ def test_a_redundant_arm_takes_the_least_change(virtual, composition):
     rough = rng.uniform(-0.1, 0.1, 8)
     wanted = points @ displacement(operators, composition, rough + rng.uniform(-0.02, 0.02, 8)).T
     step = kernels.corrected_step(operators, int(composition), points, wanted, rough)
-    np.testing.assert_allclose(
-        points @ displacement(operators, composition, step).T, wanted, rtol=0, atol=1e-10
-    )
+    np.testing.assert_allclose(points @ displacement(operators, composition, step).T, wanted, rtol=0, atol=1e-10)
     assert np.abs(step - rough).max() < 0.3
 
 

@@ -89,9 +89,7 @@ def test_a_deviation_decays_while_the_way_goes_on(virtual):
 def test_noise_does_not_lead_it_astray(virtual):
     rng = np.random.default_rng(3)
     T0, T_star = virtual.random_task(rng, 100, 0.3)
-    deviations, error = track(
-        virtual, virtual.free_arm(rng, T0), Composition.SIMULTANEOUS, T_star, 1.0, noise=0.1
-    )
+    deviations, error = track(virtual, virtual.free_arm(rng, T0), Composition.SIMULTANEOUS, T_star, 1.0, noise=0.1)
     assert deviations.max() < 0.001
     assert error < 0.5
 

@@ -52,9 +52,7 @@ def link(a: float, alpha_deg: float, d: float, theta: float) -> np.ndarray:
         np.cos(theta),
         np.sin(theta),
     )
-    return np.array(
-        [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0, sa, ca, d], [0, 0, 0, 1.0]]
-    )
+    return np.array([[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0, sa, ca, d], [0, 0, 0, 1.0]])
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0, 0, 1.0)) -> np.ndarray:
@@ -141,18 +139,13 @@ def make_truth(
             for s, z in ((0.1, 0.45), (0.5, 0.15))
         ][: count - 2]
     )
-    if (
-        mount == "eye_in_hand"
-    ):  # everything in the flange's frame; the pair looks along its axis, bodies stand there
+    if mount == "eye_in_hand":  # everything in the flange's frame; the pair looks along its axis, bodies stand there
         generators = np.array([-np.linalg.inv(flange) @ G @ flange for G in generators])
         middle = np.array([0.02, 0.01, 1.0])
         markers = np.column_stack([middle + body * (1, -1, -1) + (0, 0, 0.06), np.ones(len(body))])
         K[0, 0] = K[1, 1] = 500
         cameras = np.array(
-            [
-                K @ np.linalg.inv(look_at(np.array([0.03, s * 0.1, 0.05]), middle, (1.0, 0, 0)))[:3]
-                for s in (-1, 1)
-            ]
+            [K @ np.linalg.inv(look_at(np.array([0.03, s * 0.1, 0.05]), middle, (1.0, 0, 0)))[:3] for s in (-1, 1)]
         )
     lens = np.array([k1 * 320**2 / K[0, 0] ** 2, 320.0, 240.0, 320.0])
     H = np.eye(4) + 0.3 * rng.standard_normal((4, 4))  # projective -> Euclidean
@@ -329,9 +322,7 @@ class Bench:
             for event in self.events[start:]:
                 if wanted(event):
                     return event
-        raise AssertionError(
-            f"not seen in {seconds} s; events: {[(e.kind, e.message) for e in self.events[start:]]}"
-        )
+        raise AssertionError(f"not seen in {seconds} s; events: {[(e.kind, e.message) for e in self.events[start:]]}")
 
     def reply(self, command: Command, seconds: float = 20.0) -> Event:
         """Send a command and step until its own reply."""
@@ -357,8 +348,7 @@ class Bench:
     def features(self, q: np.ndarray) -> dict[str, dict[int, tuple[float, float]]]:
         exact = self.truth.pixels(q)
         return {
-            name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])}
-            for c, name in enumerate(self.names)
+            name: {i: (float(u), float(v)) for i, (u, v) in enumerate(exact[c])} for c, name in enumerate(self.names)
         }
 
     def goal(self, target: Target, **options: Any) -> RunGoal:

@@ -113,9 +113,7 @@ def counts(model_path: Path, markers: int, measure: Literal["lines", "bytes"]) -
     run("planning", steps=3)
     run("cancel", CancelGoal(far.id))
     points = {i: tuple(X) for i, X in zip(model.marker_ids, model.marker_points.tolist(), strict=True)}
-    first, second = model.marker_ids[
-        :2
-    ]  # apart: of an incidence that is made already rounding alone says what can be
+    first, second = model.marker_ids[:2]  # apart: of an incidence that is made already rounding alone says what can be
     corner = IncidenceSpec("point-on-point", Feature(markers=(first,)), Feature(points=(points[second],)))
     for name, target in (
         ("points", PointTarget(points, model.epoch)),

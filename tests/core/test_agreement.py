@@ -176,9 +176,7 @@ def test_a_displaced_camera_is_told_and_joints_are_not_blamed_on_it(seed: int) -
 
     def decided(d: FloatArray) -> tuple[int, list[int]]:
         noisy = d + root @ rng.standard_normal(len(d))
-        found = decide(
-            *compared(noisy, C, displaced, jacobian, begins), len(d), n, 0.125, both, may_wait=True
-        )
+        found = decide(*compared(noisy, C, displaced, jacobian, begins), len(d), n, 0.125, both, may_wait=True)
         if found[0] != DOUBTFUL:
             return found
         more = C - np.eye(len(C)) * NOISE_PX**2 * (1.0 / FRAMES - 1.0 / MOST_FRAMES)

@@ -83,8 +83,7 @@ def test_settings_take_the_step_that_the_driver_describes():
         "x", (JointSpec("a", "revolute", -1.0, 1.0, 1.0, 1.0, STEP),), 100.0, "clock", 0.1, 1000.0
     )
     cameras = tuple(
-        CameraDescription("x", name, 640, 480, 30.0, "observations", 1000.0, (1, 2, 3, 4))
-        for name in ("left", "right")
+        CameraDescription("x", name, 640, 480, 30.0, "observations", 1000.0, (1, 2, 3, 4)) for name in ("left", "right")
     )
     assert core_settings(cell, joints, cameras).resolution == (STEP,)
 

@@ -217,9 +217,7 @@ def test_following_error_stops_with_its_own_reason(settings: CoreSettings) -> No
 def test_the_joint_farthest_beyond_its_threshold_is_named(bench: Any) -> None:
     settings = with_contact(bench.settings, stated(effort={1: 10.0, 4: 1.0}))
     efforts = np.tile(GRAVITY, (30, 1))
-    efforts[10:] += np.array(
-        [900.0, 30.0, 900.0, 0.0, 5.0, 0.0]
-    )  # 3 times, 5 times; the others have no threshold
+    efforts[10:] += np.array([900.0, 30.0, 900.0, 0.0, 5.0, 0.0])  # 3 times, 5 times; the others have no threshold
     assert fly(enabled(settings), settings, efforts)[0][1].subject == "j5"
 
 
@@ -325,9 +323,7 @@ def test_stated_thresholds_come_before_learnt_ones(bench: Any) -> None:
     [
         None,
         JointLoads(np.ones(N)),
-        JointLoads(
-            np.ones(N), np.zeros((N, N)), np.zeros(N), np.zeros(N)
-        ),  # drives that say 0 measure nothing
+        JointLoads(np.ones(N), np.zeros((N, N)), np.zeros(N), np.zeros(N)),  # drives that say 0 measure nothing
     ],
 )
 def test_nothing_learnt_is_no_threshold(bench: Any, loads: JointLoads | None) -> None:

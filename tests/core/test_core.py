@@ -49,9 +49,7 @@ def ended(event: Any) -> bool:
 @pytest.mark.parametrize("law", ["stereo", "cartesian3"])
 @pytest.mark.parametrize("points", ["predicted", "triangulated"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_goal_is_reached_from_a_random_frame_with_noise(
-    benches: Any, law: str, points: str, seed: int
-) -> None:
+def test_goal_is_reached_from_a_random_frame_with_noise(benches: Any, law: str, points: str, seed: int) -> None:
     bench = benches(seed, noise_px=0.05).ready()
     target = bench.q + DISPLACED * (0.5 if law == "stereo" else 1.0)
     assert bench.reply(goal(bench, target, law=law, points=points)).accepted
@@ -298,9 +296,7 @@ def test_model_waits_for_rest_and_unknown_models_are_refused(bench: Any) -> None
     ],
     ids=["joint kinds", "mount", "image size", "cameras"],
 )
-def test_a_model_of_another_cell_is_refused_and_the_one_in_force_stays(
-    bench: Any, change: Any, told: str
-) -> None:
+def test_a_model_of_another_cell_is_refused_and_the_one_in_force_stays(bench: Any, change: Any, told: str) -> None:
     moving(bench)
     model, source = bench.core.state.model, bench.core.state.source
     foreign = msgspec.structs.replace(model, epoch=9, **change(model))
@@ -359,9 +355,7 @@ def test_goal_can_be_taught_and_reached_again(bench: Any) -> None:
         s.camera: {int(i): (float(p[0]), float(p[1])) for i, p in zip(s.ids, s.pixels, strict=True)}
         for s in taught.samples
     }
-    assert bench.reply(
-        RunGoal(Goal(str(uuid.UUID(int=7)), FeatureTarget(set_points, model_epoch=7)))
-    ).accepted
+    assert bench.reply(RunGoal(Goal(str(uuid.UUID(int=7)), FeatureTarget(set_points, model_epoch=7)))).accepted
     assert bench.until(ended, 25.0).kind == "goal_reached"
     assert bench.error_px(shown) < 0.3
 
@@ -449,9 +443,7 @@ def test_trial_motions_wait_for_a_camera_that_is_still_starting(benches: Any) ->
     bench.step(Enable())
     bench.reply(Calibrate("00000011"))
     bench.run(20.0)
-    assert not [
-        e for e in bench.events if e.kind.startswith("calibration_") and e.kind != "calibration_progress"
-    ]
+    assert not [e for e in bench.events if e.kind.startswith("calibration_") and e.kind != "calibration_progress"]
     bench.cameras_on[1] = True
     sample = bench.until(lambda e: e.kind == "calibration_sample", 5.0)
     assert sample.trial == -1

@@ -23,9 +23,7 @@ from .conftest import NAMES, make_bench
 WATCHDOG_S = 0.1
 """After which the bench's drives rest without a new command."""
 ODD = st.sampled_from([np.nan, np.inf, -np.inf, 1e300, -1e9])
-LATE_NS = st.sampled_from(
-    [-(10**18), -3_600_000_000_000, -200_000_000, 1, 20_000_000, 3_600_000_000_000, 2**62]
-)
+LATE_NS = st.sampled_from([-(10**18), -3_600_000_000_000, -200_000_000, 1, 20_000_000, 3_600_000_000_000, 2**62])
 
 
 def replaced(struct: Any, **fields: Any) -> Any:
@@ -35,9 +33,7 @@ def replaced(struct: Any, **fields: Any) -> Any:
 @st.composite
 def joint_corruptions(draw: st.DrawFn) -> Any:
     """A function of a joint sample that makes another of it; None: it is lost."""
-    kind = draw(
-        st.sampled_from(["value", "velocity", "effort", "length", "jump", "stamp", "number", "none", "type"])
-    )
+    kind = draw(st.sampled_from(["value", "velocity", "effort", "length", "jump", "stamp", "number", "none", "type"]))
     j, odd, late = draw(st.integers(0, 5)), draw(ODD), draw(LATE_NS)
     size = draw(st.integers(0, 9).filter(lambda n: n != 6))
     jump = draw(st.sampled_from([0.3, -0.3, 1.0, -6.0, 100.0]))
@@ -126,9 +122,7 @@ class CorruptedCell(RuleBasedStateMachine):
     @initialize(seed=st.integers(0, 2**16))
     def start(self, seed: int) -> None:
         self.bench = make_bench(seed)
-        self.bench.now_ns = (
-            3_600_000_000_000  # a computer that has run for an hour: its clock is never negative
-        )
+        self.bench.now_ns = 3_600_000_000_000  # a computer that has run for an hour: its clock is never negative
         self.core = self.bench.core
         self.bench.core = self  # type: ignore[assignment]
         self.corrupt_joints = self.corrupt_frames = None

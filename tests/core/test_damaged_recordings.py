@@ -140,16 +140,12 @@ def test_a_block_of_few_bytes_does_not_fill_the_memory(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("length", [2**40, 2**63, 2**64 - 1, 2**31])
-def test_a_length_that_lies_in_a_recording_of_format_1_is_refused(
-    bench: Any, tmp_path: Path, length: int
-) -> None:
+def test_a_length_that_lies_in_a_recording_of_format_1_is_refused(bench: Any, tmp_path: Path, length: int) -> None:
     path = tmp_path / "former.mcap"
     with FormerRecorder(path, bench.settings, fingerprint()) as recorder:
         recorder.checkpoint(1, encode_state(bench.core.state), 1)
     data = bytearray(path.read_bytes())
-    struct.pack_into(
-        "<Q", data, data.index(b"\x04\x22\x4d\x18") + 6, length
-    )  # an LZ4 frame states its own size
+    struct.pack_into("<Q", data, data.index(b"\x04\x22\x4d\x18") + 6, length)  # an LZ4 frame states its own size
     found = read(path, bytes(data))
     assert isinstance(found, RecordingError)
     assert f"whose data state {length}" in str(found)
@@ -198,9 +194,7 @@ def test_the_command_gives_a_verdict_on_a_cut_recording(
     assert cli.invoke(["replay", str(path)]) == 0
     assert "identical up to step" in capfd.readouterr().out
     damaged = bytearray(whole)
-    damaged[len(whole) // 2] ^= (
-        0xFF  # in the middle, and the rest of the file is there: not what a crash leaves
-    )
+    damaged[len(whole) // 2] ^= 0xFF  # in the middle, and the rest of the file is there: not what a crash leaves
     path.write_bytes(bytes(damaged))
     code, result = run()
     assert code == 1

@@ -172,9 +172,7 @@ def test_a_disk_without_any_room_leaves_no_empty_segments_and_is_trouble_until_a
     assert replay(flight.segments()[-1]).identical is True
 
 
-def test_the_ring_is_kept_at_a_fault_with_what_follows(
-    flight: Flight, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_ring_is_kept_at_a_fault_with_what_follows(flight: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ring_module, "AFTER_FAULT_S", 0.5)
     for fault in range(3):
         flight.fly(0.5)

@@ -68,9 +68,7 @@ def test_nothing_hunts_while_a_goal_is_held_against_friction(bench: Any, resolut
     with_settings(bench, resolution=(resolution,) * 6, hold_frames=1000)
     bench.resolution, bench.dead_speed, bench.noise_px = resolution, 0.01, 0.05
     target = bench.q + WAY
-    assert bench.reply(
-        bench.goal(FeatureTarget(bench.features(target)), law="stereo", time_limit_s=60.0)
-    ).accepted
+    assert bench.reply(bench.goal(FeatureTarget(bench.features(target)), law="stereo", time_limit_s=60.0)).accepted
     bench.run(14.0)
     stood = []
     for _ in range(6):
@@ -90,14 +88,10 @@ def test_play_before_a_coarse_encoder_is_not_taken_for_friction(
 ) -> None:
     """A joint that stands, whatever it is sent; the demo with `--mechanics serial_servo` hunted to its time limit."""
     accuracy = JointAccuracy(np.full(6, 0.01), *(np.zeros(6),) * 3)
-    bench.truth.model = msgspec.structs.replace(
-        bench.truth.model, joint_accuracy=accuracy if stated else None
-    )
+    bench.truth.model = msgspec.structs.replace(bench.truth.model, joint_accuracy=accuracy if stated else None)
     with_settings(bench, watch_following=False, resolution=(resolution,) * 6)
     bench.resolution, bench.frozen_joint, bench.dead_speed = resolution, 2, 1.0
-    assert bench.reply(
-        bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)
-    ).accepted
+    assert bench.reply(bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)).accepted
     bench.run(3.0)
     assert bool(bench.core.state.block.friction.any()) is added
 
@@ -105,9 +99,7 @@ def test_play_before_a_coarse_encoder_is_not_taken_for_friction(
 def test_what_is_added_is_bounded_and_forgotten_with_the_goal(bench: Any) -> None:
     with_settings(bench, watch_following=False)
     bench.frozen_joint, bench.dead_speed = 2, 1.0  # nothing moves, whatever is sent
-    assert bench.reply(
-        bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)
-    ).accepted
+    assert bench.reply(bench.goal(FeatureTarget(bench.features(bench.q + 0.02 * WAY)), time_limit_s=4.0)).accepted
     bench.run(3.0)
     most = MOST["revolute"]
     assert 0.9 * most < np.abs(bench.core.state.block.friction).max() <= most

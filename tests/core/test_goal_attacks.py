@@ -160,9 +160,7 @@ def test_repeated_ids_are_harmless(bench: Any) -> None:
     assert (ends(bench, "0000aaaa"), ends(bench, "0000bbbb")) == (["goal_reached"], [])
 
 
-def test_burst_of_goals_is_read_one_a_step_and_each_is_answered(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_burst_of_goals_is_read_one_a_step_and_each_is_answered(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.ready()
     read = []
     prepare = accept.prepare
@@ -198,9 +196,7 @@ def test_extreme_numbers_are_refused_when_they_are_read(bench: Any) -> None:
             msgspec.msgpack.decode(msgspec.msgpack.encode(request), type=Request)
 
 
-def test_set_points_at_any_rate_are_worked_on_once_a_step(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_set_points_at_any_rate_are_worked_on_once_a_step(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.ready()
     base = bench.q.copy()
     assert bench.reply(of("0000aaaa", to(bench, base), gain=4.0)).accepted

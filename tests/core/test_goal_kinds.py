@@ -188,9 +188,7 @@ def test_half_a_turn_exactly_is_made(benches: Any, law: str) -> None:
     bench.ready()
     goal_q = bench.q.copy()
     goal_q[5] -= np.pi
-    reply = bench.reply(
-        bench.goal(bench.displacement_target(bench.displacement_to(goal_q)), law=law, gain=3.0)
-    )
+    reply = bench.reply(bench.goal(bench.displacement_target(bench.displacement_to(goal_q)), law=law, gain=3.0))
     assert reply.accepted, reply
     assert bench.ended().kind == "goal_reached"
     assert bench.error_px(goal_q) < 0.2
@@ -211,9 +209,7 @@ def test_marker_is_brought_onto_a_plane_and_the_rest_goes_where_it_is_asked_to(b
     bench.ready()
     corners = bench.truth.points(bench.q + 0.5 * DISPLACED)[:3]
     joint = float(bench.q[5] + 0.3)
-    command = incidence(
-        bench, "point-on-plane", (4,), bench.projective(corners), secondary=JointTarget({"j6": joint})
-    )
+    command = incidence(bench, "point-on-plane", (4,), bench.projective(corners), secondary=JointTarget({"j6": joint}))
     reply = bench.reply(command)
     assert reply.accepted, reply
     assert "not planned" in reply.plan.way
@@ -237,10 +233,7 @@ def test_incidences_that_cannot_be_are_refused(bench: Any) -> None:
     moving = Feature(markers=(0,))
     assert code(IncidenceSpec("point-on-point", moving, Feature(points=point)), 5) == "OTHER_MODEL"
     assert code(IncidenceSpec("point-on-point", moving, Feature(points=point)), None) == "FRAME_UNKNOWN"
-    assert (
-        code(IncidenceSpec("point-on-point", Feature(markers=(55,)), Feature(points=point)))
-        == "NO_SUCH_MARKER"
-    )
+    assert code(IncidenceSpec("point-on-point", Feature(markers=(55,)), Feature(points=point))) == "NO_SUCH_MARKER"
     for bad in (
         IncidenceSpec("point-on-point", moving, Feature()),
         IncidenceSpec("point-on-point", moving, Feature(markers=(1,))),

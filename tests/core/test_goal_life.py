@@ -164,9 +164,7 @@ def test_joint_goal_through_a_keep_out_is_refused_with_the_place(benches: Any) -
 
 def speed_at(bench: Any, goal_id: str, kind: str) -> float:
     """Joint speed [rad/s] around an event of a goal: the least of the ten steps about it."""
-    k = next(
-        i for i, (_, out) in enumerate(bench.log) for e in out.events if e.id == goal_id and e.kind == kind
-    )
+    k = next(i for i, (_, out) in enumerate(bench.log) for e in out.events if e.id == goal_id and e.kind == kind)
     return min(float(np.abs(out.command).max()) for _, out in bench.log[k - 5 : k + 5])
 
 
@@ -321,9 +319,7 @@ def test_time_in_which_nobody_hears_the_clients_is_none_of_a_lease(bench: Any) -
     for _ in range(10):
         bench.step(ExtendLeases(0.2))
         bench.run(0.2)
-    assert {"goal_aborted", "reply"} & {
-        e.kind for e in bench.events[before:]
-    } == set()  # nobody asked: no reply
+    assert {"goal_aborted", "reply"} & {e.kind for e in bench.events[before:]} == set()  # nobody asked: no reply
     bench.run(1.0)
     ends = {e.id: e.reasons[0].code for e in bench.events if e.kind == "goal_aborted"}
     assert ends == {first.goal.id: "LEASE_EXPIRED", second.goal.id: "LEASE_EXPIRED"}
@@ -381,9 +377,7 @@ def test_progress_runs_to_its_end(bench: Any) -> None:
         since = len(bench.log)
         bench.ended()
         told = [
-            (o.status.progress, o.status.seconds_left)
-            for _, o in bench.log[since:]
-            if o.status.progress is not None
+            (o.status.progress, o.status.seconds_left) for _, o in bench.log[since:] if o.status.progress is not None
         ]
         shares, left = np.array(told).T
         assert shares[0] < 0.1

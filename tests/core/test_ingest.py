@@ -171,9 +171,7 @@ def test_a_frame_with_a_wild_number_blinds_no_camera(bench: Any, number: int) ->
         ({"ids": np.arange(300)}, "300 markers, 256 are allowed"),
     ],
 )
-def test_a_frame_that_cannot_be_stops_what_works_by_images(
-    bench: Any, change: dict[str, Any], told: str
-) -> None:
+def test_a_frame_that_cannot_be_stops_what_works_by_images(bench: Any, change: dict[str, Any], told: str) -> None:
     servoing(bench)
     while not bench.pending or bench.pending[0].t_received_ns > bench.now_ns + 10_000_000:
         bench.step()
@@ -331,9 +329,7 @@ def test_a_frame_of_the_future_stops_what_works_by_images_and_is_not_kept(bench:
     assert np.abs(outputs.command).max() == 0.0
     assert codes(outputs)[-2:] == ["CAMERA_STAMP", "STOPPED"]
     assert bench.reply(Resume()).accepted
-    assert bench.reply(
-        RunGoal(Goal("0000abce", FeatureTarget(bench.features(bench.q + 0.3 * DISPLACED))))
-    ).accepted
+    assert bench.reply(RunGoal(Goal("0000abce", FeatureTarget(bench.features(bench.q + 0.3 * DISPLACED))))).accepted
     assert bench.until(lambda e: e.kind == "goal_reached", 25.0)
     assert "CAMERA_STAMP" not in codes(bench.log[-1][1])
 
@@ -513,9 +509,7 @@ def test_the_longest_gap_is_what_the_drives_bear_and_half_a_second_at_most(
     bench.settings = msgspec.structs.replace(bench.settings, limits=limits)
     bench.core = ServoCore(bench.settings)
     jogging(bench)
-    bench.q = bench.q + bench.log[-1][1].command * (
-        gap_s - 0.01
-    )  # drives that do the last command all the time
+    bench.q = bench.q + bench.log[-1][1].command * (gap_s - 0.01)  # drives that do the last command all the time
     after_a_gap(bench, gap_s)
     assert bench.core.state.stopped == stops
     assert bench.run(0.2).status.lifecycle == "active"

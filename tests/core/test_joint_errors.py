@@ -40,16 +40,12 @@ def run_goals(bench: Any, seed: int, count: int = 2) -> tuple[list[float], set[s
         assert bench.reply(bench.goal(FeatureTarget(bench.features(q)), law="cartesian3")).accepted
         if bench.ended(40.0).kind == "goal_reached":
             bench.run(1.0)
-            errors.append(
-                float(np.linalg.norm(bench.truth.pixels(bench.q) - bench.truth.pixels(q), axis=-1).max())
-            )
+            errors.append(float(np.linalg.norm(bench.truth.pixels(bench.q) - bench.truth.pixels(q), axis=-1).max()))
     return errors, {outputs.status.health.verdict for _, outputs in bench.log}
 
 
 @pytest.mark.parametrize("play_deg", [0.5, 1.0])
-def test_play_that_the_model_states_is_no_verdict_and_goals_end_by_the_pictures(
-    benches: Any, play_deg: float
-) -> None:
+def test_play_that_the_model_states_is_no_verdict_and_goals_end_by_the_pictures(benches: Any, play_deg: float) -> None:
     play = np.radians(play_deg)
     for seed in SEEDS:
         bench = imperfect(benches, seed, play, stated(play))
@@ -129,9 +125,7 @@ def test_what_a_model_states_of_its_joints_has_a_bound(benches: Any) -> None:
         bench.zero_offset[0] += 0.9e-3
         bench.step()
     assert any(event.kind == "health" for event in bench.events)
-    short = msgspec.structs.replace(
-        bench.truth.model, joint_accuracy=JointAccuracy(*(np.zeros(2),) * 4), epoch=8
-    )
+    short = msgspec.structs.replace(bench.truth.model, joint_accuracy=JointAccuracy(*(np.zeros(2),) * 4), epoch=8)
     bench.step(model_update=ModelUpdate(short))
     assert "errors of joint readings" in bench.events[-1].message
 

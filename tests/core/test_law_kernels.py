@@ -50,9 +50,7 @@ def test_laws_in_the_images_work_in_cameras_that_lose_sight_of_the_face(compiled
             plain = {name: dataclasses.replace(given, kernel=None) for name, given in LAWS.items()}
             loop.core._derived.laws = plain
         loop.take_model()
-        goal = Goal(
-            str(uuid.UUID(int=1)), loop.target_at(0.3), law="stereo", jacobian="fixed-depth", gain=0.2
-        )
+        goal = Goal(str(uuid.UUID(int=1)), loop.target_at(0.3), law="stereo", jacobian="fixed-depth", gain=0.2)
         loop.step(requests=(Request(2, "test", RunGoal(goal)),))
         for _ in range(400):
             if isinstance(loop.core.state.source, ServoGoal) and loop.core.state.source.choice.cameras:

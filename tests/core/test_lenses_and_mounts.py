@@ -67,15 +67,12 @@ def test_the_lens_is_what_makes_the_images_fit(benches: Any) -> None:
     """The same images under the same model without its lenses contradict it."""
     bench = benches(1, k1=K1)
     pinholes = tuple(
-        msgspec.structs.replace(camera, lens=np.array([0.0, 320, 240, 320]))
-        for camera in bench.truth.model.cameras
+        msgspec.structs.replace(camera, lens=np.array([0.0, 320, 240, 320])) for camera in bench.truth.model.cameras
     )
     bench.truth.model = msgspec.structs.replace(bench.truth.model, cameras=pinholes)
     bench.ready()
     bench.reply(
-        RunGoal(
-            Goal("0000000a", JointTarget(dict(zip(bench.settings.joint_names, bench.q + FAR, strict=True))))
-        )
+        RunGoal(Goal("0000000a", JointTarget(dict(zip(bench.settings.joint_names, bench.q + FAR, strict=True)))))
     )
     bench.until(ended, 10.0)
     bench.run(0.3)
@@ -180,9 +177,7 @@ def test_state_survives_serialisation_bit_for_bit(benches: Any, k1: float, mount
 @pytest.mark.parametrize("law", ["stereo", "cartesian3"])
 @pytest.mark.parametrize("points", ["predicted", "triangulated"])
 @pytest.mark.parametrize("k1", [0.0, K1])
-def test_arm_that_carries_the_cameras_reaches_its_goal(
-    benches: Any, law: str, points: str, k1: float
-) -> None:
+def test_arm_that_carries_the_cameras_reaches_its_goal(benches: Any, law: str, points: str, k1: float) -> None:
     bench = benches(6, noise_px=0.05, k1=k1, mount="eye_in_hand").ready()
     target = bench.q + NEAR_ON_THE_ARM
     assert bench.reply(goal(bench, target, law=law, points=points)).accepted

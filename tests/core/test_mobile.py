@@ -44,9 +44,7 @@ class Carried:
 
     def __init__(self, bench: Any, cameras: tuple[int, ...], seconds: float = 3.0) -> None:
         self.bench, self.seconds, self.begun_ns = bench, seconds, bench.now_ns
-        self.extrinsics = {
-            c: np.vstack([np.linalg.solve(K, bench.truth.cameras[c]), [0, 0, 0, 1.0]]) for c in cameras
-        }
+        self.extrinsics = {c: np.vstack([np.linalg.solve(K, bench.truth.cameras[c]), [0, 0, 0, 1.0]]) for c in cameras}
 
     def step(self, *commands: Any) -> Any:
         s = min((self.bench.now_ns - self.begun_ns) * 1e-9 / self.seconds, 1.0)
@@ -316,9 +314,7 @@ def test_late_stamps_and_faulty_drives_move_no_camera(cells: Any) -> None:
         begun = len(bench.pending)
         honest()
         bench.pending[begun:] = [
-            msgspec.structs.replace(
-                o, t_shutter_ns=o.t_shutter_ns - (15_000_000 if o.camera == "high" else 0)
-            )
+            msgspec.structs.replace(o, t_shutter_ns=o.t_shutter_ns - (15_000_000 if o.camera == "high" else 0))
             for o in bench.pending[begun:]
         ]
 
@@ -392,9 +388,7 @@ def test_adjusted_camera_survives_a_reanchored_model(cells: Any) -> None:
 
 def test_model_that_is_not_metric_treats_it_as_one_that_stands(cells: Any) -> None:
     bench = cells(0)
-    model = msgspec.structs.replace(
-        bench.truth.model, stratum="affine", projective_to_euclidean=None, epoch=8
-    )
+    model = msgspec.structs.replace(bench.truth.model, stratum="affine", projective_to_euclidean=None, epoch=8)
     bench.step(model_update=ModelUpdate(model))
     bench.run(0.3)
     warnings = [e for e in bench.events if e.kind == "warning"]

@@ -126,9 +126,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turns", [False, True])
 @pytest.mark.parametrize("damping", [0.0, 0.4])
-def test_features_that_go_with_a_target_are_followed(
-    benches: Any, kind: str, turns: bool, damping: float
-) -> None:
+def test_features_that_go_with_a_target_are_followed(benches: Any, kind: str, turns: bool, damping: float) -> None:
     """Damping holds back no motion that the target's asks for."""
     cell = Cell(benches(1, noise_px=NOISE_PX).ready())
     moving, own = KINDS[kind]
@@ -197,9 +195,7 @@ def off_target_px(cell: Cell, seconds: float) -> float:
 
 
 @pytest.mark.parametrize("size", [0.05, 0.1])
-def test_a_flat_part_that_leans_otherwise_is_not_taken_for_its_mirror_image(
-    benches: Any, size: float
-) -> None:
+def test_a_flat_part_that_leans_otherwise_is_not_taken_for_its_mirror_image(benches: Any, size: float) -> None:
     """It was, by the one camera that showed it first, and the other camera's pictures were put down to that camera."""
     cell = Cell(benches(0, noise_px=NOISE_PX).ready())
     middle = cell.bench.truth.points(BASE).mean(axis=0) + np.array([0.0, 0.06, 0.03])
@@ -324,9 +320,7 @@ def test_a_body_that_moves_before_cameras_on_the_arm_is_kept_on_features_of_the_
     moving, own = KINDS[kind]
     fixed = bench.truth.points(BASE)[list(own)]
     markers = bench.truth.markers
-    bench.truth.points = lambda q: (np.linalg.inv(flange_at(q)) @ cell.moved @ flange_at(BASE) @ markers.T).T[
-        :, :3
-    ]
+    bench.truth.points = lambda q: (np.linalg.inv(flange_at(q)) @ cell.moved @ flange_at(BASE) @ markers.T).T[:, :3]
     assert cell.send(kind, moving, fixed, tuple(range(8))).accepted
     cell.run(0.3)
     cell.set_out(sliding(3, 0.03))

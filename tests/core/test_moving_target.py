@@ -234,9 +234,7 @@ def test_a_goal_that_cannot_follow_is_refused_with_its_cause(benches: Any) -> No
 
 
 @pytest.mark.parametrize(("joints", "warned"), [(6, []), (2, ["TARGET_NOT_TRACKABLE"])])
-def test_a_body_said_to_move_that_the_model_cannot_follow_is_told(
-    benches: Any, joints: int, warned: list[str]
-) -> None:
+def test_a_body_said_to_move_that_the_model_cannot_follow_is_told(benches: Any, joints: int, warned: list[str]) -> None:
     """Two joints and no metric model tell no displacements of the body; six joints do."""
     bench, told = benches(0, mount="eye_in_hand"), list[str]()
     settings = msgspec.structs.replace(bench.settings, body_moves=True)
@@ -289,9 +287,7 @@ def test_the_scaled_basis_moves_the_markers_by_a_pixel_each_way() -> None:
     assert good
     np.testing.assert_allclose(J.T @ J / len(J), np.eye(6), atol=1e-8)
     whitening = np.linalg.lstsq(scaled.reshape(6, 16).T, basis.reshape(6, 16).T, rcond=None)[0]
-    np.testing.assert_allclose(
-        drift, 6.0 * whitening @ whitening.T / np.trace(whitening @ whitening.T), atol=1e-8
-    )
+    np.testing.assert_allclose(drift, 6.0 * whitening @ whitening.T / np.trace(whitening @ whitening.T), atol=1e-8)
 
 
 def test_turns_are_about_the_middle_of_the_markers() -> None:
@@ -301,9 +297,7 @@ def test_turns_are_about_the_middle_of_the_markers() -> None:
     np.testing.assert_allclose(found[3:] @ points.mean(axis=0), 0.0, atol=1e-12)
     turned = displaced(np.eye(4), found, np.array([0, 0, 0, 1.0, 0, 0]))
     alone = displaced(np.eye(4), basis, np.array([0, 0, 0, 0.3, 0, 0]))
-    np.testing.assert_allclose(
-        np.linalg.eigvals(turned).imag.max(), np.linalg.eigvals(alone).imag.max(), atol=1e-6
-    )
+    np.testing.assert_allclose(np.linalg.eigvals(turned).imag.max(), np.linalg.eigvals(alone).imag.max(), atol=1e-6)
 
 
 def test_a_target_that_jumped_is_found_in_one_frame_of_one_camera() -> None:

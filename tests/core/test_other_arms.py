@@ -31,8 +31,7 @@ class Loop:
         )  # fmt: skip
         self.model = exact_model(cell)
         cameras = tuple(
-            CameraSettings(c.name, c.width, c.height, 25.0, cell.mount, cell.marker_ids)
-            for c in self.model.cameras
+            CameraSettings(c.name, c.width, c.height, 25.0, cell.mount, cell.marker_ids) for c in self.model.cameras
         )
         self.core = ServoCore(
             CoreSettings(
@@ -92,9 +91,7 @@ class Loop:
         self.step(RunGoal(Goal("0000000a", target, **options)))
         for _ in range(round(seconds * 100)):
             for event in self.events[since:]:
-                if event.kind in ("goal_reached", "goal_aborted") or (
-                    event.kind == "reply" and not event.accepted
-                ):
+                if event.kind in ("goal_reached", "goal_aborted") or (event.kind == "reply" and not event.accepted):
                     return event
             self.step()
         raise AssertionError(f"nothing ended: {self.events[since:]}")
@@ -174,9 +171,7 @@ def test_a_law_of_components_that_the_arm_makes_only_together_is_refused_before_
 
 def of_markers(target: FeatureTarget, ids: tuple[int, ...]) -> FeatureTarget:
     """The same goal, shown by these markers only."""
-    return FeatureTarget(
-        {camera: {i: pixels[i] for i in ids} for camera, pixels in target.set_points.items()}
-    )
+    return FeatureTarget({camera: {i: pixels[i] for i in ids} for camera, pixels in target.set_points.items()})
 
 
 @pytest.mark.parametrize("law", ["stereo", "image", "cartesian3"])
@@ -192,9 +187,7 @@ def test_one_point_and_two_are_goals_of_an_arm_of_few_freedoms(arm: Any, shown: 
     apart = loop.cell.pixels(np.array([loop.q, goal_q]))[:, :, 2 : 2 + shown]
     assert np.abs(apart[:, 0] - apart[:, 1]).max() < 0.15
     moved = np.abs(loop.q - cell.home)
-    assert (
-        moved.max() < 2.0 * np.abs(goal_q - cell.home).max()
-    )  # and what a point leaves open is not driven about
+    assert moved.max() < 2.0 * np.abs(goal_q - cell.home).max()  # and what a point leaves open is not driven about
 
 
 @pytest.mark.parametrize("law", ["stereo", "image"])

@@ -79,9 +79,7 @@ class Cell:
         update = next((w for w in self.waiting if isinstance(w, ModelUpdate)), None)
         refusals = [w for w in self.waiting if isinstance(w, ReanchorRefused)]
         self.waiting = []
-        outputs = self.bench.step(
-            *commands, *refusals, **({} if update is None else {"model_update": update})
-        )
+        outputs = self.bench.step(*commands, *refusals, **({} if update is None else {"model_update": update}))
         for event in self.bench.events[self.heard :]:
             if event.kind == "reanchor" and self.answers:
                 self.job.add(event)
@@ -152,9 +150,7 @@ def frames_shown(cell: Cell, camera: str, until_ns: int) -> int:
 
 
 @pytest.mark.parametrize(("camera", "after_s"), [(0, 0.1), (1, 0.8)])
-def test_bumped_camera_is_named_in_three_frames_and_the_goal_goes_on(
-    cells: Any, camera: int, after_s: float
-) -> None:
+def test_bumped_camera_is_named_in_three_frames_and_the_goal_goes_on(cells: Any, camera: int, after_s: float) -> None:
     cell = cells(camera)
     target = cell.bench.q + DISPLACED
     goal = cell.goal(target)
@@ -185,9 +181,7 @@ def test_without_a_metric_a_bumped_camera_is_found_anew_and_the_goal_goes_on(
 ) -> None:
     """As a whole matrix from eight markers that are known to the kinematics (8.27, 8.28), in the model's own frame."""
     cell = cells(1)
-    model = msgspec.structs.replace(
-        cell.bench.truth.model, stratum=stratum, projective_to_euclidean=None, epoch=8
-    )
+    model = msgspec.structs.replace(cell.bench.truth.model, stratum=stratum, projective_to_euclidean=None, epoch=8)
     cell.bench.step(model_update=ModelUpdate(model))
     cell.run(0.3)
     target = cell.bench.q + DISPLACED
@@ -662,9 +656,7 @@ def test_no_picture_of_before_is_averaged_where_stamps_are_known_to_be_late(cell
     cell = cells()
     bench, state = cell.bench, cell.bench.core.state
     offsets = tuple(ShutterOffset(name, -1e-9 * late_ns, 1e-4) for name in bench.names)
-    bench.step(
-        model_update=ModelUpdate(msgspec.structs.replace(state.model, epoch=2, shutter_offsets=offsets))
-    )
+    bench.step(model_update=ModelUpdate(msgspec.structs.replace(state.model, epoch=2, shutter_offsets=offsets)))
     bench.stamped_late_ns = late_ns
     bench.run(0.5)
     averaged = 0

@@ -68,9 +68,7 @@ def record(
             if k == tamper_at:
                 inputs = msgspec.structs.replace(
                     inputs,
-                    joints=msgspec.structs.replace(
-                        inputs.joints, positions=inputs.joints.positions * (1 + 1e-12)
-                    ),
+                    joints=msgspec.structs.replace(inputs.joints, positions=inputs.joints.positions * (1 + 1e-12)),
                 )
             recorder.step(encode_step(inputs, outputs), inputs.now_ns)
         return recorder.steps
@@ -101,9 +99,7 @@ def test_a_recording_without_the_field_is_read(benches: Any, tmp_path: Path) -> 
     assert msgspec.convert(tree, Fingerprint).laws == {}
 
 
-def test_a_law_that_raises_ends_its_goal_and_not_the_loop(
-    benches: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_law_that_raises_ends_its_goal_and_not_the_loop(benches: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def step(scene: Scene, task: Task, options: Options) -> LawStep:
         raise ZeroDivisionError("by zero")
 
@@ -300,9 +296,7 @@ def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_p
     with pytest.raises(RecordingError) as caught:
         replay(path)
     said = str(caught.value)
-    assert (
-        f"state is of version {OLDEST_VERSION - 1}, this program works with version {STATE_VERSION}" in said
-    )
+    assert f"state is of version {OLDEST_VERSION - 1}, this program works with version {STATE_VERSION}" in said
     assert "written by stereoservo 0.0.1" in said
     assert "Replay it with the version that wrote it, or record anew" in said
     assert "not damaged" in said

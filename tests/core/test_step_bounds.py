@@ -67,9 +67,7 @@ def of_bytes(model: Path, markers: int) -> dict[str, int]:
 
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("count", [of_bytes, pytest.param(of_lines, marks=pytest.mark.slow)])
-def test_no_step_grows_faster_than_its_markers(
-    count: Callable[[Path, int], dict[str, int]], tmp_path: Path
-) -> None:
+def test_no_step_grows_faster_than_its_markers(count: Callable[[Path, int], dict[str, int]], tmp_path: Path) -> None:
     found = {}
     for markers in (SIZES[0], *SIZES):  # the first one loads what is loaded once
         path = tmp_path / f"{markers}.json"
@@ -90,9 +88,7 @@ def test_no_step_grows_faster_than_its_markers(
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(
-    "kinds", [COSTLIEST, pytest.param((), marks=pytest.mark.slow)], ids=["costliest", "all"]
-)
+@pytest.mark.parametrize("kinds", [COSTLIEST, pytest.param((), marks=pytest.mark.slow)], ids=["costliest", "all"])
 def test_no_step_in_the_largest_cell_does_more_than_is_stated(kinds: tuple[str, ...], tmp_path: Path) -> None:
     path = tmp_path / "steps.msgpack"
     done = recorded(path, kinds)
@@ -159,9 +155,7 @@ def test_a_way_that_is_planned_anew_at_rest_goes_on_from_every_state_bit_for_bit
     loop.take_model()
     goals = (
         Goal("00000001", loop.target_at(0.4), law="cartesian3", gain=2.0),
-        Goal(
-            "00000002", loop.target_at(-0.3), law="trajectory"
-        ),  # planned while the arm moves on: anew at rest
+        Goal("00000002", loop.target_at(-0.3), law="trajectory"),  # planned while the arm moves on: anew at rest
     )
     anew = 0
     for number, (goal, steps) in enumerate(zip(goals, (50, 120), strict=True)):

@@ -27,9 +27,7 @@ def fold(timing: CameraTiming, innovation: FloatArray, velocity: FloatArray, t_n
     timing.product, timing.square, timing.seen_ns = sums
 
 
-def seen(
-    late_s: float, *, seed: int, frames: int = 300, amplitude: float = 60.0, bias: float = 0.1
-) -> CameraTiming:
+def seen(late_s: float, *, seed: int, frames: int = 300, amplitude: float = 60.0, bias: float = 0.1) -> CameraTiming:
     """Markers that swing by ``amplitude`` [px] at 0.5 Hz, predicted for stamps that are ``late_s`` too early."""
     rng = np.random.default_rng(seed)
     timing = CameraTiming()

@@ -110,9 +110,7 @@ def test_extrapolation_is_exact_on_straight_tracks_and_counts_what_was_seen(benc
 
 
 def test_a_joint_that_hardly_moves_the_markers_is_named_with_a_cure(benches: Any) -> None:
-    bench = with_trials(
-        benches(0, noise_px=0.05), range=np.array([0.1] * 5 + [0.03]), min_range=0.02, frames=1
-    )
+    bench = with_trials(benches(0, noise_px=0.05), range=np.array([0.1] * 5 + [0.03]), min_range=0.02, frames=1)
     end, _ = calibrated(bench)
     assert end.kind == "calibration_aborted"
     reason = end.reasons[0]
@@ -142,9 +140,7 @@ def test_joints_stand_on_either_side_independently() -> None:
     assert np.array_equal(sides.T @ sides, 16.0 * np.eye(MAX_JOINTS))
 
 
-def test_a_stop_of_all_joints_that_is_not_reached_is_left_out(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_of_all_joints_that_is_not_reached_is_left_out(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole programme was aborted, with all single joints done."""
     stuck = Reason("STOP_NOT_REACHED", "hold", "j2", 0.0, 0.1, "rad or m", "joint j2 did not reach its stop")
 
@@ -157,9 +153,7 @@ def test_a_stop_of_all_joints_that_is_not_reached_is_left_out(
     assert end.kind == "calibration_finished", end
     assert len([e for e in samples if e.trial < 0]) == 1 + 4
     [told] = [e.message for e in bench.events if e.kind == "warning"]
-    assert told == (
-        "calibration: stop 3 of all joints is not reached: joint j2 did not reach its stop; left out"
-    )
+    assert told == ("calibration: stop 3 of all joints is not reached: joint j2 did not reach its stop; left out")
 
 
 def test_stops_of_all_joints_that_would_lose_the_markers_are_left_out(benches: Any) -> None:
@@ -219,9 +213,7 @@ def test_a_keep_out_on_the_way_ends_a_side_before_it(bench: Any) -> None:
     end, samples = calibrated(bench)
     assert end.kind == "calibration_finished", end
     assert moved(samples, 3, base).max() == pytest.approx(stop_offset(1, 1, 2, 0.05), abs=2e-3)
-    assert [
-        e for e in bench.events if e.kind == "warning" and "j4" in e.message and "keep-out post" in e.message
-    ]
+    assert [e for e in bench.events if e.kind == "warning" and "j4" in e.message and "keep-out post" in e.message]
 
 
 def test_stops_of_all_joints_from_which_a_keep_out_bars_the_way_back_are_left_out(bench: Any) -> None:
@@ -296,9 +288,7 @@ def test_state_in_mid_calibration_survives_serialisation(bench: Any) -> None:
         assert twin.step(inputs).command.tobytes() == outputs.command.tobytes()
 
 
-@pytest.mark.parametrize(
-    "command", [Calibrate(GOAL, lease_s=0.5), Home(GOAL, lease_s=0.5), Calibrate(GOAL, True, 0.5)]
-)
+@pytest.mark.parametrize("command", [Calibrate(GOAL, lease_s=0.5), Home(GOAL, lease_s=0.5), Calibrate(GOAL, True, 0.5)])
 def test_motion_of_a_client_that_died_ends_with_its_lease(bench: Any, command: Any) -> None:
     bench.q = bench.q - 1.5 * np.sign(bench.q)
     bench.ready()

@@ -22,9 +22,7 @@ from stereoservo.kinematics.model import JointLoads
 @pytest.fixture
 def settings() -> CoreSettings:
     base = example_settings()
-    cameras = tuple(
-        CameraSettings(name, 640, 480, 30.0, "eye_to_hand", (1, 4, 7)) for name in ("left", "right")
-    )
+    cameras = tuple(CameraSettings(name, 640, 480, 30.0, "eye_to_hand", (1, 4, 7)) for name in ("left", "right"))
     return msgspec.structs.replace(base, cameras=cameras)
 
 
@@ -33,15 +31,11 @@ def sample(camera: str, ids: list[int], offset: float = 0.0) -> Sample:
     pixels = np.arange(2.0 * k).reshape(k, 2) + offset
     covariances = np.tile(np.diag([0.03, 0.01]), (k, 1, 1))
     count = len(ids)
-    return Sample(
-        camera, np.array(ids, dtype=np.int64), pixels, covariances, 5, np.full(count, 5.0), np.zeros(count)
-    )
+    return Sample(camera, np.array(ids, dtype=np.int64), pixels, covariances, 5, np.full(count, 5.0), np.zeros(count))
 
 
 def stop(seq: int, trial: int, *samples: Sample, goal: str = "a") -> Event:
-    return Event(
-        seq, seq, "calibration_sample", id=goal, joints=np.full(6, 0.1 * seq), samples=samples, trial=trial
-    )
+    return Event(seq, seq, "calibration_sample", id=goal, joints=np.full(6, 0.1 * seq), samples=samples, trial=trial)
 
 
 def test_each_pixel_stands_at_its_camera_stop_and_marker(settings: CoreSettings) -> None:
@@ -112,9 +106,7 @@ def test_noise_is_as_the_frames_scatter_whatever_few_markers_of_great_variance_s
 def test_where_no_noise_is_seen_or_stated_the_detector_is_believed(
     settings: CoreSettings, systematic_px: float
 ) -> None:
-    cameras = tuple(
-        msgspec.structs.replace(camera, systematic_px=float(systematic_px)) for camera in settings.cameras
-    )
+    cameras = tuple(msgspec.structs.replace(camera, systematic_px=float(systematic_px)) for camera in settings.cameras)
     job = TrialCollector(msgspec.structs.replace(settings, cameras=cameras))
     job.add(stop(1, 0, sample("left", [1, 4])))
     np.testing.assert_allclose(job.trials().sigmas[0, 0], np.sqrt(0.02))

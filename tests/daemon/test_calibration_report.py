@@ -204,6 +204,4 @@ def test_statistics_are_needed_for_a_verdict(fitted: tuple) -> None:
     assert assess_fit(model, fitted[2].report).grade == "usable"
     assert isinstance(fitted[2].model.statistics, FitStatistics)
     with pytest.raises(CalibrationError):
-        residuals_of(
-            msgspec.structs.replace(fitted[2].model, joint_names=tuple("abcdef")), fitted[1], fitted[2].report
-        )
+        residuals_of(msgspec.structs.replace(fitted[2].model, joint_names=tuple("abcdef")), fitted[1], fitted[2].report)

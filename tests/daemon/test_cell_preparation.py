@@ -26,9 +26,7 @@ class OnlyDeclared:
         return msgspec.structs.replace(self.inner.describe(), auxiliary=(gripper,))
 
 
-def test_auxiliary_joints_that_nobody_can_order_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auxiliary_joints_that_nobody_can_order_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     load = plugins.load
     monkeypatch.setattr(
         cell_preparation.plugins,

@@ -12,9 +12,7 @@ SIGMA = 0.02
 RATE_HZ = 30.0
 
 
-def observations(
-    count: int, seed: int = 0, markers: int = 14, speed_px: float = 0.0
-) -> list[CameraObservation]:
+def observations(count: int, seed: int = 0, markers: int = 14, speed_px: float = 0.0) -> list[CameraObservation]:
     """``count`` frames of markers at rest, or all moving at ``speed_px`` [px/s], with honest noise."""
     rng = np.random.default_rng(seed)
     places = rng.uniform(50, 400, (markers, 2))
@@ -63,9 +61,7 @@ def test_a_frame_that_disagrees_is_refused_and_named() -> None:
 def test_markers_of_few_frames_are_left_out_and_none_at_all_is_refused() -> None:
     seen = observations(10, markers=3)
     few = [
-        CameraObservation(
-            o.camera, o.seq, o.t_shutter_ns, o.t_received_ns, o.ids[:2], o.pixels[:2], o.covariances[:2]
-        )
+        CameraObservation(o.camera, o.seq, o.t_shutter_ns, o.t_received_ns, o.ids[:2], o.pixels[:2], o.covariances[:2])
         for o in seen[4:]
     ]
     found = averaged("left", seen[:4] + few, 0.0, (640, 480))

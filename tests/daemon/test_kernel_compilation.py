@@ -110,9 +110,7 @@ def test_no_cell_needs_kernels_that_the_example_did_not(joints: int) -> None:
         core = ServoCore(settings)
         for step in range(1, 30):
             inputs = kernel_compilation._inputs(step, pixels, model)
-            still = msgspec.structs.replace(
-                inputs.joints, positions=np.zeros(joints), velocities=np.zeros(joints)
-            )
+            still = msgspec.structs.replace(inputs.joints, positions=np.zeros(joints), velocities=np.zeros(joints))
             goal = (Request(1, "tester", RunGoal(Goal("00000001", target, law=law))),) if step == 5 else ()
             core.step(msgspec.structs.replace(inputs, joints=still, requests=goal, driver_active=True))
         assert core.state.model is not None
@@ -181,9 +179,7 @@ def test_kernels_are_loaded_one_at_a_time_once_a_new_record_is_there(
     (wanted,) = [o for o in overloads() if o.name == "_calls_with_literals"]
     loads: list[Overload] = []
     monkeypatch.setattr(kernel_compilation, "load", lambda found: (loads.append(o) for o in found))
-    record = kernel_compilation._Compiled(
-        kernel_compilation._machine(), {__file__: (0, 0)}, {}, (wanted,) * 3
-    )
+    record = kernel_compilation._Compiled(kernel_compilation._machine(), {__file__: (0, 0)}, {}, (wanted,) * 3)
     path.write_bytes(pickle.dumps(tuple(record)))
     loader.advance(10**10)
     assert not loads, "the sources have changed since"
@@ -197,9 +193,7 @@ def test_kernels_are_loaded_one_at_a_time_once_a_new_record_is_there(
     assert loader.loaded
 
 
-def test_a_record_holds_for_its_sources_and_its_cache_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_holds_for_its_sources_and_its_cache_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, source, cache = tmp_path / "compiled.pickle", tmp_path / "kernels.py", tmp_path / "cache"
     monkeypatch.setattr(kernel_compilation, "_record_path", lambda: path)
     cache.mkdir()
@@ -258,9 +252,7 @@ def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pyte
     compilation.end()
 
 
-def test_a_cell_with_drives_on_a_bus_waits_for_what_compiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cell_with_drives_on_a_bus_waits_for_what_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As long as the other process holds the lock, and no longer; or until somebody ends the cell."""
     monkeypatch.setattr(kernel_compilation, "_record_path", lambda: tmp_path / "record")
     monkeypatch.setattr(kernel_compilation, "WAIT_S", 0.001)

@@ -253,9 +253,7 @@ def test_a_servo_process_started_anew_has_its_calls_carried_out(cell: Cell) -> N
     assert calls == ["configure", "configure"]
 
 
-def test_a_process_number_that_is_another_users_by_now_is_no_plant(
-    cell: Cell, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_number_that_is_another_users_by_now_is_no_plant(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(pid: int, number: int) -> None:
         raise PermissionError(1, "Operation not permitted")
 

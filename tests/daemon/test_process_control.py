@@ -46,9 +46,7 @@ def test_nohup_is_respected() -> None:
 
 
 def test_a_log_that_cannot_be_written_ends_nothing() -> None:
-    program = (
-        "from stereoservo.daemon.process_control import write_log\nwrite_log('servo', 'line')\nprint('alive')"
-    )
+    program = "from stereoservo.daemon.process_control import write_log\nwrite_log('servo', 'line')\nprint('alive')"
     with open("/dev/full", "wb") as full:
         done = subprocess.run(
             [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=full, text=True, check=False

@@ -167,8 +167,7 @@ class Bench:
                 "camera": [{"name": "left", "driver": "stub"}],
                 "safety": {
                     "limit": [
-                        {"joint": j.name, "min": -2.0, "max": 2.0, "velocity": 1.0, "acceleration": 4.0}
-                        for j in JOINTS
+                        {"joint": j.name, "min": -2.0, "max": 2.0, "velocity": 1.0, "acceleration": 4.0} for j in JOINTS
                     ]
                 },
             }
@@ -514,9 +513,7 @@ def test_records_begin_with_a_checkpoint_and_a_full_ring_makes_a_counted_gap(
     while writer.write(filled):
         pass
     encoded: list[int] = []
-    monkeypatch.setattr(
-        step_records, "encode_state", lambda state: encoded.append(state.step) or encode_state(state)
-    )
+    monkeypatch.setattr(step_records, "encode_state", lambda state: encoded.append(state.step) or encode_state(state))
     while bench.process._stream.dropped == 0:
         bench.run(50)
     bench.run(100)
@@ -549,11 +546,7 @@ def module_level_imports(name: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             found.add(node.module)
             package = importlib.util.find_spec(node.module)
-            if (
-                node.module.startswith("stereoservo")
-                and package is not None
-                and package.submodule_search_locations
-            ):
+            if node.module.startswith("stereoservo") and package is not None and package.submodule_search_locations:
                 candidates = {f"{node.module}.{alias.name}" for alias in node.names}
                 found |= {module for module in candidates if importlib.util.find_spec(module)}
     return found
@@ -625,9 +618,7 @@ def test_what_another_process_wrote_wrongly_is_left_out_and_told_and_the_loop_go
     ],
     ids=lambda change: ", ".join(f"{key} {array.dtype} {array.shape}" for key, array in change.items()),
 )
-def test_an_observation_of_wrong_shapes_never_reaches_the_core(
-    tmp_path: Path, change: dict[str, Any]
-) -> None:
+def test_an_observation_of_wrong_shapes_never_reaches_the_core(tmp_path: Path, change: dict[str, Any]) -> None:
     bench = Bench(tmp_path)
     now = bench.clock.now_ns()
     good = CameraObservation("left", 1, now, now, np.arange(3), np.zeros((3, 2)), np.zeros((3, 2, 2)))

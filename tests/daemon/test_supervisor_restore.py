@@ -28,9 +28,7 @@ CELL = check_cell(
         "safety": {"limit": []},
     }
 )
-JOINTS = JointDriverDescription(
-    "stub", (JointSpec("j1", "revolute", -2.0, 2.0, 1.0, 4.0),), 250.0, "clock", 0.1, 100.0
-)
+JOINTS = JointDriverDescription("stub", (JointSpec("j1", "revolute", -2.0, 2.0, 1.0, 4.0),), 250.0, "clock", 0.1, 100.0)
 CAMERA = CameraDescription("stub", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2))
 
 

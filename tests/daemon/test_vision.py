@@ -131,9 +131,7 @@ def test_a_detector_gets_a_fresh_prior_and_no_stale_one(tmp_path: Path) -> None:
     bench = Bench(tmp_path, detector)
     bench.camera.arriving = [bench.frame(1)]
     bench.pipeline.poll()
-    prior = Prior(
-        "left", bench.clock.now_ns(), np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2))
-    )
+    prior = Prior("left", bench.clock.now_ns(), np.array([1]), np.ones((1, 2)), np.zeros((1, 2)), np.zeros((1, 2, 2)))
     bench.priors.write(encode_prior(prior))
     for _ in range(2):  # the second frame of the same prior gets it, too
         bench.camera.arriving = [bench.frame(2)]
@@ -178,9 +176,7 @@ def test_a_lost_camera_is_reported_once_retried_with_growing_pauses_and_its_retu
     bench: Bench,
 ) -> None:
     def lose() -> None:
-        bench.camera.fail["poll"] = bench.camera.fail["configure"] = DriverError(
-            "connection_lost", "the cable is out"
-        )
+        bench.camera.fail["poll"] = bench.camera.fail["configure"] = DriverError("connection_lost", "the cable is out")
 
     def back() -> None:
         bench.camera.fail.clear()
@@ -196,9 +192,7 @@ def test_a_lost_camera_is_reported_once_retried_with_growing_pauses_and_its_retu
 
 def test_a_camera_that_falls_silent_is_opened_anew(bench: Bench) -> None:
     run(bench, 2.0 * SILENT_CAMERA_S, {})
-    assert bench.reports == [
-        ("camera_lost", f"camera left: no image for {SILENT_CAMERA_S:g} s; trying again")
-    ]
+    assert bench.reports == [("camera_lost", f"camera left: no image for {SILENT_CAMERA_S:g} s; trying again")]
     assert bench.camera.calls.count("configure") == 2
 
 

@@ -33,16 +33,12 @@ def episodes() -> list[Episode]:
         joints = np.column_stack([np.sin(0.7 * k + number), 0.1 * k - number])
         levels = (LEVELS * (k + 1)).astype(np.uint8)[None, :, None, None]
         found.append(
-            Episode(
-                joints, np.broadcast_to(levels, (2, count, HEIGHT, WIDTH)).copy(), np.zeros((2, count, 0, 2))
-            )
+            Episode(joints, np.broadcast_to(levels, (2, count, HEIGHT, WIDTH)).copy(), np.zeros((2, count, 0, 2)))
         )
     return found
 
 
-def context(
-    folder: Path, clock: VirtualClock, camera: str = "", arm: dict[str, Any] | None = None
-) -> DriverContext:
+def context(folder: Path, clock: VirtualClock, camera: str = "", arm: dict[str, Any] | None = None) -> DriverContext:
     return DriverContext(clock, "t", folder, folder, camera, arm=arm or {})
 
 
@@ -231,9 +227,7 @@ def cut(folder: Path) -> None:
         ("v3.0", "image", lambda f: changed(f, "data", UP, ["up.png"] * 21), "no picture that OpenCV"),
     ],
 )  # fmt: skip
-def test_damaged_pictures_are_refused_by_name(
-    version: str, kind: str, damage: Any, named: str, tmp_path: Path
-) -> None:
+def test_damaged_pictures_are_refused_by_name(version: str, kind: str, damage: Any, named: str, tmp_path: Path) -> None:
     damage(write(tmp_path / "set", version, episodes(), kind))
     with pytest.raises(DriverError, match=re.escape(named)):
         play(begun(tmp_path, VirtualClock(), "up", loop=False, pace="every"))
@@ -254,9 +248,7 @@ def play(driver: VideoCameraDriver) -> None:
         ({"episodes": 2}, "did you mean 'episode'?"),
     ],
 )
-def test_options_of_joints_that_name_nothing_are_refused(
-    options: dict[str, Any], named: str, tmp_path: Path
-) -> None:
+def test_options_of_joints_that_name_nothing_are_refused(options: dict[str, Any], named: str, tmp_path: Path) -> None:
     write(tmp_path / "set", "v2.1", episodes())
     with pytest.raises(DriverError, match=re.escape(named)):
         EpisodeJointDriver(JOINTS | options, context(tmp_path, VirtualClock()))

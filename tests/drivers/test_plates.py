@@ -147,10 +147,7 @@ def test_the_scale_bar_is_100_mm(tmp_path, name):
             run(tmp_path / name)
         number = rb"(-?[\d.]+)"
         path = rb"%s %s m\s+%s %s l\s+S" % (4 * (number,))
-        ends = [
-            [float(v) / 72 * 25.4 for v in match]
-            for match in re.findall(path, (tmp_path / name).read_bytes())
-        ]
+        ends = [[float(v) / 72 * 25.4 for v in match] for match in re.findall(path, (tmp_path / name).read_bytes())]
     lengths = [np.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in ends]
     assert max(lengths) == pytest.approx(100.0, abs=1e-3)
 
@@ -169,9 +166,7 @@ def test_a_pdf_holds_the_same_faces(tmp_path):
         low, high = ends.min(axis=0), ends.max(axis=0)
         discs.append([*(low + high) / 2, *(high - low) / 2])
     discs = np.array(discs)
-    circles = np.array(
-        [values[:3] for kind, *values, _ in parsed(tmp_path / "plate.svg")[1] if kind == "circle"]
-    )
+    circles = np.array([values[:3] for kind, *values, _ in parsed(tmp_path / "plate.svg")[1] if kind == "circle"])
     np.testing.assert_allclose(discs[:, :2] * [1, -1] + [0, 297], circles[:, :2], atol=2e-3)
     np.testing.assert_allclose(discs[:, 2:], 5.0, atol=2e-3)
 
@@ -203,13 +198,9 @@ def test_nothing_is_drawn_over_a_plate_or_off_the_page():
                     for x, y in ((line.x0, line.y0), (line.x1, line.y1)):
                         assert 0 < x < 210
                         assert 0 < y < 297
-                        assert not any(b.x < x < b.x + b.width and b.y < y < b.y + b.height for b in boxes), (
-                            names
-                        )
+                        assert not any(b.x < x < b.x + b.width and b.y < y < b.y + b.height for b in boxes), names
                 texts = [s for s in page.shapes if hasattr(s, "words")]
-                assert all(
-                    not b.y < t.y < b.y + b.height or t.x > b.x + b.width for t in texts for b in boxes
-                )
+                assert all(not b.y < t.y < b.y + b.height or t.x > b.x + b.width for t in texts for b in boxes)
 
 
 # What the detectors see

@@ -96,9 +96,7 @@ def test_a_joint_that_was_blocked_is_let_go_when_its_command_ends_or_turns(sag, 
     for _ in range(200):
         before = float(order[0])
         order = servo.output.step(np.array([then]), np.array([servo.position]), *LIMITS)
-        assert abs(float(order[0]) - before) < 0.4 * PERIOD, (
-            "a position that jumps is a fault of many a drive"
-        )
+        assert abs(float(order[0]) - before) < 0.4 * PERIOD, "a position that jumps is a fault of many a drive"
         if float(order[0]) - servo.position <= sag + 2e-3:
             break
     assert float(order[0]) < pressed

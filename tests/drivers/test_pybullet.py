@@ -55,9 +55,7 @@ def test_two_runs_are_the_same_bit_for_bit(tmp_path):
 
 
 def run_python(code):
-    return subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
-    )
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240)
 
 
 def test_nothing_is_printed(tmp_path):

@@ -91,9 +91,7 @@ def test_each_row_of_a_rolling_shutter_shows_the_arm_at_its_own_time(tmp_path):
             late_ns = round((pixel[1] / (rows - 1) - 0.5) * readout_s * 1e9)
             truth = CELL.truth_pixels(cell.world.at(item.t_shutter_ns + late_ns))["left"][marker]
             assert np.abs(pixel - truth).max() < 2e-3
-            skews.append(
-                np.linalg.norm(pixel - CELL.truth_pixels(cell.world.at(item.t_shutter_ns))["left"][marker])
-            )
+            skews.append(np.linalg.norm(pixel - CELL.truth_pixels(cell.world.at(item.t_shutter_ns))["left"][marker]))
     assert max(skews) > 0.1  # what the shutter does is no rounding
 
 
@@ -166,9 +164,7 @@ def test_the_same_run_gives_the_same_data_bit_for_bit(tmp_path, kind):
     runs = []
     for _ in range(2):
         (items,) = Cell(tmp_path, [(kind, {"drop_rate": 0.3})]).run(0.5, velocity=np.full(6, 0.1))
-        runs.append(
-            [(item.seq, (item.image if hasattr(item, "image") else item.pixels).tobytes()) for item in items]
-        )
+        runs.append([(item.seq, (item.image if hasattr(item, "image") else item.pixels).tobytes()) for item in items])
     assert runs[0] == runs[1]
     assert 3 < len(runs[0]) < 14
 
@@ -260,9 +256,7 @@ def test_a_frame_waits_for_an_arm_that_is_a_little_late(tmp_path):
     assert item.t_shutter_ns == cell.clock.now_ns()
 
 
-@pytest.mark.parametrize(
-    ("mount", "k1"), [("eye_to_hand", -0.3), ("eye_in_hand", 0.0), ("eye_in_hand", -0.15)]
-)
+@pytest.mark.parametrize(("mount", "k1"), [("eye_to_hand", -0.3), ("eye_in_hand", 0.0), ("eye_in_hand", -0.15)])
 def test_lens_and_mount_of_the_cell_file_are_what_is_shown(tmp_path, mount, k1):
     """Fake and rendering camera alike, with the arm in motion: against OpenCV, by the arm's own kinematics."""
     cell = Cell(tmp_path, [], shared=True)

@@ -24,9 +24,7 @@ from stereoservo_sim.world.robots import flange_pose
 
 PATH = shipped_cell_path("twist")
 BASE = {"joint1": 1.07, "joint2": 0.49, "joint3": -0.91, "joint4": -0.97, "joint5": 2.42, "joint6": 1.61}
-OPTIONS: dict[str, Any] = load_cell_file(PATH).joints.options | {
-    "base": BASE
-}  # stated: nothing is searched for
+OPTIONS: dict[str, Any] = load_cell_file(PATH).joints.options | {"base": BASE}  # stated: nothing is searched for
 ELSEWHERE = OPTIONS | {
     "mounted": {"shift_m": [0.1, -0.2, 0.3], "turn_deg": [10.0, 20.0, -30.0]},
     "tool": {"shift_m": [0.02, 0.0, 0.1], "turn_deg": [0.0, 25.0, 40.0]},
@@ -65,9 +63,7 @@ def test_virtual_joints_are_those_of_a_serial_arm_that_has_them() -> None:
     for _ in range(20):
         q = rng.uniform(-1.0, 1.0, 6) * [0.4, 0.4, 0.4, 3.0, 1.3, 3.0] + [0.3, 0.0, 0.4, 0.0, 0.0, 0.0]
         pose = flange_pose(virtual.robot, q)
-        at_tool = pose @ np.block(
-            [[tool, np.array([[0.02], [0.0], [0.1]])], [np.zeros((1, 3)), np.ones((1, 1))]]
-        )
+        at_tool = pose @ np.block([[tool, np.array([[0.02], [0.0], [0.1]])], [np.zeros((1, 3)), np.ones((1, 1))]])
         base = np.linalg.inv(cell.robot.mounted)
         found = positions_of(base @ at_tool, attitude, q + rng.uniform(-3.0, 3.0, 6))
         wrapped = found - q
@@ -114,9 +110,7 @@ def test_the_arm_goes_where_it_is_told_and_its_camera_sees_it_there(tmp_path: Pa
 
 def test_the_controller_stops_by_itself_and_after_a_reset_the_way_back_is_free(tmp_path: Path) -> None:
     """At the arm's last joint's limit, which the cell does not know; and where the arm is stretched."""
-    driver, clock = driven(
-        tmp_path, OPTIONS | {"arm": "fake", "turns": [2.0, 1.2, 9.0], "box": [2.0, 2.0, 2.0]}
-    )
+    driver, clock = driven(tmp_path, OPTIONS | {"arm": "fake", "turns": [2.0, 1.2, 9.0], "box": [2.0, 2.0, 2.0]})
 
     def drive(rates: list[float], steps: int) -> None:
         for _ in range(steps):

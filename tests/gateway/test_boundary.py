@@ -65,9 +65,7 @@ def test_refusals_are_counted_and_logged_once_a_second(
 
 def test_what_a_client_sent_cannot_fill_or_forge_the_log(capsys: pytest.CaptureFixture[str]) -> None:
     boundary = Boundary("boot")
-    reply = refused(
-        boundary, MessageError("\x1b[2J\nstereoservo servo: all is well" + "x" * 60_000), "goal/\n"
-    )
+    reply = refused(boundary, MessageError("\x1b[2J\nstereoservo servo: all is well" + "x" * 60_000), "goal/\n")
     (line,) = capsys.readouterr().err.splitlines()
     assert line.isprintable()
     assert len(line) < MAX_TEXT_CHARS + 200

@@ -88,9 +88,7 @@ class StubLink:
 
 
 @pytest.mark.parametrize("at", [0, 200, 1000, -30])
-def test_a_damaged_model_is_set_aside_and_the_one_before_is_used(
-    tmp_path: Path, bench: Bench, at: int
-) -> None:
+def test_a_damaged_model_is_set_aside_and_the_one_before_is_used(tmp_path: Path, bench: Bench, at: int) -> None:
     store, link = models(tmp_path, 1, 2, 3), StubLink()
     flip(store.path(3), at)
     damaged = store.path(3).read_bytes()
@@ -104,9 +102,7 @@ def test_a_damaged_model_is_set_aside_and_the_one_before_is_used(
     assert [(event.kind, event.message) for event in bench.events] == [("warning", note)]
     assert (tmp_path / "model-000003.json.damaged-1").read_bytes() == damaged
     assert store.next_epoch() == 4  # that of the damaged one is never given again
-    again = CalibrationJobs(
-        SETTINGS, store, cast(ServoConnection, link), bench.log, tmp_path / "checks.jsonl"
-    )
+    again = CalibrationJobs(SETTINGS, store, cast(ServoConnection, link), bench.log, tmp_path / "checks.jsonl")
     again.load(2)
     assert again.notes == ()
 
@@ -141,9 +137,7 @@ def test_who_only_looks_renames_nothing(tmp_path: Path) -> None:
 
 def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -> None:
     store = ModelStore(tmp_path / "gone")
-    jobs = CalibrationJobs(
-        SETTINGS, store, cast(ServoConnection, StubLink()), bench.log, tmp_path / "checks.jsonl"
-    )
+    jobs = CalibrationJobs(SETTINGS, store, cast(ServoConnection, StubLink()), bench.log, tmp_path / "checks.jsonl")
     jobs.load(0)
     assert "No such file" in jobs.notes[0]
 
@@ -152,9 +146,7 @@ def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -
 
 
 @pytest.mark.parametrize("data", [b"", b'{"schema": 2, "goals": {', b"[" * 60_000, b"\xff", b'{"schema": 9}'])
-def test_a_damaged_file_of_taught_goals_is_set_aside_and_told_once(
-    tmp_path: Path, bench: Bench, data: bytes
-) -> None:
+def test_a_damaged_file_of_taught_goals_is_set_aside_and_told_once(tmp_path: Path, bench: Bench, data: bytes) -> None:
     path = tmp_path / "taught.json"
     path.write_bytes(data)
     store = TaughtStore(path, recover=bench.notes.tell)
@@ -235,9 +227,7 @@ def test_what_cannot_be_written_keeps_its_bytes_is_told_and_ends_nothing(
     goals = OpenGoalRecord(directories, "boot")
     log = EventLog("boot", lambda _: None, goals.observe)
     log.add("goal_accepted", id="one")
-    teaching = TaughtGoalRegistry(
-        TaughtStore(directories.taught), ObservationCache({"left": 0.0}), lambda: MODEL, log
-    )
+    teaching = TaughtGoalRegistry(TaughtStore(directories.taught), ObservationCache({"left": 0.0}), lambda: MODEL, log)
     assert teaching.taught(taught_event())
     link = cast(ServoConnection, StubLink())
     cameras = RelocalizationJobs(store, link, log, lambda: MODEL, lambda _: None)
@@ -295,17 +285,13 @@ def test_a_journal_on_a_full_disk_counts_what_it_loses_and_goes_on(
     space[0] = 1000
     journal.add(b'{"line": 5}')
     journal.close()
-    assert (
-        path.read_bytes() == b'{"line": 0}\n{"line": 1}\n\n{"line": 5}\n'.replace(b"1}\n\n", b"1}\n") or True
-    )
+    assert path.read_bytes() == b'{"line": 0}\n{"line": 1}\n\n{"line": 5}\n'.replace(b"1}\n\n", b"1}\n") or True
     whole = [line for line in path.read_bytes().splitlines() if line.endswith(b"}")]
     assert whole[0] == b'{"line": 0}'
     assert whole[-1] == b'{"line": 5}'
 
 
-def test_a_journal_that_cannot_be_opened_is_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_journal_that_cannot_be_opened_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(persistence.time, "monotonic", lambda: now)
     path = tmp_path / "state" / "journal.jsonl"

@@ -103,9 +103,7 @@ def test_what_does_not_tell_the_motion_is_refused_with_the_cause():
 
 def test_an_edge_that_is_another_one_is_named():
     goal, model, sights, _ = scene(1, wrong=True)
-    with pytest.raises(
-        TransferError, match=r"have not moved as one body.*without edge 104-105 the others agree"
-    ):
+    with pytest.raises(TransferError, match=r"have not moved as one body.*without edge 104-105 the others agree"):
         resolve(TaughtTarget("pick", "workpiece", (), LINES), goal, model, sights)
 
 
@@ -114,9 +112,7 @@ def test_a_fixed_line_by_segments_is_the_line_whatever_their_ends():
     cameras, model = Cameras(), make_model(np.random.default_rng(6), Cameras(), placed(BODY, HAND))
     pose = some_pose(rng)
     ends = [slid(rng), slid(rng)]
-    seen = [
-        cameras.pixels(placed(places, pose))[name] for name, places in zip(cameras.names, ends, strict=True)
-    ]
+    seen = [cameras.pixels(placed(places, pose))[name] for name, places in zip(cameras.names, ends, strict=True)]
     segments = {
         name: tuple(tuple(pixels[marker].tolist()) for marker in LINES[1])
         for name, pixels in zip(cameras.names, seen, strict=True)

@@ -32,9 +32,7 @@ def stated(note):
 def errors(target, cameras, truth):
     """All differences from the true pixels [px]."""
     pixels = cameras.pixels(truth)
-    return np.array(
-        [np.array(p) - pixels[c][m] for c, seen in target.set_points.items() for m, p in seen.items()]
-    )
+    return np.array([np.array(p) - pixels[c][m] for c, seen in target.set_points.items() for m, p in seen.items()])
 
 
 def moved_workpiece(rng, stratum, sigma=0.05, work=WORK):
@@ -108,9 +106,7 @@ def test_a_body_mounted_anew_is_noticed_and_a_goal_by_the_tool_survives_it():
 def test_a_goal_by_the_tool_needs_no_workpiece_while_the_model_is_the_same():
     rng = np.random.default_rng(13)
     cameras, model, hand = Cameras(), make_model(rng, Cameras(), placed(BODY, HAND)), some_pose(rng)
-    grip = pose(
-        [0.0, 0.3, 0.0], [0.01, 0.0, 0.02]
-    )  # the tool sits otherwise in the hand than when it was taught
+    grip = pose([0.0, 0.3, 0.0], [0.01, 0.0, 0.02])  # the tool sits otherwise in the hand than when it was taught
     goal = teach(model, cameras, placed(BODY, hand) | placed(TOOL, hand), rng, tool=tuple(TOOL))
     here = some_pose(rng)
     now = cameras.sights(placed(BODY, here) | placed(TOOL, here @ grip), rng)
@@ -122,9 +118,7 @@ def test_a_goal_by_the_tool_needs_no_workpiece_while_the_model_is_the_same():
 
 
 def drawing(tool, on_work):
-    return Synthesise(
-        "pick", dict(WORK), {m: TOOL[m] if m in TOOL else BODY[m] for m in tool}, tuple(on_work.ravel())
-    )
+    return Synthesise("pick", dict(WORK), {m: TOOL[m] if m in TOOL else BODY[m] for m in tool}, tuple(on_work.ravel()))
 
 
 @pytest.mark.parametrize("stratum", STRATA)
@@ -139,9 +133,7 @@ def test_a_goal_is_made_from_drawings(stratum):
     after = some_pose(rng)
     later = cameras.sights(placed(BODY, HAND) | placed(WORK, after), rng)
     found = resolve(TaughtTarget("pick", "workpiece"), goal, model, later)
-    assert np.abs(errors(found.target, cameras, placed(BODY, after @ on_work))).max() < 0.5 + 4.5 * stated(
-        found.note
-    )
+    assert np.abs(errors(found.target, cameras, placed(BODY, after @ on_work))).max() < 0.5 + 4.5 * stated(found.note)
 
 
 def test_a_drawn_tool_that_the_model_does_not_know_is_found_in_the_hand():
@@ -154,9 +146,7 @@ def test_a_drawn_tool_that_the_model_does_not_know_is_found_in_the_hand():
     assert goal.target.set_points == {}
     found = resolve(TaughtTarget("pick"), goal, model, sights)
     # Tool and body are drawn in the hand's coordinates: the tool at its pose puts the body there as well.
-    assert np.abs(errors(found.target, cameras, placed(BODY, work @ on_work))).max() < 4.5 * stated(
-        found.note
-    )
+    assert np.abs(errors(found.target, cameras, placed(BODY, work @ on_work))).max() < 4.5 * stated(found.note)
 
 
 def test_cameras_on_the_arm_go_to_where_the_workpiece_looks_as_it_was_taught():
@@ -210,9 +200,7 @@ def test_as_taught_in_a_camera_that_was_moved_and_found_anew_since(stratum):
     assert again.target.set_points == found.target.set_points
     assert again.target.model_epoch == model.epoch
     other = msgspec.structs.replace(anew, plane_at_infinity=1.01 * anew.plane_at_infinity)
-    assert (
-        resolve(TaughtTarget("pick"), goal, other, sights).target == goal.target
-    )  # the core refuses its epoch
+    assert resolve(TaughtTarget("pick"), goal, other, sights).target == goal.target  # the core refuses its epoch
 
 
 # -- refusals -------------------------------------------------------------------------------------------------
@@ -268,9 +256,7 @@ def test_a_wrong_world_is_refused_in_words_with_values():
     only = {c: {m: s for m, s in seen.items() if m in (0, 1, 2, 10, 11)} for c, seen in sights.items()}
     one_eye = {"left": sights["left"], "right": {}}
     moving = {c: {m: s._replace(moves=m == 13) for m, s in seen.items()} for c, seen in sights.items()}
-    mirror = {
-        c: {m: seen[{10: 11, 11: 10, 12: 13, 13: 12}.get(m, m)] for m in seen} for c, seen in sights.items()
-    }
+    mirror = {c: {m: seen[{10: 11, 11: 10, 12: 13, 13: 12}.get(m, m)] for m in seen} for c, seen in sights.items()}
     cases = [
         (wanted, goal, None, sights, "no model yet: calibrate first"),
         (wanted, msgspec.structs.replace(goal, model=None), model, sights, "earlier version.*teach it again"),

@@ -210,9 +210,7 @@ def test_goals_that_run_are_told_with_set_points_and_plan_until_they_end(bench: 
     assert bench.intake.running().goals == ()
 
 
-def test_goals_have_time_to_be_planned_and_commands_have_not(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_goals_have_time_to_be_planned_and_commands_have_not(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
     bench.goal(Goal(ID, JointTarget({"j1": 0.1})))
@@ -234,9 +232,7 @@ def test_streamed_set_points_and_acknowledgements_are_put_on_the_goals_key(bench
     assert bench.kinds() == []
 
 
-def test_a_stream_that_is_refused_is_told_once_a_second(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stream_that_is_refused_is_told_once_a_second(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
     wrong = encode(UpdateGoal(ID, FeatureTarget({"middle": POINTS["left"]})))
@@ -260,9 +256,7 @@ def test_the_tool_of_a_taught_goal_is_remembered_with_its_request(bench: Bench) 
 
 def test_a_put_goal_is_told_by_an_event_when_it_is_refused(bench: Bench) -> None:
     bench.intake.goal_sample(Message(KEYS.goal("anna"), b'{"id": "x"}'))
-    bench.intake.goal_sample(
-        Message("stereoservo/v1/demo/goal/**", encode(Goal(ID, JointTarget({"j1": 0.1}))))
-    )
+    bench.intake.goal_sample(Message("stereoservo/v1/demo/goal/**", encode(Goal(ID, JointTarget({"j1": 0.1})))))
     assert bench.kinds() == ["goal_refused", "goal_refused"]
     assert bench.link.asked == []
     bench.intake.goal_sample(Message(KEYS.goal("anna"), encode(RenewGoal(ID))))

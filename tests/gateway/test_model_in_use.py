@@ -66,13 +66,9 @@ def test_a_model_that_another_has_overtaken_is_no_longer_waited_for(tmp_path: Pa
 
 
 @pytest.mark.parametrize("order", orders(4, 5, AGREES))
-def test_a_model_of_moved_cameras_is_taken_once_the_core_works_with_it(
-    order: tuple[Any, ...], tmp_path: Path
-) -> None:
+def test_a_model_of_moved_cameras_is_taken_once_the_core_works_with_it(order: tuple[Any, ...], tmp_path: Path) -> None:
     log, taken = EventLog("boot", lambda _: None), list[int]()
-    jobs = RelocalizationJobs(
-        ModelStore(tmp_path), LINK, log, lambda: None, lambda model: taken.append(model.epoch)
-    )
+    jobs = RelocalizationJobs(ModelStore(tmp_path), LINK, log, lambda: None, lambda model: taken.append(model.epoch))
     fit: Any = SimpleNamespace(cameras=("left",), goal="g")
     jobs._hand_over(MODEL, SimpleNamespace(message="moved", model="m.json"), fit)  # type: ignore[arg-type]
     for step in order:

@@ -75,9 +75,7 @@ def test_a_file_of_taught_goals_with_a_cut_matrix_names_it(tmp_path: Path) -> No
     tree = msgspec.json.decode(path.read_bytes())
     tree["goals"]["pick"]["model"]["cameras"][1]["matrix"].pop()
     path.write_bytes(msgspec.json.encode(tree))
-    with pytest.raises(
-        TaughtFileError, match=r"goals\.pick\.model: right\.matrix has 11 numbers; 12 are needed"
-    ):
+    with pytest.raises(TaughtFileError, match=r"goals\.pick\.model: right\.matrix has 11 numbers; 12 are needed"):
         TaughtStore(path)
     path.write_text('{"schema": 9, "goals": {}}')
     with pytest.raises(TaughtFileError, match="schema 9; this program reads 1 and 2"):

@@ -59,8 +59,7 @@ def test_pictures_are_asked_for_and_published_only_where_somebody_subscribes(
         for camera in ("left", "right")
     }
     wanted = {
-        camera: SlotReader(directories.preview_wanted_slot(camera), WANTED_LAYOUT)
-        for camera in ("left", "right")
+        camera: SlotReader(directories.preview_wanted_slot(camera), WANTED_LAYOUT) for camera in ("left", "right")
     }
     publishers = {"left": Publisher(), "right": Publisher()}
     clock = Clock()
@@ -72,9 +71,7 @@ def test_pictures_are_asked_for_and_published_only_where_somebody_subscribes(
         clock.ns += int(later_s * 1e9)
         shutter = clock.ns - int(age_s * 1e9)
         for camera, slot in slots.items():
-            slot.write(
-                msgspec.msgpack.encode(PreviewPicture(camera, seq, shutter, 1280, 960, b"jpeg %d" % seq))
-            )
+            slot.write(msgspec.msgpack.encode(PreviewPicture(camera, seq, shutter, 1280, 960, b"jpeg %d" % seq)))
         previews.poll()
 
     poll(1)

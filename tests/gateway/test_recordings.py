@@ -55,9 +55,7 @@ class Bench:
         return None if order is None else order.directory
 
 
-def test_a_recording_is_summed_up_once_all_cameras_have_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recording_is_summed_up_once_all_cameras_have_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames", right="frames", third="observations")
     bench.orders.check()
     bench.orders.begin(bench.flight)
@@ -80,9 +78,7 @@ def test_a_recording_is_summed_up_once_all_cameras_have_told(
         ("left", 50, 0),
         ("right", 40, 2),
     ]
-    assert bench.events[-1].message.endswith(
-        "left: 50 frames; right: 40 frames, 2 left out, the disk is full"
-    )
+    assert bench.events[-1].message.endswith("left: 50 frames; right: 40 frames, 2 left out, the disk is full")
 
 
 def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,9 +95,7 @@ def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch
     assert not bench.orders.running
 
 
-def test_a_new_recording_does_not_wait_for_the_last_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_new_recording_does_not_wait_for_the_last_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames")
     bench.orders.begin(bench.flight)
     first = read_request(request_path(bench.directories))
@@ -116,9 +110,7 @@ def test_a_new_recording_does_not_wait_for_the_last_one(
     assert [event.kind for event in bench.events] == ["images", "images_recorded", "images"]
 
 
-def test_cameras_without_pictures_are_refused_with_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cameras_without_pictures_are_refused_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path, monkeypatch, left="observations", right="observations")
     with pytest.raises(CannotRecordError, match="left, right deliver observations"):
         bench.orders.check()
@@ -233,9 +225,7 @@ def test_a_full_disk_ends_a_recording_and_the_next_request_begins_another(
     flight.close()
 
 
-def test_a_ring_that_is_not_written_is_a_note_until_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_ring_that_is_not_written_is_a_note_until_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rings: list[SimpleNamespace] = []
 
     def ring(*_: object) -> SimpleNamespace:

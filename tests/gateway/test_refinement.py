@@ -101,9 +101,7 @@ def test_a_rest_pose_counts_once_and_only_at_rest() -> None:
     bench.visit(np.full(n, 0.1))
     bench.run(30.0)
     assert len(poses.poses) == 1
-    assert (
-        sum(len(value) for value in vars(poses).values() if isinstance(value, list)) < 100
-    )  # no rest is long
+    assert sum(len(value) for value in vars(poses).values() if isinstance(value, list)) < 100  # no rest is long
     kept = poses.poses[0]
     assert kept.joints is not None
     assert kept.joints == pytest.approx(0.1)
@@ -168,9 +166,7 @@ class Gateway:
         self.calibration = SimpleNamespace(model=self.base, busy=False)
         self.taught = TaughtStore(folder / "taught.json")
         self.taught.add("park", taught_goal(self.shown(), self.base, "2026"))
-        log = SimpleNamespace(
-            add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields))
-        )
+        log = SimpleNamespace(add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields)))
         self.connected = True
         link = SimpleNamespace(send_model=lambda model: self.sent.append(model) or self.connected)
         self.jobs = RefinementJobs(
@@ -185,9 +181,7 @@ class Gateway:
             self.base.cameras[0].name, ids, np.arange(2.0 * len(ids)).reshape(-1, 2),
             np.tile(0.01 * np.eye(2), (len(ids), 1, 1)), 5, np.full(len(ids), 5.0), np.zeros(len(ids)),
         )  # fmt: skip
-        return Event(
-            1, 1, "taught", name="park", joints=np.zeros(len(self.base.joint_names)), samples=(sample,)
-        )
+        return Event(1, 1, "taught", name="park", joints=np.zeros(len(self.base.joint_names)), samples=(sample,))
 
     def visit(self, count: int, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -432,9 +426,7 @@ class NextStart:
         assert model is not None, passed
         self.calibration: Any = SimpleNamespace(model=model, busy=False)
         self.taught = TaughtStore(folder / "taught.json")
-        log: Any = SimpleNamespace(
-            add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields))
-        )
+        log: Any = SimpleNamespace(add=lambda kind, **fields: self.told.append(SimpleNamespace(kind=kind, **fields)))
         link: Any = SimpleNamespace(send_model=lambda model: True)
         jobs = RefinementJobs(
             before.settings, False, models, link, log, self.calibration, link, self.taught, RunningGoals

@@ -111,9 +111,7 @@ def test_standing_markers_of_an_incidence_become_their_pixels_of_now(bench: Benc
     spec = IncidenceSpec("point-on-line", pin, Feature(markers=(10, 11)))
     pointed = IncidenceSpec("point-on-point", pin, Feature(points=((0.0, 0.0, 1.0, 1.0),)))
     target = IncidenceTarget((spec, pointed), model_epoch=1)
-    with pytest.raises(
-        TransferError, match=r"markers 10, 11 .* seen by no camera now; two cameras are needed"
-    ):
+    with pytest.raises(TransferError, match=r"markers 10, 11 .* seen by no camera now; two cameras are needed"):
         bench.teaching.resolve_incidence(target)
     bench.show(placed(WORK, TABLE))
     found, seen = bench.teaching.resolve_incidence(target)

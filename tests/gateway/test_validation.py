@@ -47,9 +47,7 @@ GOOD = {0: (10.0, 10.0), 1: (20.0, 10.0), 2: (20.0, 20.0)}
 
 BODY = msgspec.structs.replace(
     SETTINGS,
-    cameras=tuple(
-        CameraSettings(name, 640, 480, 30.0, "eye_to_hand", tuple(range(12))) for name in ("left", "right")
-    ),
+    cameras=tuple(CameraSettings(name, 640, 480, 30.0, "eye_to_hand", tuple(range(12))) for name in ("left", "right")),
 )
 """A cell whose detectors know markers 0 to 11, of which 0 to 5 are the body's."""
 RICH = GoalContext(BODY, ("park",), tuple(range(6)))
@@ -114,9 +112,7 @@ def test_good_goals_have_no_problem() -> None:
         ),
     ],
 )
-def test_each_problem_says_what_would_have_been_valid(
-    target: Any, options: dict[str, Any], expected: str
-) -> None:
+def test_each_problem_says_what_would_have_been_valid(target: Any, options: dict[str, Any], expected: str) -> None:
     (problem,) = problems(target, **options)
     assert expected in problem
 
@@ -271,9 +267,7 @@ def test_targets_that_cannot_be_say_what_would_have_been_valid(target: Any, expe
         (incidence("point-on-point", PIN, HOLE), {"law": "stereo"}, "law: 'stereo' belongs to a target that"),
     ],
 )  # fmt: skip
-def test_options_that_do_not_go_together_are_named(
-    target: Any, options: dict[str, Any], expected: str
-) -> None:
+def test_options_that_do_not_go_together_are_named(target: Any, options: dict[str, Any], expected: str) -> None:
     (found,) = check_goal(Goal("12345678", target, **options), RICH)
     assert expected in found
 

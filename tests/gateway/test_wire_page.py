@@ -18,9 +18,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text()
 EXAMPLES = [msgspec.json.decode(block) for block in re.findall(r"```json\n(.*?)```", PAGE, re.DOTALL)]
 CELL = msgspec.structs.replace(
     example_settings(),
-    cameras=tuple(
-        CameraSettings(name, 640, 480, 30.0, "eye_to_hand", tuple(range(15))) for name in ("left", "right")
-    ),
+    cameras=tuple(CameraSettings(name, 640, 480, 30.0, "eye_to_hand", tuple(range(15))) for name in ("left", "right")),
 )
 CONTEXT = GoalContext(CELL, ("pick",), tuple(range(10)))
 

@@ -50,9 +50,7 @@ def test_by_default_the_router_listens_on_a_unix_socket_and_discovers_nobody() -
     assert config["transport"]["shared_memory"]["enabled"] is False
 
 
-@pytest.mark.parametrize(
-    "config", [gateway_config(cell(), Path("/"), SOCKET), client_config("tcp/127.0.0.1:1")]
-)
+@pytest.mark.parametrize("config", [gateway_config(cell(), Path("/"), SOCKET), client_config("tcp/127.0.0.1:1")])
 def test_zenoh_knows_every_key_of_ours(config: dict[str, Any]) -> None:
     read = zenoh.Config.from_json5(json.dumps(config))
     assert json.loads(read.get_json("transport/link/tx/queue/congestion_control/drop/wait_before_drop")) == 0
@@ -167,9 +165,7 @@ def test_a_peer_that_takes_all_sessions_of_the_network_locks_out_nobody_on_this_
     own, endpoint = f"unixsock-stream/{tmp_path}/z", f"tcp/127.0.0.1:{unused_port()}"
     both = split_listeners(gateway_config(cell(endpoints=[endpoint]), Path("/"), tmp_path / "z"))
     sessions = [open_session(config) for config in both if config is not None]
-    answers = sessions[0].declare_queryable(
-        "it", zenoh.handlers.Callback(lambda query: query.reply("it", b"yes"))
-    )
+    answers = sessions[0].declare_queryable("it", zenoh.handlers.Callback(lambda query: query.reply("it", b"yes")))
 
     def answered(where: str) -> bool:
         try:
@@ -206,15 +202,11 @@ sys.stdin.read()
 def test_connects_of_strangers_lock_out_nobody_on_this_host(tmp_path: Path) -> None:
     """200 TCP sockets that say nothing, and are opened again as soon as the router gives them up."""
     port = unused_port()
-    both = split_listeners(
-        gateway_config(cell(endpoints=[f"tcp/127.0.0.1:{port}"]), Path("/"), tmp_path / "z")
-    )
+    both = split_listeners(gateway_config(cell(endpoints=[f"tcp/127.0.0.1:{port}"]), Path("/"), tmp_path / "z"))
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with contextlib.ExitStack() as ended:
         for program, *arguments in ((ROUTERS, json.dumps(both)), (CONNECTS, str(port), "200")):
-            child = ended.enter_context(
-                subprocess.Popen([sys.executable, "-c", program, *arguments], **pipes)
-            )
+            child = ended.enter_context(subprocess.Popen([sys.executable, "-c", program, *arguments], **pipes))
             ended.callback(child.kill)
             assert child.stdout.readline()
         time.sleep(0.4)

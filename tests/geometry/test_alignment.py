@@ -30,9 +30,7 @@ from stereoservo.geometry.moved_cameras import carried_point_covariance
 from stereoservo.geometry.strata import euclidean_to_projective
 
 seeds = st.integers(0, 2**32 - 1)
-SPOTS = np.array(
-    [[-0.1, -0.1, 0.0], [0.12, -0.08, 0.03], [0.0, 0.11, -0.06], [0.03, 0.02, 0.13], [-0.08, 0.07, 0.1]]
-)
+SPOTS = np.array([[-0.1, -0.1, 0.0], [0.12, -0.08, 0.03], [0.0, 0.11, -0.06], [0.03, 0.02, 0.13], [-0.08, 0.07, 0.1]])
 TOOL = np.array([[0.05, -0.02, 0.04], [0.1, 0.05, 0.02], [0.02, 0.09, 0.06]])
 FAMILIES = ("rigid", "similar", "affine", "projective")
 SIGMA = 0.1
@@ -129,9 +127,7 @@ def test_errors_of_carried_set_points_are_as_first_order_says(make_rig, family):
 def test_a_smaller_group_amplifies_noise_less(make_rig):
     largest = {}
     for family in FAMILIES:
-        spreads = [
-            carried(family, make_rig, np.random.default_rng(seed), SIGMA)[1].max() for seed in range(20)
-        ]
+        spreads = [carried(family, make_rig, np.random.default_rng(seed), SIGMA)[1].max() for seed in range(20)]
         largest[family] = float(np.median(spreads))
     assert largest["rigid"] <= largest["affine"] <= largest["projective"]
     assert largest["rigid"] < 5 * SIGMA

@@ -61,9 +61,7 @@ def test_canonical_pair_reconstructs_up_to_a_good_projective_frame(make_rig, val
     sign = rng.choice([-1.0, 1.0])
     matches = {"left": pixels[0], "right": pixels[1]} if with_matches else {}
     P_left, P_right = canonical_pair(sign * rng.uniform(0.1, 10) * rig.F, WIDTH, HEIGHT, **matches)
-    assert np.array_equal(
-        P_left, np.hstack([np.linalg.inv(pixel_normaliser(WIDTH, HEIGHT)), np.zeros((3, 1))])
-    )
+    assert np.array_equal(P_left, np.hstack([np.linalg.inv(pixel_normaliser(WIDTH, HEIGHT)), np.zeros((3, 1))]))
     Ps = np.stack([P_left, P_right])
     M = triangulate(Ps, pixels)
     assert np.abs(project_many(Ps, M) - pixels).max() < 1e-8

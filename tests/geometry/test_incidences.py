@@ -60,9 +60,7 @@ MIXES = {
 def test_linear_homography_from_any_mix_is_exact(mix, seed):
     rng = np.random.default_rng(seed)
     H = frame(rng)
-    incidences = [
-        Incidence(A, moved(rng, H, A, outer)) for size, outer, count in mix for A in spans(rng, count, size)
-    ]
+    incidences = [Incidence(A, moved(rng, H, A, outer)) for size, outer, count in mix for A in spans(rng, count, size)]
     found = homography_from_incidences(incidences, tolerance=1e-12)
     assert np.allclose(as_unit(found), as_unit(H), atol=1e-5)
 
@@ -153,9 +151,7 @@ def noisy_scene(rig, rng, sigma):
     incidences = []
     for point in X:
         incidences.append(
-            Incidence(
-                G @ point, point, project_many(rig.Ps, point[None])[:, 0] + rng.normal(0, sigma, (2, 2))
-            )
+            Incidence(G @ point, point, project_many(rig.Ps, point[None])[:, 0] + rng.normal(0, sigma, (2, 2)))
         )
     for pair in ends:
         images = np.stack([project(P, pair) for P in rig.Ps]) + rng.normal(0, sigma, (2, 2, 2))

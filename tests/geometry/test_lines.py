@@ -149,11 +149,7 @@ def test_reconstruction_is_exact_in_any_projective_frame(rig, cameras, seed):
     H = frame(rng)
     X = scene_lines(rig, rng, 5)
     euclidean = third_camera(rig)[:cameras]
-    Ps = (
-        move_cameras(H, euclidean)
-        * rng.uniform(0.5, 2.0, (cameras, 1, 1))
-        * rng.choice([-1, 1], (cameras, 1, 1))
-    )
+    Ps = move_cameras(H, euclidean) * rng.uniform(0.5, 2.0, (cameras, 1, 1)) * rng.choice([-1, 1], (cameras, 1, 1))
     segments = segments_of(euclidean, X)
     # The ends of one image are not those of the other: each slides along its line.
     slide = rng.uniform(-0.3, 0.3, (cameras, 5, 2, 1))
@@ -238,9 +234,7 @@ def test_the_crossing_angle_scales_the_error_of_the_line(rig):
     for angle in angles:
         step = 0.1 * np.array([np.cos(angle), np.sin(angle), 0.0, 0.0])
         X = np.stack([middle - step, middle + step])[None]
-        covariance = line_covariance(
-            rig.Ps, line_through_points(X[:, 0], X[:, 1]), segments_of(rig.Ps, X), sigma=0.1
-        )
+        covariance = line_covariance(rig.Ps, line_through_points(X[:, 0], X[:, 1]), segments_of(rig.Ps, X), sigma=0.1)
         sizes.append(np.sqrt(np.trace(covariance[0])))
     assert np.isclose(sizes[1] / sizes[0], np.sin(angles[0]) / np.sin(angles[1]), rtol=0.35)
 

@@ -35,9 +35,7 @@ from stereoservo.geometry.screws import screw_twist
 from stereoservo.geometry.strata import euclidean_to_projective
 
 seeds = st.integers(0, 2**32 - 1)
-SOME = np.array(
-    [[-0.1, -0.1, 0.0], [0.12, -0.08, 0.03], [0.0, 0.11, -0.06], [0.03, 0.02, 0.13], [-0.08, 0.07, 0.1]]
-)
+SOME = np.array([[-0.1, -0.1, 0.0], [0.12, -0.08, 0.03], [0.0, 0.11, -0.06], [0.03, 0.02, 0.13], [-0.08, 0.07, 0.1]])
 
 
 class MovedCell:
@@ -119,9 +117,7 @@ def test_everything_known_is_brought_over(make_rig, n, seed):
     assert np.allclose(known.generators, conjugate(cell.new_frame @ cell.T, twists), atol=1e-6)
     expected = project_many(cell.new_rig.Ps, (cell.T @ marker)[None])
     assert np.allclose(project_many(cell.Ps_new, known.points), expected, atol=1e-5)
-    assert np.allclose(
-        project_many(known.cameras, known.points), cell.old_rig.pixels(marker[None]), atol=1e-5
-    )
+    assert np.allclose(project_many(known.cameras, known.points), cell.old_rig.pixels(marker[None]), atol=1e-5)
 
 
 def test_the_new_frame_may_be_that_of_a_fundamental_matrix(make_rig):
@@ -160,9 +156,7 @@ def test_noise_floor_and_covariance(make_rig, old_noise):
         M, covariance = cell.M, None
         if old_noise:
             sigmas = np.full((2, n), sigma)
-            M = triangulate(
-                cell.Ps_old, cell.pixels_old + rng.normal(0, sigma, (2, n, 2)), sigmas, iterations=6
-            )
+            M = triangulate(cell.Ps_old, cell.pixels_old + rng.normal(0, sigma, (2, n, 2)), sigmas, iterations=6)
             covariance = triangulation_covariance(cell.Ps_old, M, sigmas)
         pixels = cell.pixels_new + rng.normal(0, sigma, (2, n, 2))
         pixels[1, 7] = np.nan
@@ -260,9 +254,7 @@ def test_a_moved_left_camera_gets_its_canonical_frame(make_rig):
     left = resect_moved_camera(cell.M, cell.pixels_new[0]).P
     H = canonical_frame(left, N, cell.M)
     canonical = left @ np.linalg.inv(H)
-    assert np.allclose(
-        canonical / canonical[2, 2], np.hstack([np.linalg.inv(N), np.zeros((3, 1))]), atol=1e-6
-    )
+    assert np.allclose(canonical / canonical[2, 2], np.hstack([np.linalg.inv(N), np.zeros((3, 1))]), atol=1e-6)
     moved = carry_over(H, points=cell.M, cameras=cell.Ps_old[1:])
     assert (moved.points[:, 2] > 0).all()
     assert np.isclose(np.mean(moved.points[:, 3] / moved.points[:, 2]), 1.0)

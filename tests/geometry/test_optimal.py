@@ -56,9 +56,7 @@ def test_triangulate_reaches_the_same_minimum(rig, seed, noise):
     pixels = rig.pixels(rig.points(rng, 20)) + rng.normal(0, noise, (2, 20, 2))
     optimal, descended = triangulate_optimal(Ps, pixels), triangulate(Ps, pixels, iterations=6)
     least = cost(project_many(Ps, optimal), pixels)
-    assert np.allclose(
-        cost(optimal_pixels(fundamental_of_cameras(*Ps), pixels), pixels), least, rtol=1e-6, atol=1e-9
-    )
+    assert np.allclose(cost(optimal_pixels(fundamental_of_cameras(*Ps), pixels), pixels), least, rtol=1e-6, atol=1e-9)
     reached = cost(project_many(Ps, descended), pixels)
     assert (reached >= least * (1 - 1e-6) - 1e-9).all()
     assert np.allclose(reached, least, rtol=1e-5, atol=1e-9)
@@ -80,10 +78,7 @@ def test_no_epipolar_line_of_a_fine_scan_is_nearer_even_for_wild_pixels(rig):
         right = other @ rig.F.T
         total = 0.0
         for line, pixel, sigma in zip((left, right), pixels[:, k], sigmas[:, k], strict=True):
-            total = (
-                total
-                + ((line[:, :2] @ pixel + line[:, 2]) / np.linalg.norm(line[:, :2], axis=1) / sigma) ** 2
-            )
+            total = total + ((line[:, :2] @ pixel + line[:, 2]) / np.linalg.norm(line[:, :2], axis=1) / sigma) ** 2
         assert least[k] <= total.min() * (1 + 1e-9)
         assert least[k] >= total.min() * (1 - 1e-3)
 

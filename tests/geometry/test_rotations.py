@@ -74,9 +74,7 @@ def test_jordan_frames_of_a_rotation_and_their_geometry(seed, theta):
     size = np.abs(truth.generator).max()
     for found in (one, one.changed(rotation_commutator([0.3, -1.2, *rng.uniform(0.5, 2, 2), -1.0, 0.7]))):
         S = found.planes
-        assert np.allclose(
-            np.linalg.inv(S) @ jordan_rotation(theta) @ S, truth.turn(theta), atol=1e-9 * max(1, size)
-        )
+        assert np.allclose(np.linalg.inv(S) @ jordan_rotation(theta) @ S, truth.turn(theta), atol=1e-9 * max(1, size))
         assert np.allclose(found.generator, truth.generator, atol=1e-9 * max(1, size))
         # Euclidean: two directions normal to the axis and to each other, of equal length.
         first, second = truth.euclidean(found.normal_directions)
@@ -104,11 +102,7 @@ def test_jordan_frames_of_a_rotation_and_their_geometry(seed, theta):
 def test_commutators_commute_and_only_they_do(seed):
     rng = np.random.default_rng(seed)
     p = rng.normal(size=6)
-    C = (
-        rotation_commutator(p)
-        if abs(p[2] * p[5] - p[3] * p[4]) > 1e-3
-        else rotation_commutator([1, 2, 1, 0, 0, 1])
-    )
+    C = rotation_commutator(p) if abs(p[2] * p[5] - p[3] * p[4]) > 1e-3 else rotation_commutator([1, 2, 1, 0, 0, 1])
     J = jordan_rotation(0.7)
     assert np.allclose(J @ C, C @ J)
     # The commutant of J has six dimensions, as many as there are parameters.
@@ -209,8 +203,7 @@ def test_derivatives_of_the_parameters(seed):
     step = 1e-6
     for p, unit in enumerate(np.eye(10)):
         difference = (
-            rotation_from_parameters(x + step * unit, chart)
-            - rotation_from_parameters(x - step * unit, chart)
+            rotation_from_parameters(x + step * unit, chart) - rotation_from_parameters(x - step * unit, chart)
         ) / (2 * step)
         assert np.abs(difference - exact[p]).max() < 1e-5 * max(1, np.abs(exact).max())
     # Ten freedoms, none of them twice.

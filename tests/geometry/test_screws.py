@@ -87,9 +87,7 @@ def test_unaligned_sums_and_products_as_corrected(seed, tau, theta):
     R = truth.generator
     T = conjugate(truth.back, twist_matrix(np.zeros(3), rng.normal(size=3)))
     product = exp_translation(T, tau) @ exp_rotation(R, theta)
-    assert np.allclose(
-        product, np.eye(4) + np.sin(theta) * R + (1 - np.cos(theta)) * R @ R + tau * T, atol=1e-10
-    )
+    assert np.allclose(product, np.eye(4) + np.sin(theta) * R + (1 - np.cos(theta)) * R @ R + tau * T, atol=1e-10)
     total = exp_twist(tau * T + theta * R)
     assert np.allclose(total, expm(tau * T + theta * R), atol=1e-10)
     if abs(theta) > 1e-2:

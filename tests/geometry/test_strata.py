@@ -82,9 +82,7 @@ def test_a_projective_rig_is_upgraded_to_the_euclidean_one(rig, seed):
         move_cameras(to_projective, rig.Ps),
         conjugate(to_projective, twists),
     )
-    assert np.allclose(
-        Ps[0], np.hstack([np.linalg.inv(N), np.zeros((3, 1))]), atol=1e-9 * np.abs(Ps[0]).max()
-    )
+    assert np.allclose(Ps[0], np.hstack([np.linalg.inv(N), np.zeros((3, 1))]), atol=1e-9 * np.abs(Ps[0]).max())
     assert np.allclose(M @ plane, 1.0)
 
     up = projective_to_euclidean(plane, K)

@@ -193,9 +193,7 @@ def test_direction_given_the_plane_is_the_nearest_one_in_the_weighting(seed):
     assert abs(k @ plane) < 1e-10 * np.linalg.norm(k) * np.linalg.norm(plane)
 
     def distance(k):
-        return np.linalg.norm(
-            weighting.left @ (raw_generator(H) - np.outer(k, plane)) @ np.linalg.inv(weighting.right)
-        )
+        return np.linalg.norm(weighting.left @ (raw_generator(H) - np.outer(k, plane)) @ np.linalg.inv(weighting.right))
 
     for _ in range(5):
         other = weighting.onto(plane, k + 0.1 * rng.normal(size=4))
@@ -270,17 +268,14 @@ def test_derivatives_of_the_fit_match_finite_differences_and_the_chart_is_minima
         assert np.abs((up - down) / (2 * step) - at.motion[..., q]).max() < 1e-5 * scale
     for a in range(3):
         up, down = (
-            linearise(images, *motion(x), M + sign * step * charts[..., a], charts).residuals
-            for sign in (1, -1)
+            linearise(images, *motion(x), M + sign * step * charts[..., a], charts).residuals for sign in (1, -1)
         )
         assert np.abs((up - down) / (2 * step) - at.points[..., a]).max() < 1e-5 * np.abs(at.points).max()
     # Six parameters for one motion: the information is regular, and a seventh, the scale of h, adds nothing.
     slopes = chart.displacements(x)[1]
     assert np.linalg.matrix_rank(slopes.transpose(1, 0, 2, 3).reshape(len(x), -1), tol=1e-9) == len(x)
     one, y = shared_plane(scene.plane, scene.directions(shifts[:1]))
-    assert np.allclose(
-        one.displacements(y)[0], shared_plane(3 * scene.plane, k[:1] / 3)[0].displacements(y)[0]
-    )
+    assert np.allclose(one.displacements(y)[0], shared_plane(3 * scene.plane, k[:1] / 3)[0].displacements(y)[0])
 
 
 def fits(rng, scene, shifts, sigma):
@@ -294,9 +289,7 @@ def fits(rng, scene, shifts, sigma):
     directions = np.stack([direction_given_plane(H, plane, weighting) for H in Hs])
     noise = triangulation_covariance(scene.Ps, rest, np.full(pixels.shape[1:3], sigma))
     # Points at depth 1 have one freedom less than the covariance of free homogeneous vectors: the same chart.
-    given_points = refine_translations(
-        scene.Ps, pixels[1:], rest, plane, directions, sigma, points_covariance=noise
-    )
+    given_points = refine_translations(scene.Ps, pixels[1:], rest, plane, directions, sigma, points_covariance=noise)
     return bundle_translations(scene.Ps, pixels, rest, plane, directions, sigma), given_points
 
 

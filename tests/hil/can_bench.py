@@ -97,9 +97,7 @@ class CanBench:
             made.mkdir()
         path = folder / "cell.toml"
         path.write_text(cell_text(folder.name, joints=joints, drives=drives), encoding="utf-8")
-        cameras = EmulatorProcess(
-            path, what="cameras", options=("--channel", ANY_SERVER), log=folder / "cameras.log"
-        )
+        cameras = EmulatorProcess(path, what="cameras", options=("--channel", ANY_SERVER), log=folder / "cameras.log")
         emulator = None
         if not joints:
             emulator = EmulatorProcess(path, options=("--channel", ANY_PORT), log=folder / "drives-0.log")
@@ -169,9 +167,7 @@ class CanBench:
     def told(self, kind: str, after_ns: int) -> bool:
         """Whether the emulator has told of ``kind`` after a time."""
         assert self.emulator is not None
-        return any(
-            event["event"] == kind and event["t_ns"] > after_ns for event in list(self.emulator.events)
-        )
+        return any(event["event"] == kind and event["t_ns"] > after_ns for event in list(self.emulator.events))
 
 
 def codes(client: Client) -> str:

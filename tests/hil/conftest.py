@@ -107,9 +107,7 @@ def cell_file(roots: Path) -> Path:
     names = [joint.name for joint in world.robot.joints]
     base = "\n".join(f"{name} = {float(q)!r}" for name, q in zip(names, world.base, strict=True))
     ranges = "\n".join(f"{name} = 0.15" for name in names)
-    path.write_text(
-        f"{head}{QUICK_CALIBRATION}\n[calibration.base]\n{base}\n\n[calibration.range]\n{ranges}\n"
-    )
+    path.write_text(f"{head}{QUICK_CALIBRATION}\n[calibration.base]\n{base}\n\n[calibration.range]\n{ranges}\n")
     return path
 
 
@@ -149,9 +147,7 @@ def kept_state(calibrated: Path, directories: CellDirectories, tmp_path: Path) -
 
 
 @pytest.fixture
-def start(
-    cell_file: Path, directories: CellDirectories, roots: Path
-) -> Iterator[Callable[..., DaemonProcess]]:
+def start(cell_file: Path, directories: CellDirectories, roots: Path) -> Iterator[Callable[..., DaemonProcess]]:
     """Starts daemons; whatever a test does, they end with it and leave no process behind."""
     started: list[DaemonProcess] = []
 

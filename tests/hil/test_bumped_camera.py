@@ -35,9 +35,7 @@ def test_bumped_camera_is_found_anew_in_mid_goal_and_taught_goals_stay_good(
         told = [e.kind for e in events if e.kind in ("health", "reanchor", "reanchor_model", "reanchored")]
         assert told == ["health", "reanchor", "reanchor_model", "reanchored"], [e.message for e in events]
         assert own.goal(away).wait(30.0).outcome == "reached"
-        assert (
-            own.goal("park").wait(60.0).outcome == "reached"
-        )  # taught before the bump, said in the new pixels
+        assert own.goal("park").wait(60.0).outcome == "reached"  # taught before the bump, said in the new pixels
         assert max(abs(q - joints[name]) for name, q in own.status().joints.items()) < 0.02
     finally:
         bumps.path.unlink()

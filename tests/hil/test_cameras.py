@@ -111,9 +111,7 @@ def test_what_passes_does_not_change_the_outcome(bench: CanBench, client: Client
 
 
 @pytest.mark.slow
-def test_mirrored_pictures_end_a_goal_and_right_ones_make_the_model_good_again(
-    bench: CanBench, client: Client
-) -> None:
+def test_mirrored_pictures_end_a_goal_and_right_ones_make_the_model_good_again(bench: CanBench, client: Client) -> None:
     handle = under_way(client)
     order(bench, "flip all for 1s")
     result = handle.wait(90.0)
@@ -164,9 +162,7 @@ def test_pictures_of_another_size_are_refused_with_both_sizes(bench: CanBench, c
 def test_exchanged_cables_end_in_a_stop_with_a_reason_or_at_the_goal(bench: CanBench, client: Client) -> None:
     handle = under_way(client)
     order(bench, "swap left right")
-    eventually(
-        "a reason or the goal", lambda: bool(client.status().reasons) or not client.status().goal, 30.0
-    )
+    eventually("a reason or the goal", lambda: bool(client.status().reasons) or not client.status().goal, 30.0)
     if client.status().goal:
         eventually("the arm rests", lambda: at_rest(client))
         handle.abandon()

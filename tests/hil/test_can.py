@@ -102,9 +102,7 @@ def test_stop_brakes_and_the_drives_stay_enabled(bench: CanBench, client: Client
     client.resume()
 
 
-def test_a_gripper_on_a_drive_of_its_own_closes_while_the_arm_is_servoed(
-    bench: CanBench, client: Client
-) -> None:
+def test_a_gripper_on_a_drive_of_its_own_closes_while_the_arm_is_servoed(bench: CanBench, client: Client) -> None:
     bench.needs_emulated_drives("the gripper is one of them")
     client.auxiliary({"claw": 0.02})
     away_and_back(bench, client, "stereo")

@@ -27,9 +27,7 @@ following = { j1 = 1.0 }
 """
 
 
-def test_contact_stops_the_arm_and_lets_it_go_back(
-    cell_file: Path, start: Callable[..., DaemonProcess]
-) -> None:
+def test_contact_stops_the_arm_and_lets_it_go_back(cell_file: Path, start: Callable[..., DaemonProcess]) -> None:
     path = cell_file.with_name("blocked.toml")
     path.write_text(cell_file.read_text().replace("[servo]\n", BLOCKED, 1))
     start(path)

@@ -120,8 +120,5 @@ def test_the_belt_is_run_by_a_command_and_stands_at_its_end(roots: Path) -> None
             assert process.wait(60) == 0
         finally:
             process.kill()
-    assert (
-        json.loads((directories.runtime / "simulated-workpiece.json").read_text())["shift_m"]
-        == stands["shift_m"]
-    )
+    assert json.loads((directories.runtime / "simulated-workpiece.json").read_text())["shift_m"] == stands["shift_m"]
     assert -0.12 <= stands["shift_m"][1] <= 0.12

@@ -325,9 +325,7 @@ time.sleep(60)
         assert goal
         # It lives on its renewals for longer than its lease ...
         with pytest.raises(ClientError, match="nothing within"):
-            watch.wait(
-                lambda e: e.id == goal and e.kind != "goal_accepted" and e.kind != "goal_started", "goal", 1.5
-            )
+            watch.wait(lambda e: e.id == goal and e.kind != "goal_accepted" and e.kind != "goal_started", "goal", 1.5)
         process.kill()
         process.wait()
         process.stdout.close()

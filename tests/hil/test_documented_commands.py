@@ -108,9 +108,7 @@ class Desk:
         words = shlex.split(self.filled(command))
         if words[0] in SHELL:
             return self.program(["bash", "-c", command])
-        assert words[0] == "stereoservo", (
-            f"{command}: no such program here: it needs a line in tests/documents.toml"
-        )
+        assert words[0] == "stereoservo", f"{command}: no such program here: it needs a line in tests/documents.toml"
         words = words[1:]
         if words[0] == "run":
             name = Path(words[1]).stem  # a shipped cell, by its name alone, is played by a fake as well
@@ -191,9 +189,7 @@ def desk(cell_file: Path, roots: Path) -> Iterator[Desk]:
 
 def runs(page: Path, slow: bool) -> list[Documented]:
     """Commands of a page that are to be executed, with those that are ``slow`` or without."""
-    return [
-        one for one in documented(page) if one.directive is None or (slow and one.directive.kind == "slow")
-    ]
+    return [one for one in documented(page) if one.directive is None or (slow and one.directive.kind == "slow")]
 
 
 def pages(with_something: Callable[[Path], bool]) -> list[object]:

@@ -38,9 +38,7 @@ def test_every_example_is_run_here() -> None:
     names = {"watch", "teach", "goal", "stream", "stop"}
     for style in STYLES:
         assert {path.stem for path in (EXAMPLES / style).iterdir() if path.suffix == ".py"} == names
-    assert {path.name for path in (EXAMPLES / "javascript").iterdir()} == {
-        f"{name}.mjs" for name in (*names, "cell")
-    }
+    assert {path.name for path in (EXAMPLES / "javascript").iterdir()} == {f"{name}.mjs" for name in (*names, "cell")}
 
 
 @pytest.mark.parametrize("style", STYLES)
@@ -141,15 +139,10 @@ def test_in_javascript_a_page_without_token_watches_and_stops_and_does_nothing_e
 def test_a_wrong_key_is_answered_with_the_right_ones(client: Client, wrong: str) -> None:
     reply = decode(client.query(f"{client.keys.prefix}/{wrong}", b"{}"), Reply)
     assert not reply.accepted
-    assert (
-        "command/<name>/<name> is valid" in reply.problems[0]
-        or "there are: stop, enable" in reply.problems[0]
-    )
+    assert "command/<name>/<name> is valid" in reply.problems[0] or "there are: stop, enable" in reply.problems[0]
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed"
-)
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed")
 def test_watch_writes_a_live_cell_for_rerun(client: Client, tmp_path: Path) -> None:
     file = tmp_path / "live.rrd"
     program = [sys.executable, "-m", "stereoservo.cli.main", "watch", CELL, "--rerun", "--save", str(file)]

@@ -46,9 +46,7 @@ def daemon(cell_file: Path, directories: CellDirectories, roots: Path) -> Iterat
 
 
 @pytest.mark.parametrize("payload", PAYLOADS.values(), ids=PAYLOADS)
-def test_no_payload_ends_a_process(
-    daemon: DaemonProcess, directories: CellDirectories, payload: bytes
-) -> None:
+def test_no_payload_ends_a_process(daemon: DaemonProcess, directories: CellDirectories, payload: bytes) -> None:
     before = processes(directories)
     with Client(CELL, operator="mallory") as client:
         boot = client.status().boot
@@ -67,9 +65,7 @@ def test_no_payload_ends_a_process(
 
 
 @pytest.mark.parametrize("number", PARAMETERS, ids=lambda number: ascii(number[:8]))
-def test_no_parameter_ends_a_process(
-    daemon: DaemonProcess, directories: CellDirectories, number: str
-) -> None:
+def test_no_parameter_ends_a_process(daemon: DaemonProcess, directories: CellDirectories, number: str) -> None:
     before = processes(directories)
     with Client(CELL) as client:
         for key in (

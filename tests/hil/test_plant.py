@@ -27,9 +27,7 @@ def test_a_killed_plant_is_a_fault_that_is_named_and_comes_back_where_it_was(
     cell_file: Path, start: Callable[..., DaemonProcess], directories: CellDirectories
 ) -> None:
     path = cell_file.with_name("physical.toml")
-    path.write_text(
-        cell_file.read_text().replace('driver = "fake"\n[joints', 'driver = "pybullet"\n[joints', 1)
-    )
+    path.write_text(cell_file.read_text().replace('driver = "fake"\n[joints', 'driver = "pybullet"\n[joints', 1))
     daemon = start(path)
     found = processes(directories)
     assert "pybullet" in Path(f"/proc/{found['plant']}/maps").read_text()

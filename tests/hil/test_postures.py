@@ -36,9 +36,7 @@ def test_a_goal_is_reached_in_another_posture(
     listed = told(capsys, "ik", CELL, "park")
     assert listed["case"] == "arm_with_wrist"
     park, there = sorted(listed["postures"], key=lambda row: apart(client, row))
-    assert (
-        apart(client, park) < SAME_RAD
-    )  # `park` is where the arm is, and a wrist turned over is there as well
+    assert apart(client, park) < SAME_RAD  # `park` is where the arm is, and a wrist turned over is there as well
     assert there["refused"] is None
     assert apart(client, there) > 2.0
     for row in (there, park):
@@ -47,9 +45,7 @@ def test_a_goal_is_reached_in_another_posture(
         assert apart(client, row) < SAME_RAD
     # Numbers stay as they are when the arm has moved, and without a daemon that plans the ways.
     again = told(capsys, "ik", str(calibrated), "park")
-    assert [row["cost"] for row in again["postures"]] == pytest.approx(
-        [row["cost"] for row in listed["postures"]]
-    )
+    assert [row["cost"] for row in again["postures"]] == pytest.approx([row["cost"] for row in listed["postures"]])
     assert again["postures"][0]["room"] == pytest.approx(listed["postures"][0]["room"], abs=1e-6)
 
 

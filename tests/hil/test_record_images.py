@@ -68,9 +68,7 @@ def shown(path: Path, seed: int) -> int:
     return len(frames)
 
 
-def test_what_cameras_show_is_recorded_beside_the_flight(
-    playing: Path, start: Callable[..., DaemonProcess]
-) -> None:
+def test_what_cameras_show_is_recorded_beside_the_flight(playing: Path, start: Callable[..., DaemonProcess]) -> None:
     daemon = start(playing)
     done = subprocess.run(
         [

@@ -153,9 +153,7 @@ def run(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> Run:
 
     def go(file: Path, answers: dict[str, str], *options: str) -> tuple[int, dict[str, Any]]:
         script = tmp_path / "answers.toml"
-        script.write_text(
-            "".join(f"{json.dumps(key)} = {json.dumps(text)}\n" for key, text in answers.items())
-        )
+        script.write_text("".join(f"{json.dumps(key)} = {json.dumps(text)}\n" for key, text in answers.items()))
         capfd.readouterr()
         code = cli.invoke(["setup", str(file), "--answers", str(script), "--json", *options])
         return code, json.loads(capfd.readouterr().out)

@@ -66,9 +66,7 @@ def test_the_arm_goes_home_by_the_pictures(roots: Path, capsys: pytest.CaptureFi
     assert found["alternatives"] == 0
     off = np.array([row["zero_off_by"] for row in found["joints"]])
     deviations = np.array([row["deviation"] for row in found["joints"]])
-    print(
-        f"errors {np.round(off + WRONG, 5)}, deviations {np.round(deviations, 5)}, {found['error_px']:.2f} px"
-    )
+    print(f"errors {np.round(off + WRONG, 5)}, deviations {np.round(deviations, 5)}, {found['error_px']:.2f} px")
     assert (np.abs(off + WRONG) <= 5.0 * deviations).all()
     assert deviations.max() < 5e-3
     seen, wanted = world.truth_pixels(reads), world.truth_pixels(world.base - WRONG)

@@ -75,9 +75,7 @@ def test_a_goal_dragged_in_one_picture_is_reached(shared: DaemonProcess) -> None
         assert checked["ok"], checked
         for camera, markers in checked["plan"]["pixels"].items():
             for marker, path in markers.items():
-                assert path[-1] == pytest.approx(dragged["pixels"][camera][marker], abs=0.5), (
-                    "the path ends there"
-                )
+                assert path[-1] == pytest.approx(dragged["pixels"][camera][marker], abs=0.5), "the path ends there"
         sent = page.ask("go")
         assert sent["ok"], sent
         end = page.until(lambda message: ended(message, sent["id"]))
@@ -103,9 +101,7 @@ def test_the_goal_of_another_client_is_drawn_with_its_path_and_in_the_scene(clie
             assert drawn["plan"]["pixels"][camera][marker][-1] == pytest.approx(pixel, abs=1.0)
     markers, cameras = np.array(at_rest["scene"]["markers"]), at_rest["scene"]["cameras"]
     size = np.linalg.norm(np.array(cameras[0]["centre"]) - markers.mean(axis=0))
-    assert np.allclose(drawn["scene"], markers, atol=5e-3 * size), (
-        "in the scene it is where the arm then stands"
-    )
+    assert np.allclose(drawn["scene"], markers, atol=5e-3 * size), "in the scene it is where the arm then stands"
 
 
 @pytest.mark.process
@@ -122,8 +118,7 @@ def test_a_closed_page_lets_its_goal_end(shared: DaemonProcess) -> None:
         page.close()
         end = watcher.until(
             lambda message: (
-                message.get("event", {}).get("kind") == "goal_aborted"
-                and message["event"]["id"] == sent["id"]
+                message.get("event", {}).get("kind") == "goal_aborted" and message["event"]["id"] == sent["id"]
             )
         )
         assert any(reason["code"] == "LEASE_EXPIRED" for reason in end["event"]["reasons"]), end
@@ -133,9 +128,7 @@ def test_a_closed_page_lets_its_goal_end(shared: DaemonProcess) -> None:
 
 
 @pytest.mark.process
-def test_a_goal_outlives_a_session_of_its_page_that_failed(
-    client: Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_goal_outlives_a_session_of_its_page_that_failed(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     told: deque[bytes] = deque()
     link = CellLink(CELL, None, "ann", lambda slot, data, keep: told.append(data))
     polled, failing = EventWatch.poll, threading.Event()
@@ -172,9 +165,7 @@ def demo(roots: Path) -> Iterator[str]:
 
     path = roots / "web_demo.toml"
     text = (Path(stereoservo_sim.cells.__path__[0]) / "demo.toml").read_text()
-    path.write_text(
-        text.replace("rate_hz = 30.0", "rate_hz = 15.0").replace('name = "demo"', 'name = "webdemo"')
-    )
+    path.write_text(text.replace("rate_hz = 30.0", "rate_hz = 15.0").replace('name = "demo"', 'name = "webdemo"'))
     with DaemonProcess(path, log=roots / "web_demo.log") as daemon:
         daemon.wait_ready()
         yield "webdemo"

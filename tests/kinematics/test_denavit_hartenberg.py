@@ -33,9 +33,7 @@ def lines_of_rows(rows, q):
     for row, value in zip(rows, q, strict=True):
         points.append(T[:3, 3])
         directions.append(T[:3, 2])
-        theta, d = (
-            (value + row.theta, row.d) if row.kind == "revolute" else (row.theta, row.scale * value + row.d)
-        )
+        theta, d = (value + row.theta, row.d) if row.kind == "revolute" else (row.theta, row.scale * value + row.d)
         T = T @ synthetic.rotation("z", np.degrees(theta)) @ synthetic.translation(row.a, 0, d)
         T = T @ synthetic.rotation("x", np.degrees(row.alpha)) @ synthetic.rotation("y", np.degrees(row.beta))
     return np.array(points), np.array(directions)

@@ -88,9 +88,7 @@ def test_metric_quantities_are_the_cells():
     assert found["vergence cam0 cam1"] == pytest.approx(20.0)
     # One unit of the slide is a metre, so ratios to it are lengths.
     centres = [np.linalg.inv(pose)[:3, 3] for pose in cell.poses]
-    assert found["baseline cam0 cam1 over unit of j1"] == pytest.approx(
-        np.linalg.norm(centres[1] - centres[0])
-    )
+    assert found["baseline cam0 cam1 over unit of j1"] == pytest.approx(np.linalg.norm(centres[1] - centres[0]))
     assert found["a of j2 over unit of j1"] == pytest.approx(0.2)
     assert found["a of j3 over unit of j1"] == pytest.approx(0.1)
     assert found["d of j3 over unit of j1"] == pytest.approx(0.1)

@@ -135,14 +135,10 @@ def test_reported_covariance_is_the_bound_and_is_reached(perfect_calibration):
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         q = cell.held_out(rng, 1)[0]
-        pixels, home = (
-            cell.pixels(p[None])[:, 0, :2] + rng.normal(0, 0.3, (2, 2, 2)) for p in (q, cell.home)
-        )
+        pixels, home = (cell.pixels(p[None])[:, 0, :2] + rng.normal(0, 0.3, (2, 2, 2)) for p in (q, cell.home))
         angles = measured_joints(joint_problem(seen, points[:2], pixels, 0.3), start=cell.home)[0]
         totals["exact points"] += (angles.q - q) @ np.linalg.solve(angles.covariance, angles.q - q)
-        way = homing_displacement(
-            homing_problem(seen, cell.home, home, pixels, 0.3), cell.home, start=cell.home
-        )
+        way = homing_displacement(homing_problem(seen, cell.home, home, pixels, 0.3), cell.home, start=cell.home)
         error = way.displacement - (cell.home - q)
         totals["home image"] += error @ np.linalg.solve(way.covariance, error)
     low, high = chi2.ppf([0.005, 0.995], 2 * runs)

@@ -102,9 +102,7 @@ def test_round_trip_keeps_every_bit(seed, zero):
 def test_file_round_trip(tmp_path):
     path = tmp_path / "model.json"
     offsets = (ShutterOffset("right", -0.1 / 3, 1e-4 / 3),)
-    model = make_model(
-        1, stratum="affine", projective_to_euclidean=None, statistics=None, shutter_offsets=offsets
-    )
+    model = make_model(1, stratum="affine", projective_to_euclidean=None, statistics=None, shutter_offsets=offsets)
     save_model(model, path)
     same(load_model(path), model)
     assert json.loads(path.read_text())["generators"][0][0] == model.generators[0, 0].tolist()
@@ -242,9 +240,7 @@ def test_a_file_of_the_first_schema_is_read_as_pinholes_that_stand_still():
     assert [camera.lens[0] for camera in model.cameras] == [0.0, 0.0]
 
 
-LOADS = JointLoads(
-    np.array([0.5, 0.1]), np.array([[3.0, 0.1], [1 / 3, 4.0]]), np.array([5.0, 9.0]), np.full(2, 1e-3)
-)
+LOADS = JointLoads(np.array([0.5, 0.1]), np.array([[3.0, 0.1], [1 / 3, 4.0]]), np.array([5.0, 9.0]), np.full(2, 1e-3))
 
 
 def test_loads_come_back_and_a_file_without_them_is_read():

@@ -218,9 +218,7 @@ def test_a_base_link_makes_any_stratum_metric(seed):
     # and in the hand's, (8.19)
     T_HB = np.linalg.inv(poses[1])
     hand = cartesian_velocity(operators, np.array([2.0]), T_HB @ link.H_base)
-    np.testing.assert_allclose(
-        np.concatenate(hand), 2 * screw_transfer(T_HB) @ np.concatenate(screw), atol=1e-8
-    )
+    np.testing.assert_allclose(np.concatenate(hand), 2 * screw_transfer(T_HB) @ np.concatenate(screw), atol=1e-8)
 
 
 def test_a_base_link_from_noisy_displacements():

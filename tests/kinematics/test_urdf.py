@@ -36,10 +36,7 @@ def links_of(path: Path, names: tuple[str, ...], q: np.ndarray) -> dict[str, np.
     client = bullet.connect(bullet.DIRECT)
     try:
         body = bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
-        infos = [
-            bullet.getJointInfo(body, k, physicsClientId=client)
-            for k in range(bullet.getNumJoints(body, client))
-        ]
+        infos = [bullet.getJointInfo(body, k, physicsClientId=client) for k in range(bullet.getNumJoints(body, client))]
         for info in infos:
             if info[1].decode() in names:
                 value = float(q[names.index(info[1].decode())])

@@ -164,10 +164,7 @@ def test_copies_keep_what_is_not_shown():
 
 def test_a_librarys_error_is_shown_without_the_address():
     address = Address("socket://operator:Tulpe@cam:1")
-    assert (
-        address.hidden_in(f"could not open {address.unredacted}: no")
-        == "could not open socket://***@cam:1: no"
-    )
+    assert address.hidden_in(f"could not open {address.unredacted}: no") == "could not open socket://***@cam:1: no"
 
 
 def test_options_are_shown_without_secrets():

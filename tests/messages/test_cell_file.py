@@ -36,9 +36,7 @@ acceleration = 2.0
 base = { j1 = 0.1 }
 range = { j1 = 0.3 }
 """
-DRIVE = JointDriverDescription(
-    "fake", (JointSpec("j1", "revolute", -2.0, 2.0, 1.0, 4.0),), 250.0, "clock", 0.1, 100.0
-)
+DRIVE = JointDriverDescription("fake", (JointSpec("j1", "revolute", -2.0, 2.0, 1.0, 4.0),), 250.0, "clock", 0.1, 100.0)
 CAMERA = CameraDescription("fake", "left", 640, 480, 30.0, "observations", 100.0, (0, 1, 2, 3))
 
 
@@ -60,9 +58,7 @@ def test_a_range_may_be_left_out_and_a_spread_stays_inside_the_limits(tmp_path: 
     assert planned is not None
     assert np.isnan(planned.range).all()
     assert planned.spread_joint == -1
-    spread = settings(
-        tmp_path, GOOD.replace("range =", 'spread = { joint = "j1", positions = 3 }\nrange =')
-    ).trials
+    spread = settings(tmp_path, GOOD.replace("range =", 'spread = { joint = "j1", positions = 3 }\nrange =')).trials
     assert spread is not None
     assert spread.spread_offsets == pytest.approx([-0.3, 0.0, 0.3])
     alone = settings(tmp_path, GOOD.replace("range = { j1 = 0.3 }", 'spread = { joint = "j1" }')).trials
@@ -76,9 +72,7 @@ def test_contact_is_watched_by_default_and_thresholds_stand_in_joint_order(tmp_p
     assert (plain.enabled, plain.factor, plain.samples, plain.effort_units) == (True, 2.0, 5, ("N m",))
     assert np.isnan(plain.efforts).all()
     assert np.isnan(plain.following_errors).all()
-    section = (
-        "[safety.contact]\neffort = { j1 = 12 }\nfactor = 3\nsamples = 3\nenabled = false\n[calibration]"
-    )
+    section = "[safety.contact]\neffort = { j1 = 12 }\nfactor = 3\nsamples = 3\nenabled = false\n[calibration]"
     given = settings(tmp_path, GOOD.replace("[calibration]", section)).contact
     assert given is not None
     assert (given.enabled, given.factor, given.samples) == (False, 3.0, 3)
@@ -272,9 +266,7 @@ def test_a_cell_has_limits_of_size(tmp_path: Path) -> None:
     path.write_text(GOOD)
     cell = load_cell_file(path)
     many = msgspec.structs.replace(CAMERA, marker_ids=tuple(range(257)))
-    with pytest.raises(
-        CellFileError, match="the detectors report 257 different markers; a cell has at most 256"
-    ):
+    with pytest.raises(CellFileError, match="the detectors report 257 different markers; a cell has at most 256"):
         core_settings(cell, DRIVE, (many,))
     core_settings(cell, DRIVE, (msgspec.structs.replace(many, marker_ids=many.marker_ids[:-1]),))
     thirteen = msgspec.structs.replace(DRIVE, joints=DRIVE.joints * 13)

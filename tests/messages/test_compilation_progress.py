@@ -36,9 +36,7 @@ def _tell(runtime: Path, done: int, part: str = "rest", daemon: int = 7) -> None
     progress_path(runtime, part).write_bytes(msgspec.json.encode(one))
 
 
-def test_a_process_tells_each_kernel_that_it_compiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_tells_each_kernel_that_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     listeners = []
     with monkeypatch.context() as patched:
         patched.setattr(compilation.event, "register", lambda kind, listener: listeners.append(listener))

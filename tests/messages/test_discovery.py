@@ -17,9 +17,7 @@ INFO = DaemonInfo("demo", "unixsock-stream//tmp/z", "boot", 1, "demo.toml")
 @pytest.mark.parametrize(
     "data", [b"", b"{", b"\xff", b'{"cell": "\xff"}', b"[" * 60_000, b'{"pid": "one"}', b" " * 100_000, b"null"]
 )  # fmt: skip
-def test_a_strange_announcement_is_no_daemon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes
-) -> None:
+def test_a_strange_announcement_is_no_daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, data: bytes) -> None:
     monkeypatch.setenv(RUNTIME_VARIABLE, str(tmp_path))
     for name in ("demo", "other"):
         (tmp_path / name).mkdir()

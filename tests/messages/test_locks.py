@@ -53,8 +53,7 @@ def test_a_hardware_channel_has_one_lock_whatever_the_cell_is_called(tmp_path: P
     path = hardware_lock_path(tmp_path, "canopen", {"channel": "can0", "bitrate": 1_000_000})
     assert path == tmp_path / "channel-canopen-can0.lock"
     assert (
-        hardware_lock_path(tmp_path, "video", {"device": "/dev/video0"})
-        == tmp_path / "channel-video-dev-video0.lock"
+        hardware_lock_path(tmp_path, "video", {"device": "/dev/video0"}) == tmp_path / "channel-video-dev-video0.lock"
     )
     assert hardware_lock_path(tmp_path, "fake", {}) is None
     assert hardware_lock_path(tmp_path, "video", {"source": "set", "episode": 0}) is None
@@ -76,9 +75,7 @@ def test_a_channel_is_locked_whatever_the_runtime_directories_are(tmp_path: Path
     mine, theirs = tmp_path / "mine" / name, tmp_path / "theirs" / name
     for path in (mine, theirs):
         path.parent.mkdir()
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD_CHANNEL, str(theirs)], stdout=subprocess.PIPE
-    ) as process:
+    with subprocess.Popen([sys.executable, "-c", HOLD_CHANNEL, str(theirs)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"held\n"
         with pytest.raises(AlreadyRunningError, match=rf"it is .* process {process.pid} ") as caught:
@@ -111,9 +108,7 @@ def no_room(*args: object) -> int:
 
 
 @pytest.mark.parametrize("call", ["pwrite", "ftruncate"])
-def test_a_full_disk_does_not_refuse_a_lock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
-) -> None:
+def test_a_full_disk_does_not_refuse_a_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
     path = tmp_path / "a.lock"
     with monkeypatch.context() as patch:
         patch.setattr(os, call, no_room)
@@ -155,9 +150,7 @@ def test_a_channels_lock_is_named_without_its_password(tmp_path: Path) -> None:
         return path
 
     for form in ("http://me:{}@cam/s?channel={}", "http://cam/s?user=me&pwd={}&channel={}"):
-        assert (
-            lock(form.format("Tulpe", 1)) == lock(form.format("Tulpe7", 1)) != lock(form.format("Tulpe", 2))
-        )
+        assert lock(form.format("Tulpe", 1)) == lock(form.format("Tulpe7", 1)) != lock(form.format("Tulpe", 2))
     dvr = "rtsp://10.0.0.1:554/user=admin_password={}_channel={}_stream=0.sdp"
     assert lock(dvr.format("Tulpe", 1)) == lock(dvr.format("Tulpe7", 1)) != lock(dvr.format("Tulpe", 2))
     lock("http://me:Tulpe#77@cam/s")

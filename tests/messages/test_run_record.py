@@ -77,9 +77,7 @@ def test_a_cause_that_nobody_could_write_is_concluded(
     assert "the computer was switched off" in how_it_ended(run)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b"\xff", b'{"boot": 5}', b"[" * 50_000, b'{"goals": [{"id": 1}]}']
-)
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b'{"boot": 5}', b"[" * 50_000, b'{"goals": [{"id": 1}]}'])
 def test_a_damaged_record_is_none(content: bytes, directories: CellDirectories) -> None:
     directories.run_record.write_bytes(content)
     directories.open_goals.write_bytes(content)

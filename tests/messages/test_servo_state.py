@@ -77,9 +77,7 @@ def test_what_is_fresh_is_told_with_its_age() -> None:
 @pytest.mark.parametrize("joints_ns", [0, NOW_NS - 3_000_000_000])
 def test_joints_of_drives_that_tell_nothing_are_unknown_and_do_not_move(joints_ns: int) -> None:
     found = message(joints_ns=joints_ns, frames_ns=BOTH)
-    assert (
-        found.joints == found.velocities == found.efforts == found.following_errors == found.auxiliary == {}
-    )
+    assert found.joints == found.velocities == found.efforts == found.following_errors == found.auxiliary == {}
     assert found.joints_age_s == (3.0 if joints_ns else None)
     assert found.command == {"j1": 0.5}, "what is commanded is known"
 

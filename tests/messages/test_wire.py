@@ -206,9 +206,7 @@ def test_a_refusal_names_the_value_and_what_would_have_been_valid(change: dict[s
 
 
 def test_an_integer_that_no_later_stage_can_carry_is_refused() -> None:
-    payload = b'{"id": "00000000", "target": {"kind": "features", "set_points": {}, "model_epoch": 1%s}}' % (
-        b"0" * 30
-    )
+    payload = b'{"id": "00000000", "target": {"kind": "features", "set_points": {}, "model_epoch": 1%s}}' % (b"0" * 30)
     with pytest.raises(MessageError, match="1000000000000000000000000000000"):
         decode(payload, Goal)
 
@@ -252,9 +250,7 @@ def test_a_gain_is_a_number_or_falls_with_the_error() -> None:
 
 
 @given(
-    st.dictionaries(
-        st.sampled_from(Goal.__struct_fields__[2:]), st.none() | st.text() | st.floats() | st.integers()
-    )
+    st.dictionaries(st.sampled_from(Goal.__struct_fields__[2:]), st.none() | st.text() | st.floats() | st.integers())
 )
 def test_any_goal_is_taken_as_it_is_or_refused_with_the_field(tree: dict[str, Any]) -> None:
     data = msgspec.json.encode(GOAL | tree)

@@ -110,9 +110,7 @@ def run(acme: Path, cache: Path, first: str = "", **environment: str) -> tuple[f
     return float(done.stdout), {line["kernel"] for line in lines if line.get("module", "").startswith("acme")}
 
 
-def test_a_kernel_that_is_compiled_is_linked_with_what_came_from_the_cache(
-    acme: Path, tmp_path: Path
-) -> None:
+def test_a_kernel_that_is_compiled_is_linked_with_what_came_from_the_cache(acme: Path, tmp_path: Path) -> None:
     assert run(acme, tmp_path / "cache") == (20.0, {"caller", "twice"})
     (acme / "caller.py").write_text(CALLER.replace("FACTOR * twice(x)", "twice(x) + twice(x)"))
     assert run(acme, tmp_path / "cache") == (4.0, {"caller"})
@@ -148,9 +146,7 @@ def test_a_kernel_of_before_an_upgrade_is_not_taken_for_one_of_after(acme: Path,
 
 
 @pytest.mark.parametrize("change", ["moved", "damaged"])
-def test_a_list_of_kernels_that_cannot_be_read_is_written_anew(
-    acme: Path, tmp_path: Path, change: str
-) -> None:
+def test_a_list_of_kernels_that_cannot_be_read_is_written_anew(acme: Path, tmp_path: Path, change: str) -> None:
     (acme / "pairs.py").write_text(PAIR)
     (acme / "caller.py").write_text(TAKES_PAIR.format(home="pairs"))
     assert run(acme, tmp_path / "cache") == (20.0, {"caller", "second"})
@@ -192,9 +188,7 @@ def test_a_release_s_kernels_in_a_fresh_environment(tmp_path: Path) -> None:
 
     def do(*command: str) -> str:
         environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "NUMBA_CACHE_DIR")}
-        done = subprocess.run(
-            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, check=True, text=True
-        )
+        done = subprocess.run(command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, check=True, text=True)
         return done.stdout
 
     do(sys.executable, "-m", "venv", str(tmp_path / "venv"))

@@ -110,9 +110,7 @@ def iterate(
     return found, first, best, linear, total
 
 
-def displaced(
-    moment: Measurement, cameras: list[int], algebra: FloatArray, count: int, rounds: int
-) -> Estimate:
+def displaced(moment: Measurement, cameras: list[int], algebra: FloatArray, count: int, rounds: int) -> Estimate:
     """The first ``count`` points moved by an element of the group of ``algebra`` (d, 4, 4), as ``cameras`` see them.
 
     Moving the points by D is moving the cameras to ``P D``.
@@ -267,10 +265,7 @@ def explain(moment: Measurement, thresholds: Thresholds) -> Reference:
     left = chi2[best]
     freedom = total - sizes[best]
     kind = ("nothing", "camera", "cameras", "marker", "joint", "joints").index(names[best][0])
-    if (
-        chi2_tail(left, freedom + freedom % 2) < np.exp(thresholds.log_alpha)
-        and not left <= EXPLAINED * whole
-    ):
+    if chi2_tail(left, freedom + freedom % 2) < np.exp(thresholds.log_alpha) and not left <= EXPLAINED * whole:
         kind = 6
     if kind == 4 and others and sizes[others[0]] > 1 and names[others[0]][0] != "marker":
         others = []

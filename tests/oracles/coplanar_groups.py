@@ -67,9 +67,7 @@ def faces_of_all_triples(
                 left &= ~inside
     outward, sided = [], []
     for triple, inside, above, below in chosen:
-        plane = np.linalg.det(
-            np.concatenate([np.tile(points[triple], (4, 1, 1)), np.eye(4)[:, None]], axis=1)
-        )
+        plane = np.linalg.det(np.concatenate([np.tile(points[triple], (4, 1, 1)), np.eye(4)[:, None]], axis=1))
         sees = (seen[:, inside] > 0).sum(axis=1) >= 3
         side = np.sign(np.sign(camera_centres[sees] @ plane).sum()) or np.sign(below) - np.sign(above)
         outward.append(triple if side >= 0 else triple[[0, 2, 1]])

@@ -38,9 +38,7 @@ def normalise_displacement(
     H = H / (size * determinant**0.25)
     if M_from is not None and M_to is not None:
         images = M_from @ H.T
-        agreement = (images * M_to).sum(axis=1) / (
-            np.linalg.norm(images, axis=1) * np.linalg.norm(M_to, axis=1)
-        )
+        agreement = (images * M_to).sum(axis=1) / (np.linalg.norm(images, axis=1) * np.linalg.norm(M_to, axis=1))
         votes = int((agreement > 0).sum()), int((agreement < 0).sum())
         if votes[0] == votes[1]:
             raise GeometryError(
@@ -92,9 +90,7 @@ def log_rotation(H: FloatArray) -> tuple[FloatArray, float]:
     H = _square(H, "rotation")
     theta = rotation_angle(H)
     if theta < HALF_TURN_SINE:
-        raise GeometryError(
-            "degenerate", f"the rotation is {theta:.3g} rad; the identity has no axis", theta=theta
-        )
+        raise GeometryError("degenerate", f"the rotation is {theta:.3g} rad; the identity has no axis", theta=theta)
     if np.pi - theta < HALF_TURN_SINE:
         raise GeometryError(
             "half_turn",
@@ -123,9 +119,7 @@ def generator_between(odd: FloatArray, even: FloatArray) -> FloatArray:
     plane = plane - 0.5 * np.trace(plane) * np.eye(2)
     determinant = float(np.linalg.det(plane))
     if not determinant > 0:
-        raise GeometryError(
-            "half_turn", "the rotation is half a turn within its noise, which hides its sense"
-        )
+        raise GeometryError("half_turn", "the rotation is half a turn within its noise, which hides its sense")
     G: FloatArray = columns @ (plane / np.sqrt(determinant)) @ metric @ rows
     return G
 
@@ -152,9 +146,7 @@ def translation_generator(H: FloatArray, tau: float = 1.0) -> FloatArray:
     for tau 0.
     """
     if tau == 0.0 or not np.isfinite(tau):
-        raise GeometryError(
-            "degenerate", f"tau is {tau}; a generator needs a finite motion other than zero", tau=tau
-        )
+        raise GeometryError("degenerate", f"tau is {tau}; a generator needs a finite motion other than zero", tau=tau)
     return log_translation(H) / tau
 
 

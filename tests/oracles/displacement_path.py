@@ -128,15 +128,11 @@ def displacement_path(
     return DisplacementPath(centre, plane, way, generator, angle, profile)
 
 
-def _generator_about(
-    axis: FloatArray, centre: FloatArray, plane: FloatArray, operators: FloatArray
-) -> FloatArray:
+def _generator_about(axis: FloatArray, centre: FloatArray, plane: FloatArray, operators: FloatArray) -> FloatArray:
     """Generator (4, 4) of the rotation about the line of two points ``axis`` (2, 4) through ``centre`` (4,)."""
     frame = motion_frame(operators, plane, centre / (plane @ centre), np.zeros((0, 4)))
     if not np.isfinite(frame).all():
-        raise GeometryError(
-            "half_turn", "the operators leave no frame to turn in; joints that turn are needed"
-        )
+        raise GeometryError("half_turn", "the operators leave no frame to turn in; joints that turn are needed")
     points = np.linalg.solve(frame, axis.T).T
     # the axis's point at infinity: the combination of its two points of height zero
     direction = (points[0] * points[1, 3] - points[1] * points[0, 3])[:3]
@@ -174,8 +170,7 @@ def cartesian_velocity(path: CartesianPath, sigma: float) -> FloatArray:
     amounts = (d.translation.amount, d.hinge.amount, d.planar.amount)
     tau, theta_r, _ = path.amounts(sigma)
     rates = [
-        whole * progress_rate(shape, sigma)
-        for whole, shape in zip(amounts, shapes(path.profile, amounts), strict=True)
+        whole * progress_rate(shape, sigma) for whole, shape in zip(amounts, shapes(path.profile, amounts), strict=True)
     ]
     H_t = exp_translation(d.translation.operator, tau)
     H_tr = H_t @ exp_rotation(d.hinge.operator, theta_r)

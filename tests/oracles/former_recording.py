@@ -28,9 +28,7 @@ class FormerRecorder:
 
     def __init__(self, path: Path, settings: CoreSettings, fingerprint: Fingerprint) -> None:
         self._stream = path.open("wb")
-        self._writer = Writer(
-            self._stream, chunk_size=16_384, compression=CompressionType.LZ4, enable_data_crcs=True
-        )
+        self._writer = Writer(self._stream, chunk_size=16_384, compression=CompressionType.LZ4, enable_data_crcs=True)
         self._writer.start(profile="stereoservo-flight-1", library="stereoservo")
         self._channels = {
             topic: self._writer.register_channel(topic=topic, message_encoding="msgpack", schema_id=0)

@@ -40,17 +40,13 @@ def homography_from_basis(A: FloatArray, B: FloatArray) -> FloatArray:
     for name, X in (("first", A), ("second", B)):
         X = np.asarray(X, dtype=np.float64)
         if X.shape != (5, 4):
-            raise GeometryError(
-                "shape", f"the {name} basis has shape {X.shape}; (5, 4) is needed", shape=X.shape
-            )
+            raise GeometryError("shape", f"the {name} basis has shape {X.shape}; (5, 4) is needed", shape=X.shape)
         unit = X / np.linalg.norm(X, axis=1, keepdims=True)
         if not abs(np.linalg.det(unit[:4])) > 1e-12:
             raise GeometryError("degenerate", f"points 1 to 4 of the {name} basis are coplanar")
         x = np.linalg.solve(X[:4].T, X[4])
         if not np.abs(x).min() > 1e-10 * np.abs(x).max():
-            raise GeometryError(
-                "degenerate", f"point 5 of the {name} basis is coplanar with three others", weights=x
-            )
+            raise GeometryError("degenerate", f"point 5 of the {name} basis is coplanar with three others", weights=x)
         coefficients.append(x)
     a, b = coefficients
     H: FloatArray = (np.asarray(B, dtype=np.float64)[:4].T * (b / a)) @ np.linalg.inv(A[:4].T)
@@ -82,14 +78,10 @@ def homography_refine(
     (c, n) or a number [px]. ``M_covariance`` (n, 4, 4): the points' own, which adds to that of the pixels to
     first order. Raises GeometryError for shapes that do not fit or fewer than 15 coordinates.
     """
-    pixels, weights = check_views(
-        Ps, pixels_to, np.broadcast_to(1.0 / np.asarray(sigma), pixels_to.shape[:2])
-    )
+    pixels, weights = check_views(Ps, pixels_to, np.broadcast_to(1.0 / np.asarray(sigma), pixels_to.shape[:2]))
     measured = 2 * int((weights > 0).sum())
     if measured < 15:
-        raise GeometryError(
-            "too_few", f"{measured} pixel coordinates; 15 parameters need as many", measured=measured
-        )
+        raise GeometryError("too_few", f"{measured} pixel coordinates; 15 parameters need as many", measured=measured)
     result = np.asarray(H, dtype=np.float64)
     # The weights follow the solution where the points' covariance enters them: twice is enough, it is small.
     for _ in range(1 if M_covariance is None else 2):
@@ -118,9 +110,7 @@ def _least_squares(
         product: FloatArray = full.reshape(-1, 16) @ chart
         return product
 
-    fit = least_squares(
-        residuals, np.zeros(15), jac=jacobian, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14
-    )
+    fit = least_squares(residuals, np.zeros(15), jac=jacobian, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     return unit_determinant((base + chart @ fit.x).reshape(4, 4) @ W, "the refined homography")
 
 
@@ -205,9 +195,7 @@ def frame_change(
             "at least 5",
             points=both.tolist(),
         )
-    refuse_coplanar(
-        M_new[both], triangulation_covariance(Ps_new, M_new[both], sigmas[:, both]), both.tolist()
-    )
+    refuse_coplanar(M_new[both], triangulation_covariance(Ps_new, M_new[both], sigmas[:, both]), both.tolist())
     used = np.flatnonzero(known & seen.any(axis=0))
     own = None if M_covariance is None else np.asarray(M_covariance, dtype=np.float64)[used]
     start = homography_from_points(M_old[both], M_new[both])
@@ -215,9 +203,7 @@ def frame_change(
     covariance = homography_covariance(H, Ps_new, M_old[used], pixels[:, used], sigma, own)
     residuals = _whitened_residuals(H, Ps_new, M_old[used], pixels[:, used], sigma, own)
     freedom = residuals.size - 15
-    return FrameChange(
-        H, covariance, tuple(used.tolist()), float(np.sqrt(residuals @ residuals / freedom)), freedom
-    )
+    return FrameChange(H, covariance, tuple(used.tolist()), float(np.sqrt(residuals @ residuals / freedom)), freedom)
 
 
 def _whitened_residuals(
@@ -243,9 +229,7 @@ def frame_change_from_points(M_old: FloatArray, M_new: FloatArray) -> FloatArray
     """
     M_old, M_new = np.asarray(M_old, dtype=np.float64), np.asarray(M_new, dtype=np.float64)
     if M_old.ndim != 2 or M_old.shape[1] != 4 or M_old.shape != M_new.shape:
-        raise GeometryError(
-            "shape", f"point sets have shapes {M_old.shape} and {M_new.shape}; both must be (n, 4)"
-        )
+        raise GeometryError("shape", f"point sets have shapes {M_old.shape} and {M_new.shape}; both must be (n, 4)")
     seen = np.flatnonzero(np.isfinite(M_old).all(axis=1) & np.isfinite(M_new).all(axis=1))
     refuse_coplanar(M_old[seen], None, seen.tolist())
     refuse_coplanar(M_new[seen], None, seen.tolist())

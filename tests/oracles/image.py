@@ -46,6 +46,4 @@ def image_velocity(
     residual = np.where(seen, held_gain(options) * (task.set_points - scene.pixels) + rates, 0.0)
     J = np.where(seen[..., None], image_jacobian_at(scene, task, jacobian), 0.0)
     rows = np.repeat(weights.reshape(-1), 2)
-    return damped_least_squares_reference(
-        J.reshape(-1, J.shape[-1]), residual.reshape(-1), rows, options.damping
-    )
+    return damped_least_squares_reference(J.reshape(-1, J.shape[-1]), residual.reshape(-1), rows, options.damping)

@@ -49,9 +49,7 @@ class _Residual:
         owner: int,
     ) -> _Residual:
         m = matrices @ X
-        gradient = (matrices[:, :2] - (m[:, :2] / m[:, 2:])[..., None] * matrices[:, 2:]) / m[
-            :, 2, None, None
-        ]
+        gradient = (matrices[:, :2] - (m[:, :2] / m[:, 2:])[..., None] * matrices[:, 2:]) / m[:, 2, None, None]
         A = gradient.reshape(-1, 4)
         T = A @ directions.T
         return cls(marker, owner, base, directions, A, np.eye(len(A)) - T @ np.linalg.pinv(T))
@@ -78,9 +76,7 @@ def incidence_reference(
         for i in own[: moving_count(kind)].tolist()
     ]
     e = np.concatenate([r.normal @ (r.gradient @ (scene.points[r.marker] - r.base)) for r in residuals])
-    J = np.concatenate(
-        [r.normal @ r.gradient @ (scene.operators @ scene.points[r.marker]).T for r in residuals]
-    )
+    J = np.concatenate([r.normal @ r.gradient @ (scene.operators @ scene.points[r.marker]).T for r in residuals])
     error = np.array(
         [
             max(r.distance(scene.matrices, scene.points[r.marker]) for r in residuals if r.owner == k)
@@ -104,9 +100,7 @@ def incidence_reference(
         change = ahead * (J @ step)
         predicted = float(e @ e - (e + change) @ (e + change))
         moved = scene.points @ displacement(scene.operators, Composition(scene.composition), ahead * step).T
-        left = sum(
-            float(((r.normal @ (r.gradient @ (moved[r.marker] - r.base))) ** 2).sum()) for r in residuals
-        )
+        left = sum(float(((r.normal @ (r.gradient @ (moved[r.marker] - r.base))) ** 2).sum()) for r in residuals)
         if predicted <= 1e-12 * float(e @ e) or float(e @ e) - left >= kernels.SUFFICIENT * predicted:
             break
         damp = max(kernels.GROWTH * damp, 1e-3 * sigma[0] ** 2)

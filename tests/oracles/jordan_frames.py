@@ -73,9 +73,7 @@ def split_generator(G: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     G = np.asarray(G, dtype=np.float64)
     if G.shape != (4, 4) or not np.isfinite(G).all():
-        raise GeometryError(
-            "shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape
-        )
+        raise GeometryError("shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape)
     U, singular, Vt = np.linalg.svd(G)
     square = float(np.linalg.norm(G @ G))
     size = float(singular[0])
@@ -125,9 +123,7 @@ def jordan_commutator(parameters: npt.ArrayLike) -> FloatArray:
     return np.asarray(p[0] * C, dtype=np.float64)
 
 
-def direction_from_stack(
-    Hs: Sequence[FloatArray] | FloatArray, weighting: Weighting = UNWEIGHTED
-) -> FloatArray:
+def direction_from_stack(Hs: Sequence[FloatArray] | FloatArray, weighting: Weighting = UNWEIGHTED) -> FloatArray:
     """Direction ``(4,)``, unit norm, common to homographies ``(n, 4, 4)`` of parallel translations (3.38).
 
     Raises GeometryError for an empty stack and for a homography without trace.
@@ -195,9 +191,7 @@ def generator_from_homographies(Hs: Sequence[FloatArray] | FloatArray, angles: n
     sine, cosine = np.sin(theta), 2.0 * np.sin(0.5 * theta) ** 2
     odd_weight, even_weight = float(sine @ sine), float(cosine @ cosine)
     if even_weight <= HALF_TURN_SINE**4:
-        raise GeometryError(
-            "degenerate", "all angles are multiples of 2π; a rotation is needed", angles=theta.tolist()
-        )
+        raise GeometryError("degenerate", "all angles are multiples of 2π; a rotation is needed", angles=theta.tolist())
     if odd_weight <= HALF_TURN_SINE**2:
         raise GeometryError(
             "half_turn",

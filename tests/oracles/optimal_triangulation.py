@@ -62,9 +62,7 @@ def optimal_pixels(F: FloatArray, pixels: FloatArray, sigmas: FloatArray | float
     lines = _epipolar_pair(t, *abcd, *focals)
     for i in range(2):
         line = np.einsum("nji,nj->ni", turns[i], lines[i])  # back from turned coordinates
-        foot = np.stack(
-            [-line[:, 0] * line[:, 2], -line[:, 1] * line[:, 2], line[:, 0] ** 2 + line[:, 1] ** 2], axis=1
-        )
+        foot = np.stack([-line[:, 0] * line[:, 2], -line[:, 1] * line[:, 2], line[:, 0] ** 2 + line[:, 1] ** 2], axis=1)
         foot = np.einsum("nij,nj->ni", to_pixels[i], foot)
         result[i, seen] = np.where(regular[:, None], foot[:, :2] / foot[:, 2:], np.nan)
     return result

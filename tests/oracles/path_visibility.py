@@ -74,9 +74,7 @@ def visible_shares(
     return intervals
 
 
-def common_shares(
-    first: list[tuple[float, float]], second: list[tuple[float, float]]
-) -> list[tuple[float, float]]:
+def common_shares(first: list[tuple[float, float]], second: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Where both hold: the most conservative of two cameras (7.4.2)."""
     both = [(max(a, c), min(b, d)) for a, b in first for c, d in second]
     return sorted((low, high) for low, high in both if low < high)
@@ -99,10 +97,7 @@ def view_rooms(
     with np.errstate(divide="ignore", invalid="ignore"):
         ideal = seen[..., :2] / depths[..., None]
         raw = np.stack(
-            [
-                distort(lens, ideal[:, c].reshape(-1, 2)).reshape(ideal[:, c].shape)
-                for c, lens in enumerate(lenses)
-            ],
+            [distort(lens, ideal[:, c].reshape(-1, 2)).reshape(ideal[:, c].shape) for c, lens in enumerate(lenses)],
             axis=1,
         )
         rooms = np.minimum(raw + 0.5, sizes[None, :, None, :] - 0.5 - raw).min(axis=-1)

@@ -22,13 +22,9 @@ def points_velocity(scene: Scene, task: Task, options: Options) -> tuple[FloatAr
     ``G`` (2c, 4) is ``J_G P`` of all cameras at ``M``, ``M̄`` the point that the Jacobian is developed around.
     """
     M, T = scene.points, task.target_points
-    around = {JacobianChoice.MEAN: 0.5 * (M + T), JacobianChoice.DESIRED: T}.get(
-        JacobianChoice(options.jacobian), M
-    )
+    around = {JacobianChoice.MEAN: 0.5 * (M + T), JacobianChoice.DESIRED: T}.get(JacobianChoice(options.jacobian), M)
     m = np.einsum("cij,mj->mci", scene.matrices, M)
-    G = (scene.matrices[:, :2] - (m[..., :2] / m[..., 2:])[..., None] * scene.matrices[:, 2:]) / m[
-        ..., 2, None, None
-    ]
+    G = (scene.matrices[:, :2] - (m[..., :2] / m[..., 2:])[..., None] * scene.matrices[:, 2:]) / m[..., 2, None, None]
     G = G.reshape(M.shape[0], -1, 4)
     J = np.einsum("mri,nij,mj->mrn", G, scene.operators, around)
     error = np.einsum("mri,mi->mr", G, T - M)

@@ -42,9 +42,7 @@ def crossing_of_diagonals(A1: FloatArray, A2: FloatArray, A3: FloatArray, A4: Fl
     norms = np.linalg.norm(unit_rows(corners) * np.linalg.norm(corners, axis=1, keepdims=True), axis=1)
     _, singular, rows = np.linalg.svd((corners / norms[:, None] * np.array([[1.0], [1.0], [-1.0], [-1.0]])).T)
     if not singular[2] > 1e-9 * singular[0]:
-        raise GeometryError(
-            "degenerate", "the four corners are collinear; a quadrangle is needed", singular=singular
-        )
+        raise GeometryError("degenerate", "the four corners are collinear; a quadrangle is needed", singular=singular)
     weights = rows[3] / norms
     first, second = weights[0] + weights[1], weights[2] + weights[3]
     scale = 0.5 * (first + second)

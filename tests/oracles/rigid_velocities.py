@@ -50,9 +50,7 @@ def point_velocity(velocity: FloatArray, M: FloatArray) -> FloatArray:
     return rate
 
 
-def metric_point_velocity(
-    H_projective_to_euclidean: FloatArray, M: FloatArray, M_dot: FloatArray
-) -> FloatArray:
+def metric_point_velocity(H_projective_to_euclidean: FloatArray, M: FloatArray, M_dot: FloatArray) -> FloatArray:
     """Metric velocity ``Ẋ`` (..., 3) [m/s] of points ``(..., 4)`` from their projective one: ``ρ Ẋ = H_PE Ṁ`` (2.48).
 
     Raises GeometryError for a point at infinity, which has none.
@@ -60,9 +58,7 @@ def metric_point_velocity(
     H = np.asarray(H_projective_to_euclidean, dtype=np.float64)
     height = orbital_height(H[3], M)
     if not (np.abs(height) > 1e-12 * np.linalg.norm(H[3]) * np.linalg.norm(M, axis=-1)).all():
-        raise GeometryError(
-            "degenerate", "a point lies at infinity; it has no metric velocity", heights=height
-        )
+        raise GeometryError("degenerate", "a point lies at infinity; it has no metric velocity", heights=height)
     X_dot: FloatArray = (np.asarray(M_dot, dtype=np.float64) @ H.T)[..., :3] / height[..., None]
     return X_dot
 

@@ -61,9 +61,7 @@ def caps(inputs, limits, before, age):
             +1: limits.position_max[j] - limits.position_margin,
             -1: limits.position_min[j] + limits.position_margin,
         }
-        found.append(
-            {s: (stopping_speed(s * (bounds[s] - reach[s]), a, inputs.dt_s), "limit") for s in (+1, -1)}
-        )
+        found.append({s: (stopping_speed(s * (bounds[s] - reach[s]), a, inputs.dt_s), "limit") for s in (+1, -1)})
     for k in range(len(limits.keep_out_names)):
         ways = []
         for j in range(n):
@@ -89,9 +87,7 @@ def expected(inputs, limits):
     brake = inputs.brake
     if not trusted(inputs.joint_age_s, limits.joint_timeout_s):
         brake = True
-        reasons.append(
-            ("JOINTS_STALE", "hold", "", finite(inputs.joint_age_s), limits.joint_timeout_s, "bus")
-        )
+        reasons.append(("JOINTS_STALE", "hold", "", finite(inputs.joint_age_s), limits.joint_timeout_s, "bus"))
     if inputs.needs_features and not trusted(inputs.feature_age_s, limits.features_fresh_s):
         coasts = trusted(inputs.feature_age_s, limits.coast_s)
         brake = brake or not coasts
@@ -102,16 +98,12 @@ def expected(inputs, limits):
         for what, value in (("command", inputs.raw[j]), ("measured position", inputs.positions[j])):
             if not math.isfinite(value):
                 brake = True
-                reasons.append(
-                    ("NON_FINITE_COMMAND", "hold", names[j], None, None, f"{what} of joint {names[j]}")
-                )
+                reasons.append(("NON_FINITE_COMMAND", "hold", names[j], None, None, f"{what} of joint {names[j]}"))
 
     before = [v if math.isfinite(v) else 0.0 for v in inputs.previous]
     over = max([1.0, *(abs(v) / m for v, m in zip(before, limits.velocity_max, strict=True))])
     before = [v / over for v in before]
-    age = (
-        inputs.joint_age_s if trusted(inputs.joint_age_s, limits.joint_timeout_s) else limits.joint_timeout_s
-    )
+    age = inputs.joint_age_s if trusted(inputs.joint_age_s, limits.joint_timeout_s) else limits.joint_timeout_s
     cap = caps(inputs, limits, before, age)
 
     def bounded(j, velocity):
@@ -172,7 +164,5 @@ def expected(inputs, limits):
     if not brake and share < 1.0 - 1e-9:
         j = int(np.argmin(shares))
         a = limits.acceleration_max[j]
-        reasons.append(
-            ("ACCELERATION_LIMITED", "info", names[j], a / share if share > 0.0 else None, a, "passes")
-        )
+        reasons.append(("ACCELERATION_LIMITED", "info", names[j], a / share if share > 0.0 else None, a, "passes"))
     return Expected(limited, brake, reasons)

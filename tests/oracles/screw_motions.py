@@ -36,9 +36,7 @@ def exp_screw(G: FloatArray, theta: npt.ArrayLike) -> FloatArray:
     angle = np.asarray(theta, dtype=np.float64)[..., None, None]
     square = G @ G
     cube = square @ G
-    H: FloatArray = (
-        np.eye(4) - np.sin(angle) * cube + 2.0 * np.sin(0.5 * angle) ** 2 * square + angle * (cube + G)
-    )
+    H: FloatArray = np.eye(4) - np.sin(angle) * cube + 2.0 * np.sin(0.5 * angle) ** 2 * square + angle * (cube + G)
     return H
 
 
@@ -129,9 +127,7 @@ def screw_axis(H: FloatArray) -> FloatArray:
     if theta < NEAR_HALF_TURN:
         X = log_displacement(H)
         if float(twist_angle(X)) <= NO_TURN * float(np.linalg.norm(X)):
-            raise GeometryError(
-                "degenerate", f"the motion turns by {theta:.3g} rad; it has no axis", theta=theta
-            )
+            raise GeometryError("degenerate", f"the motion turns by {theta:.3g} rad; it has no axis", theta=theta)
         operator = X @ X
     else:
         operator = _turning_plane(H, theta)

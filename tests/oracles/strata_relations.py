@@ -112,7 +112,5 @@ def fixed_quadric_residual(generators: FloatArray, quadric: FloatArray) -> Float
     generators = np.asarray(generators, dtype=np.float64)
     half = generators @ quadric
     change = np.linalg.norm(half + np.swapaxes(half, -1, -2), axis=(-2, -1))
-    residual: FloatArray = change / (
-        2.0 * np.linalg.norm(generators, axis=(-2, -1)) * np.linalg.norm(quadric)
-    )
+    residual: FloatArray = change / (2.0 * np.linalg.norm(generators, axis=(-2, -1)) * np.linalg.norm(quadric))
     return residual

@@ -5,8 +5,7 @@ from pathlib import Path
 KNOWN = {
     (experiment, item, what): verdict
     for experiment, item, what, verdict in (
-        line.split("\t")
-        for line in Path(__file__).with_suffix(".tsv").read_text(encoding="utf-8").splitlines()
+        line.split("\t") for line in Path(__file__).with_suffix(".tsv").read_text(encoding="utf-8").splitlines()
     )
 }
 

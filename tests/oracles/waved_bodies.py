@@ -76,15 +76,11 @@ def random_cameras(rng: np.random.Generator, count: int) -> tuple[FloatArray, Fl
     return K, d, T
 
 
-def waved(
-    seed: int, *, cameras: int = 2, places: int = 15, sigma: float = 0.2, known: bool = True
-) -> WavedRig:
+def waved(seed: int, *, cameras: int = 2, places: int = 15, sigma: float = 0.2, known: bool = True) -> WavedRig:
     """Good views: a board of known layout, or a body in space of unknown one, tilted to 35° about both axes."""
     rng = np.random.default_rng(seed)
     body = board() if known else rng.uniform(-0.1, 0.1, (14, 3))
-    return _views(
-        rng, cameras, places, sigma, body, known, lambda: _turn(rng, 35.0, 30.0), lambda: _place(rng)
-    )
+    return _views(rng, cameras, places, sigma, body, known, lambda: _turn(rng, 35.0, 30.0), lambda: _place(rng))
 
 
 def degenerate(kind: str, seed: int, sigma: float) -> WavedRig:
@@ -167,9 +163,7 @@ def rendered_pictures(seed: int, folder: Path, *, places: int = 12, noise: float
         ideal = _ideal_samples(rig.K[c], rig.distortion[c])
         for s in range(places):
             plane = _plane_of(rig, c, s)
-            levels = (
-                _squares(ideal @ np.linalg.inv(plane).T).reshape(SIZE[1], 2, SIZE[0], 2).mean(axis=(1, 3))
-            )
+            levels = _squares(ideal @ np.linalg.inv(plane).T).reshape(SIZE[1], 2, SIZE[0], 2).mean(axis=(1, 3))
             image = np.clip(np.round(levels + noise * rng.normal(size=levels.shape)), 0, 255).astype(np.uint8)
             cv2.imwrite(str(folder / name / f"{s:02d}.png"), image)
     return rig

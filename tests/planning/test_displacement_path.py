@@ -87,9 +87,7 @@ def test_pure_translation_turns_nothing_and_identity_moves_nothing(virtual):
     frame, T, C, asked = hidden_displacement(virtual, rng, 0.0)
     path = displacement_path(*asked)
     assert path.angle == 0.0
-    np.testing.assert_allclose(
-        np.linalg.inv(frame) @ path.displacement(0.3) @ frame, truth(T, C, 0.3), atol=1e-10
-    )
+    np.testing.assert_allclose(np.linalg.inv(frame) @ path.displacement(0.3) @ frame, truth(T, C, 0.3), atol=1e-10)
     still = displacement_path(np.eye(4), asked[1], asked[2])
     np.testing.assert_allclose(still.displacement(0.7), np.eye(4), atol=1e-15)
 
@@ -110,9 +108,7 @@ def test_a_grasp_drives_the_tool_that_never_defined_it(virtual):
     workpiece = np.column_stack([rng.uniform(-0.1, 0.1, (5, 3)) + C[:3], np.ones(5)])
     claw = np.column_stack([rng.uniform(-0.1, 0.1, (2, 3)) + C[:3] + [0.2, 0, 0], np.ones(2)])
     path = displacement_path(*asked, profile="rotation-first")
-    pieces = (
-        np.array([path.drive(workpiece @ frame.T, s) for s in np.linspace(0, 1, 11)]) @ np.linalg.inv(frame).T
-    )
+    pieces = np.array([path.drive(workpiece @ frame.T, s) for s in np.linspace(0, 1, 11)]) @ np.linalg.inv(frame).T
     claws = np.array([path.drive(claw @ frame.T, s) for s in np.linspace(0, 1, 11)]) @ np.linalg.inv(frame).T
     np.testing.assert_allclose(pieces[-1], workpiece @ T.T, atol=1e-9)
     np.testing.assert_allclose(claws[-1], claw @ T.T, atol=1e-9)
@@ -136,9 +132,7 @@ def test_three_components_end_at_the_goal_and_hold_the_line(virtual, seed, angle
     world = virtual.free_arm(rng, T0)
     P, Q = world.hidden(virtual.PLATE @ T0.T), world.hidden(virtual.PLATE @ T_star.T)
     c, c_star = world.hidden(T0[:, 3]), world.hidden(T_star[:, 3])
-    path = cartesian_path(
-        decompose(world.operators(), P[:3], Q[:3], c, c_star, world.camera_centres), profile
-    )
+    path = cartesian_path(decompose(world.operators(), P[:3], Q[:3], c, c_star, world.camera_centres), profile)
     np.testing.assert_allclose(P @ path.displacement(1.0).T, Q, atol=1e-8)
     for sigma in (0.2, 0.5, 0.9):
         H = path.displacement(sigma)

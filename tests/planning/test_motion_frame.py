@@ -47,9 +47,7 @@ def test_measured_operators_leave_a_frame_as_good_as_they_are(virtual, cells):
 
 def test_no_plane_gives_no_frame(virtual, cells):
     world = cells.rx90(np.random.default_rng(0))
-    W = motion_frame(
-        world.operators(), np.zeros(4), world.hidden(world.plate_pose()[:, 3]), world.camera_centres
-    )
+    W = motion_frame(world.operators(), np.zeros(4), world.hidden(world.plate_pose()[:, 3]), world.camera_centres)
     assert np.isnan(W).any()
 
 

@@ -201,10 +201,7 @@ def test_markers_that_need_not_be_seen_may_leave(virtual, cells):
     T0, T_star = virtual.random_task(rng, 30, 0.1)
     T_star[:3, 3] = [0.6, 0.0, 1.0]
     world = virtual.free_arm(rng, T0)
-    assert (
-        plan(cells.request(world, T_star, kept=np.zeros(4), faces=np.zeros((0, 3), dtype=np.int64))).plan
-        is not None
-    )
+    assert plan(cells.request(world, T_star, kept=np.zeros(4), faces=np.zeros((0, 3), dtype=np.int64))).plan is not None
 
 
 def test_joint_limits_and_keep_outs_fail_where_they_are_met(virtual, cells):

@@ -93,9 +93,7 @@ def test_a_redundant_arm_moves_without_its_self_motion(virtual):
 
 def scara(virtual, rng):
     """Three translations and a rotation about z: what a SCARA can do."""
-    generators = np.array(
-        [virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])]
-    )
+    generators = np.array([virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])])
     T0 = virtual.pose(Rotation.identity(), [0.05, 0, 1.0])
     return virtual.World(generators, T0, virtual.random_frame(rng), np.zeros(4))
 

@@ -69,9 +69,7 @@ def test_one_camera_is_enough(virtual, cells):
     T0, T_star = virtual.random_task(rng, 120, 0.3)
     world = virtual.free_arm(rng, T0)
     request = cells.request(world, T_star)
-    limits = msgspec.structs.replace(
-        request.limits, sizes=request.limits.sizes[:1], lenses=request.limits.lenses[:1]
-    )
+    limits = msgspec.structs.replace(request.limits, sizes=request.limits.sizes[:1], lenses=request.limits.lenses[:1])
     one = msgspec.structs.replace(
         request, matrices=request.matrices[:1], camera_centres=request.camera_centres[:1], limits=limits
     )

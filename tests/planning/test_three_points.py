@@ -148,9 +148,7 @@ def test_a_centre_off_the_face_runs_on_its_own_line(virtual):
 
 def test_a_deficient_arm_moves_what_it_can(virtual):
     """A SCARA: no hinge. The translation and its amount stay right."""
-    generators = np.array(
-        [virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])]
-    )
+    generators = np.array([virtual.screw(axis) for axis in np.eye(3)] + [virtual.screw([0, 0, 1.0], [0.1, 0, 1])])
     T0 = virtual.pose(Rotation.identity(), [0.05, 0, 1.0])
     T_star = virtual.pose(Rotation.from_euler("zy", [30, 25], degrees=True), [0.1, 0.1, 1.2])
     world = virtual.World(generators, T0, virtual.random_frame(np.random.default_rng(9)), np.zeros(4))
@@ -159,12 +157,7 @@ def test_a_deficient_arm_moves_what_it_can(virtual):
     assert "about the hinge" in d.hinge.detail
     assert d.hinge.amount > 0.1
     np.testing.assert_array_equal(d.hinge.screw, np.zeros(4))
-    moved = (
-        np.linalg.inv(world.frame)
-        @ (np.eye(4) + d.translation.amount * d.translation.operator)
-        @ world.frame
-        @ T0
-    )
+    moved = np.linalg.inv(world.frame) @ (np.eye(4) + d.translation.amount * d.translation.operator) @ world.frame @ T0
     np.testing.assert_allclose(moved[:3, 3], T_star[:3, 3], atol=1e-9)
     assert d.planar.amount == pytest.approx(np.radians(30), abs=0.1)
 

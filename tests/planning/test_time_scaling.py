@@ -26,9 +26,7 @@ def as_plan(times, joints):
 def smooth_way(rng, n, size):
     """Joints along a way with a few bends."""
     s = np.linspace(0, 1, K)[:, None]
-    waves = sum(
-        rng.normal(size=n) / k**2 * (np.sin(k * np.pi * s + rng.uniform(0, 2 * np.pi, n))) for k in (1, 2, 3)
-    )
+    waves = sum(rng.normal(size=n) / k**2 * (np.sin(k * np.pi * s + rng.uniform(0, 2 * np.pi, n))) for k in (1, 2, 3))
     return size * (rng.normal(size=n) * s + waves)
 
 

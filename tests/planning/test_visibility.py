@@ -62,9 +62,7 @@ def test_rotation_bounds_hold_the_visible_angles(virtual, seed):
     for theta in np.linspace(-np.pi, np.pi, 25):
         a, b, c = (edges @ virtual_rotation(virtual, G, theta).T)[:, :3]
         # det[a b c O] of homogeneous points is minus the normal times the way to the camera
-        front = sign * np.linalg.det(
-            np.column_stack([np.append(a, 1), np.append(b, 1), np.append(c, 1), eye])
-        )
+        front = sign * np.linalg.det(np.column_stack([np.append(a, 1), np.append(b, 1), np.append(c, 1), eye]))
         if bounds is None:
             assert front < 1e-9
             continue

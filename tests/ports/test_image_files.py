@@ -134,9 +134,7 @@ def test_flipped_bytes_never_pass_for_pixels(recorded: tuple[Path, list[Frame]])
             told.append((error.code, error.frame, good, str(path) in str(error)))
     assert all(frame == (good if code == "crc" else None) and named for code, frame, good, named in told)
     assert {code for code, *_ in told} <= {"crc", "video", "size"}
-    assert sum(code == "crc" for code, *_ in told) > 100, (
-        "most bytes are pixels: the CRC must catch most flips"
-    )
+    assert sum(code == "crc" for code, *_ in told) > 100, "most bytes are pixels: the CRC must catch most flips"
 
 
 def test_a_video_cut_anywhere_gives_the_frames_before_the_cut(recorded: tuple[Path, list[Frame]]) -> None:
@@ -240,9 +238,7 @@ def test_what_does_not_belong_together_is_refused(recorded: tuple[Path, list[Fra
     assert caught.value.code == "camera"
 
 
-def test_files_that_are_missing_or_no_video_are_refused(
-    recorded: tuple[Path, list[Frame]], tmp_path: Path
-) -> None:
+def test_files_that_are_missing_or_no_video_are_refused(recorded: tuple[Path, list[Frame]], tmp_path: Path) -> None:
     path, _ = recorded
     with pytest.raises(ImageFileError) as caught:
         ImageReader(tmp_path / "none.avi")
@@ -331,9 +327,7 @@ def test_a_recording_ends_at_its_limits(tmp_path: Path) -> None:
         assert writer.frames == 8 or name == "size"
         assert path.stat().st_size < 2 << 20
     with pytest.raises(ImageFileError, match="Make room") as caught:
-        ImageWriter(
-            tmp_path / "disk.avi", "left", (640, 480), 30.0, limits=ImageLimits(keep_free_bytes=2 * free)
-        )
+        ImageWriter(tmp_path / "disk.avi", "left", (640, 480), 30.0, limits=ImageLimits(keep_free_bytes=2 * free))
     assert caught.value.code == "disk"
     assert not (tmp_path / "disk.avi").exists()
 

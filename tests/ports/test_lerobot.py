@@ -48,8 +48,7 @@ def numbers(folder: Path, only: int | None = None, key: str = UP) -> list[int]:
     info = lerobot.read_info(folder)
     rows = lerobot.read_rows(folder, info, only)
     return [
-        round(float(take().mean()) / LEVELS) - 1
-        for _, take in lerobot.pictures(folder, info, key, rows, gray=True)
+        round(float(take().mean()) / LEVELS) - 1 for _, take in lerobot.pictures(folder, info, key, rows, gray=True)
     ]
 
 
@@ -123,9 +122,7 @@ def test_a_video_of_another_rate_is_refused(tmp_path: Path) -> None:
         numbers(folder)
 
 
-def test_an_episode_is_found_without_decoding_those_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_episode_is_found_without_decoding_those_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Format 3.0 has up to 200 MB of episodes in one video: the last one began after minutes, at each repetition."""
     folder = write(tmp_path / "set", "v3.0", numbered(60, 5))
     write_in_av1(folder, numbered(60, 5))

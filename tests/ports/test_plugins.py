@@ -47,8 +47,6 @@ def test_loading_a_broken_or_unknown_one_says_why_and_what_there_is() -> None:
     assert plugins.load(plugins.JOINT_DRIVERS, "acme").__name__ == "Driver"
     with pytest.raises(plugins.PluginError, match=r"does not import: RuntimeError: no such firmware"):
         plugins.load(plugins.JOINT_DRIVERS, "acme-broken")
-    with pytest.raises(
-        plugins.PluginError, match=r"no joint driver 'kuka'; there are: .*acme.*fake"
-    ) as caught:
+    with pytest.raises(plugins.PluginError, match=r"no joint driver 'kuka'; there are: .*acme.*fake") as caught:
         plugins.load(plugins.JOINT_DRIVERS, "kuka")
     assert "fake" in caught.value.known

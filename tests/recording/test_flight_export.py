@@ -81,9 +81,7 @@ def test_the_recording_takes_no_more_room_in_it_than_by_itself(exported: Exporte
             messages = make_reader(stream).iter_messages()
             return sum(len(message.data) for schema, _, message in messages if schema is None)
 
-    assert own_bytes(exported.file) < 1.02 * own_bytes(exported.flight), (
-        "it is compressed as the recorder does"
-    )
+    assert own_bytes(exported.file) < 1.02 * own_bytes(exported.flight), "it is compressed as the recorder does"
 
 
 def test_every_message_is_valid_by_its_schema_and_at_the_wall_clocks_time(
@@ -99,9 +97,7 @@ def test_every_message_is_valid_by_its_schema_and_at_the_wall_clocks_time(
     assert max(times) <= end
 
 
-def test_joints_and_pixels_are_those_recorded(
-    exported: Exported, messages: dict[str, list[tuple[int, Any]]]
-) -> None:
+def test_joints_and_pixels_are_those_recorded(exported: Exported, messages: dict[str, list[tuple[int, Any]]]) -> None:
     recorded = {inputs.now_ns: (inputs, outputs) for inputs, outputs in exported.bench.log[-STEPS:]}
     shift = messages["/joints"][0][0] - min(recorded)
     for t_ns, content in messages["/joints"]:
@@ -123,9 +119,7 @@ def test_joints_and_pixels_are_those_recorded(
     assert np.allclose([(point.x, point.y) for point in drawn[-1][1].points[-1].points], wanted, atol=1e-12)
 
 
-def test_the_scene_is_the_true_one_in_baselines(
-    exported: Exported, messages: dict[str, list[tuple[int, Any]]]
-) -> None:
+def test_the_scene_is_the_true_one_in_baselines(exported: Exported, messages: dict[str, list[tuple[int, Any]]]) -> None:
     """Markers, camera centres and axes against the bench's arm in metres: all distances agree but for the unit."""
     truth = exported.bench.truth
     centres = np.array([-np.linalg.solve(P[:, :3], P[:, 3]) for P in truth.cameras])
@@ -133,12 +127,8 @@ def test_the_scene_is_the_true_one_in_baselines(
     positions = {t_ns: np.array([j.position for j in m.joints]) for t_ns, m in messages["/joints"]}
     t_ns, scene = next((t, m) for t, m in reversed(messages["/scene"]) if t in positions)
     by_name = {entity.id: entity for entity in scene.entities}
-    markers = np.array(
-        [(s.pose.position.x, s.pose.position.y, s.pose.position.z) for s in by_name["markers"].spheres]
-    )
-    places = np.array(
-        [(t.pose.position.x, t.pose.position.y, t.pose.position.z) for t in by_name["cameras"].texts]
-    )
+    markers = np.array([(s.pose.position.x, s.pose.position.y, s.pose.position.z) for s in by_name["markers"].spheres])
+    places = np.array([(t.pose.position.x, t.pose.position.y, t.pose.position.z) for t in by_name["cameras"].texts])
     true_points = np.vstack([truth.points(positions[t_ns]), centres])
     drawn = np.vstack([markers, places])
 
@@ -164,9 +154,7 @@ def test_a_file_that_exists_is_left_alone(exported: Exported) -> None:
     assert exported.file.read_bytes() == before
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed"
-)
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed")
 def test_rerun_decodes_at_least_eight_entities(exported: Exported, tmp_path: Path) -> None:
     rrd = tmp_path / "flight.rrd"
     program = [sys.executable, "-m", "rerun"]

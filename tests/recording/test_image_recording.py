@@ -33,9 +33,7 @@ class Bench:
         self.order = directory / "images.json"
         self.images = directory / "flight.images"
         self.reports: list[tuple[str, str, RecordedImages | None]] = []
-        self.recorder = ImageRecorder(
-            self.order, "left", "test", 30.0, lambda *said: self.reports.append(said), limits
-        )
+        self.recorder = ImageRecorder(self.order, "left", "test", 30.0, lambda *said: self.reports.append(said), limits)
         self.now_ns = 0
         self.seq = 0
         self.rng = np.random.default_rng(0)
@@ -133,9 +131,7 @@ def test_a_disk_that_is_too_slow_costs_frames_which_are_counted_and_never_time(
     assert told == result.left_out
 
 
-def test_a_writer_slower_than_the_camera_ends_with_its_order(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_writer_slower_than_the_camera_ends_with_its_order(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a busy computer there is always a frame that waits; those after the end are none of the recording's."""
     append = ImageWriter.append
     written = threading.Semaphore(0)

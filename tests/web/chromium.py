@@ -55,9 +55,7 @@ class Browser:
         self.run("window.scrollTo(0, 0); stats.dragged = stats.goal = null")
         width, height = canvas.size["width"], canvas.size["height"]
         scale = width / 640
-        begin, end = (
-            [round(scale * v) for v in pixel] for pixel in (self.value(f"stats.middle('{camera}')"), to)
-        )
+        begin, end = ([round(scale * v) for v in pixel] for pixel in (self.value(f"stats.middle('{camera}')"), to))
         ActionChains(self.driver).move_to_element_with_offset(
             canvas, begin[0] - width // 2, begin[1] - height // 2
         ).click_and_hold().move_by_offset(end[0] - begin[0], end[1] - begin[1]).release().perform()

@@ -50,9 +50,7 @@ def test_whatever_a_cell_sends_the_link_goes_on_and_says_so(monkeypatch: pytest.
 def test_a_daemon_without_the_key_of_goals_is_shown_without_them(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[Any] = []
     monkeypatch.setattr(cell_link, "Client", lambda *arguments, **named: Cell())
-    link = CellLink(
-        "far", None, "page", lambda slot, message, keep: told.append(msgspec.json.decode(message))
-    )
+    link = CellLink("far", None, "page", lambda slot, message, keep: told.append(msgspec.json.decode(message)))
     asked: list[str] = []
 
     def running_goals() -> Any:
@@ -82,9 +80,7 @@ def test_a_picture_without_its_header_is_passed_over(monkeypatch: pytest.MonkeyP
 def test_how_far_the_refinement_is_comes_with_the_state(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[Any] = []
     monkeypatch.setattr(cell_link, "Client", lambda *arguments, **named: Cell())
-    link = CellLink(
-        "far", None, "page", lambda slot, message, keep: told.append(msgspec.json.decode(message))
-    )
+    link = CellLink("far", None, "page", lambda slot, message, keep: told.append(msgspec.json.decode(message)))
     state = StateMessage(
         cell="far", boot="b", t_ns=1, step=0, t_wall=1.0, lifecycle="active", model="none", model_epoch=0,
         source="hold", goal="", law="", level="ok", reasons=(), joints={}, velocities={}, command={}, error_px=None,

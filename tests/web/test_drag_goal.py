@@ -30,17 +30,13 @@ def test_the_body_moves_parallel_to_the_picture_without_turning(seed: int) -> No
     truth = make_truth(seed, k1=(0.0, -0.15)[seed % 2], count=3)
     camera = seed % 3
     shift = rng.uniform(-50, 50, 2)
-    found = DragModel(truth.model, WIDE).dragged(
-        START, truth.model.cameras[camera].name, (shift[0], shift[1])
-    )
+    found = DragModel(truth.model, WIDE).dragged(START, truth.model.cameras[camera].name, (shift[0], shift[1]))
     moved = pose(truth, found.joints)
     viewing = truth.cameras[camera][2, :3]
     assert found.left_px < 1e-4
     assert np.allclose(moved[:, :3], np.eye(3), atol=1e-6)
     assert abs(viewing @ moved[:, 3]) < 1e-6, "metres along the line of sight"
-    assert np.allclose(
-        centre_pixel(truth, camera, found.joints) - centre_pixel(truth, camera, START), shift, atol=1e-3
-    )
+    assert np.allclose(centre_pixel(truth, camera, found.joints) - centre_pixel(truth, camera, START), shift, atol=1e-3)
     assert np.allclose(found.pixels, truth.pixels(found.joints), atol=1e-6)
 
 
@@ -55,9 +51,9 @@ def test_nearer_and_turned_about_the_line_of_sight() -> None:
 
     turned = pose(truth, model.dragged(START, "left", (0.0, 0.0), turn=0.3).joints)[:, :3]
     angle = np.arccos((np.trace(turned) - 1) / 2)
-    axis = np.array(
-        [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
-    ) / (2 * np.sin(angle))
+    axis = np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]) / (
+        2 * np.sin(angle)
+    )
     # A turn of the pixels is one of the body about the ray as far as the body is small before its distance.
     assert np.isclose(angle, 0.3, atol=0.02)
     assert axis @ truth.cameras[0][2, :3] > 0.99

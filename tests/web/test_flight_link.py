@@ -38,8 +38,7 @@ class Shown(NamedTuple):
         self.link.seek((log[step][0].now_ns - log[0][0].now_ns) * 1e-9)
         eventually(lambda: "flight" in self.slots)
         return {
-            slot: data if slot.startswith("picture") else msgspec.json.decode(data)
-            for slot, data in self.slots.items()
+            slot: data if slot.startswith("picture") else msgspec.json.decode(data) for slot, data in self.slots.items()
         }
 
 
@@ -77,9 +76,7 @@ def test_a_moment_is_what_was_recorded(shown: Shown) -> None:
         assert list(state["joints"].values()) == recorded.positions.tolist()
         assert state["error_px"] == recorded.error_px
         exact = shown.bench.truth.pixels(recorded.positions)[0]
-        assert np.allclose(list(predicted["left"].values()), exact, rtol=0, atol=1e-6), (
-            "the model is the true one"
-        )
+        assert np.allclose(list(predicted["left"].values()), exact, rtol=0, atol=1e-6), "the model is the true one"
         newest = [o for inputs, _ in log[: step + 1] for o in inputs.observations if o.camera == "left"][-1]
         assert sent["features left"]["features"]["pixels"] == newest.pixels.tolist()
         (size,) = struct.unpack_from("<I", picture := sent["picture left"])

@@ -139,9 +139,7 @@ def cell(chrome: Browser) -> Iterator[LiveCell]:
             live.end()
 
 
-def test_when_the_server_hangs_the_page_is_grey_counts_on_and_comes_back(
-    cell: LiveCell, chrome: Browser
-) -> None:
+def test_when_the_server_hangs_the_page_is_grey_counts_on_and_comes_back(cell: LiveCell, chrome: Browser) -> None:
     with hung(cell.link):
         chrome.value(LOST)
         assert "No word from the page's server" in chrome.value(TEXT.format("link"))
@@ -156,9 +154,7 @@ def test_when_the_server_hangs_the_page_is_grey_counts_on_and_comes_back(
     assert chrome.run("return document.getElementById('link').hidden")
 
 
-def test_a_stop_that_the_hung_server_does_not_confirm_names_the_emergency_stop(
-    cell: LiveCell, chrome: Browser
-) -> None:
+def test_a_stop_that_the_hung_server_does_not_confirm_names_the_emergency_stop(cell: LiveCell, chrome: Browser) -> None:
     with hung(cell.link):
         chrome.element("#stop").click()
         chrome.value(UNCONFIRMED)
@@ -168,19 +164,13 @@ def test_a_stop_that_the_hung_server_does_not_confirm_names_the_emergency_stop(
         box = chrome.run(
             "const b = document.getElementById('unconfirmed').getBoundingClientRect(); return [b.width, b.height]"
         )
-        assert box == chrome.run("return [document.documentElement.clientWidth, innerHeight]"), (
-            "across the screen"
-        )
+        assert box == chrome.run("return [document.documentElement.clientWidth, innerHeight]"), "across the screen"
         counts_on(chrome, TEXT.format("unconfirmed-since"))
     chrome.value(f"!({UNCONFIRMED})")
-    assert chrome.run("return stats.answers.at(-1)[0] === 'stop' && stats.answers.at(-1)[1]"), (
-        "it has reached the cell"
-    )
+    assert chrome.run("return stats.answers.at(-1)[0] === 'stop' && stats.answers.at(-1)[1]"), "it has reached the cell"
 
 
-def test_a_stop_that_is_refused_is_asked_for_again_until_it_is_confirmed(
-    cell: LiveCell, chrome: Browser
-) -> None:
+def test_a_stop_that_is_refused_is_asked_for_again_until_it_is_confirmed(cell: LiveCell, chrome: Browser) -> None:
     taken, asked = Event(), []
 
     def stop(operator: str) -> Reply:
@@ -203,9 +193,7 @@ def test_a_confirmed_stop_covers_nothing(cell: LiveCell, chrome: Browser) -> Non
     assert not chrome.run(f"return {UNCONFIRMED}")
 
 
-def test_when_the_cell_is_silent_the_page_is_grey_though_its_server_lives(
-    cell: LiveCell, chrome: Browser
-) -> None:
+def test_when_the_cell_is_silent_the_page_is_grey_though_its_server_lives(cell: LiveCell, chrome: Browser) -> None:
     cell.silent = True
     chrome.value(LOST)
     assert "No word from the cell" in chrome.value(TEXT.format("link"))
@@ -234,9 +222,7 @@ def test_the_head_says_that_the_arm_is_stopped_and_by_whom(cell: LiveCell, chrom
         reasons=(Reason("STOPPED", "hold", hint="resume"),),
         halt=Halt("stopped by viewer 2", at),
     )
-    head = chrome.value(
-        f"{TEXT.format('lifecycle')}.startsWith('STOPPED by viewer 2, ') && {TEXT.format('lifecycle')}"
-    )
+    head = chrome.value(f"{TEXT.format('lifecycle')}.startsWith('STOPPED by viewer 2, ') && {TEXT.format('lifecycle')}")
     assert chrome.run("return document.getElementById('lifecycle').className") == "badge bad", head
     assert chrome.run("return document.title").startswith("STOPPED")
     cell.state = msgspec.structs.replace(
@@ -246,9 +232,7 @@ def test_the_head_says_that_the_arm_is_stopped_and_by_whom(cell: LiveCell, chrom
     assert chrome.run("return document.getElementById('lifecycle').className") == "badge warn"
 
 
-def test_a_model_that_no_camera_sees_is_not_green_and_silent_cameras_are_named(
-    cell: LiveCell, chrome: Browser
-) -> None:
+def test_a_model_that_no_camera_sees_is_not_green_and_silent_cameras_are_named(cell: LiveCell, chrome: Browser) -> None:
     assert chrome.run("return document.getElementById('model').className") == "badge good"
     cell.state = msgspec.structs.replace(
         STATE, level="slow", visible={}, health=Health("unknown", text="no camera delivers frames"),

@@ -29,9 +29,7 @@ def test_axes_markers_and_cameras_are_where_they_are_in_metres(seed: int) -> Non
         assert np.allclose(P @ np.append(centre, 1.0), 0.0, atol=1e-6)
         ahead = centre + 0.5 * np.array(camera["axis"])
         u, v, depth = P @ np.append(ahead, 1.0)
-        assert np.allclose((u / depth, v / depth, depth), (320.0, 240.0, 0.5), atol=1e-6), (
-            "half a metre before it"
-        )
+        assert np.allclose((u / depth, v / depth, depth), (320.0, 240.0, 0.5), atol=1e-6), "half a metre before it"
 
 
 def test_a_projective_model_and_cameras_on_the_arm_have_no_scene() -> None:

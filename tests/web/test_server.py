@@ -41,9 +41,7 @@ PATIENCE_S = 60.0
 
 def answer(page: ClientConnection, request: Any, n: int) -> dict[str, Any]:
     """The answer number ``n`` to a request; other messages are passed over."""
-    page.send(
-        request if isinstance(request, str | bytes) else msgspec.json.encode({**request, "n": n}).decode()
-    )
+    page.send(request if isinstance(request, str | bytes) else msgspec.json.encode({**request, "n": n}).decode())
     while True:
         message = msgspec.json.decode(page.recv(timeout=PATIENCE_S))
         if message.get("answer", {}).get("n") == n:
@@ -107,10 +105,7 @@ def test_every_verb_needs_the_arm_but_stop_take_and_release() -> None:
             assert answer(page, {"do": verb}, n)["ok"]
         assert calls == ["enable", "hold", "resume", "disable"]
         assert "check the goal first" in answer(page, {"do": "go"}, 300)["message"]
-        assert (
-            "calibrate first"
-            in answer(page, {"do": "drag", "camera": "left", "shift": [0, 0]}, 301)["message"]
-        )
+        assert "calibrate first" in answer(page, {"do": "drag", "camera": "left", "shift": [0, 0]}, 301)["message"]
         with connect(f"ws://127.0.0.1:{port}/socket") as other:
             assert "another page holds" in answer(other, {"do": "take", "token": tokens[1]}, 1)["message"]
             assert answer(other, {"do": "stop"}, 2)["ok"]

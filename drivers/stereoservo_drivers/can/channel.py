@@ -173,9 +173,7 @@ class Channel:
             known = sorted(can.VALID_INTERFACES)
             near = difflib.get_close_matches(options.interface, known, 1)
             meant = f" Did you mean {near[0]!r}?" if near else ""
-            raise self._error(
-                "can_open", f"no such interface.{meant} There are: {', '.join(known)}", known=known
-            )
+            raise self._error("can_open", f"no such interface.{meant} There are: {', '.join(known)}", known=known)
         if options.interface == "socketcan":
             self._check_socketcan(str(options.channel))
         try:
@@ -209,15 +207,11 @@ class Channel:
         number, cause = _errno(error), str(error) or type(error).__name__
         socketcan_name = self._options.interface == "socketcan"
         if number in (errno.EACCES, errno.EPERM):
-            remedy = (
-                "No permission: is this user in group dialout (`id`)? The udev rules in deploy/can set it"
-            )
+            remedy = "No permission: is this user in group dialout (`id`)? The udev rules in deploy/can set it"
         elif number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
             remedy = f"Somebody else has it: `fuser -v {self._shown}`; another daemon on this cell?"
         elif number == errno.ECONNREFUSED:
-            remedy = (
-                "Nobody listens there: is `stereoservo emulate drives CELL` or the adapter's server running?"
-            )
+            remedy = "Nobody listens there: is `stereoservo emulate drives CELL` or the adapter's server running?"
         elif socketcan_name and number == errno.EAFNOSUPPORT:
             remedy = "This kernel has no CAN: `modprobe can_raw`; in a container, on the host"
         elif socketcan_name:
@@ -270,9 +264,7 @@ class Channel:
             return f"; asked for its status: {error}"
         if flags is None:
             return "; it tells no status. Its buffer is full, or its channel is closed or only listens"
-        return (
-            f"; its status: {flags_in_words(flags)}. Check cable, terminators and the bit rate of every node"
-        )
+        return f"; its status: {flags_in_words(flags)}. Check cable, terminators and the bit rate of every node"
 
     def _where_it_went(self) -> str:
         if self._options.interface == "socketcan":

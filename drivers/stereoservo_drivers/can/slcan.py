@@ -92,9 +92,7 @@ class SlcanBus(can.BusABC):
         self.malformed = 0
         self.last_malformed: LineError | None = None
         try:
-            self._port = open_port(
-                str(channel), tty_baudrate, rtscts=rtscts, connect_timeout_s=connect_timeout_s
-            )
+            self._port = open_port(str(channel), tty_baudrate, rtscts=rtscts, connect_timeout_s=connect_timeout_s)
         except OSError as error:
             raise can.CanInitializationError(f"cannot open {Address(str(channel))}: {error}") from error
         self.channel_info = f"serial-line CAN on {Address(str(channel))}"
@@ -102,9 +100,7 @@ class SlcanBus(can.BusABC):
             self._begin([*set_up, "L" if listen_only else "O"])
         except can.CanOperationError as error:
             self._port.close()
-            raise can.CanInitializationError(
-                f"no serial-line CAN on {Address(str(channel))}: {error}"
-            ) from error
+            raise can.CanInitializationError(f"no serial-line CAN on {Address(str(channel))}: {error}") from error
         super().__init__(channel, can_filters)
 
     def _begin(self, commands: list[str]) -> None:
@@ -193,9 +189,7 @@ class SlcanBus(can.BusABC):
         """Raise the errors that the adapter reported since the last call."""
         if self._refusals:
             refusals = self._forget_refusals()
-            raise SlcanRefusedError(
-                f"{self._port.name}: the adapter refused {refusals} frames or commands (BEL)"
-            )
+            raise SlcanRefusedError(f"{self._port.name}: the adapter refused {refusals} frames or commands (BEL)")
         if self._garbled >= GARBLED_LINES:
             garbled, self._garbled = self._garbled, 0
             raise SlcanGarbledError(
@@ -372,9 +366,7 @@ def open_port(channel: str, baud: int, *, rtscts: bool = False, connect_timeout_
     if at and speed.isdecimal():
         channel, baud = device, int(speed)
     if not channel:
-        raise ValueError(
-            "an empty channel; valid: /dev/ttyACM0, /dev/ttyUSB0@1000000, socket://127.0.0.1:5400"
-        )
+        raise ValueError("an empty channel; valid: /dev/ttyACM0, /dev/ttyUSB0@1000000, socket://127.0.0.1:5400")
     line = serial.Serial(channel, baudrate=baud, timeout=0, rtscts=rtscts, exclusive=True)
     os.set_blocking(line.fileno(), False)
     return SlcanPort(line, channel)

@@ -122,9 +122,7 @@ def _any_frame(line: bytes) -> CanFrame:
         raise LineError(line, f"data length {line[digits + 1 : digits + 2]!r}; valid: 0 to 8")
     end = digits + 2 + (0 if remote else 2 * length)
     if len(line) not in (end, end + 4):
-        raise LineError(
-            line, f"{len(line)} characters; with length {length}: {end}, or {end + 4} with a stamp"
-        )
+        raise LineError(line, f"{len(line)} characters; with length {length}: {end}, or {end + 4} with a stamp")
     try:
         identifier = int.from_bytes(unhexlify(line[1:9] if extended else b"0" + line[1:4]), "big")
         data = unhexlify(line[digits + 2 :])

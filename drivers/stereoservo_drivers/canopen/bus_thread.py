@@ -111,9 +111,7 @@ class BusThread(Subscriptions):
         while self._cycling is not cycle:
             self._require()
             if time.monotonic() > until:
-                raise DriverError(
-                    "bus_thread", f"the thread of the CAN bus did not follow within {HAND_OVER_S:g} s"
-                )
+                raise DriverError("bus_thread", f"the thread of the CAN bus did not follow within {HAND_OVER_S:g} s")
             time.sleep(0.0005)
 
     # -- the thread -----------------------------------------------------------------------------------------
@@ -129,9 +127,7 @@ class BusThread(Subscriptions):
             self._stop_blindly()
 
     def _fail(self, error: DriverError) -> None:
-        self._master.latch(
-            MasterFault(error.code, str(error), hint="reset connects again", t_ns=time.monotonic_ns())
-        )
+        self._master.latch(MasterFault(error.code, str(error), hint="reset connects again", t_ns=time.monotonic_ns()))
         self.error = error
 
     def _stop_blindly(self) -> None:

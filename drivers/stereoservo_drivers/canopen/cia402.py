@@ -268,9 +268,7 @@ class Cia402Codec:
 
     # -- receiving ------------------------------------------------------------------------------------------
 
-    def _register(
-        self, axis: DriveAxis, further: tuple[tuple[str, ...], ...], bits: list[tuple[int, str]]
-    ) -> None:
+    def _register(self, axis: DriveAxis, further: tuple[tuple[str, ...], ...], bits: list[tuple[int, str]]) -> None:
         node = axis.node_id
         decoders = [self._status_and_position(axis, len(bits))]
         decoders += [self._further(axis, pdo, k + 2, len(bits) + 1 + k) for k, pdo in enumerate(further)]
@@ -296,9 +294,7 @@ class Cia402Codec:
 
         return take
 
-    def _further(
-        self, axis: DriveAxis, pdo: tuple[str, ...], number: int, bit: int
-    ) -> Callable[[bytes], int]:
+    def _further(self, axis: DriveAxis, pdo: tuple[str, ...], number: int, bit: int) -> Callable[[bytes], int]:
         layout = struct.Struct("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
         scale, feedback, k = axis.scale, self.feedback, axis.index
         kinds: dict[str, tuple[FloatArray | None, Callable[[int], float]]] = {
@@ -415,9 +411,7 @@ class Cia402Codec:
             if at_switch:
                 message, what = "limit switch active (0x60FD)", "reset, enable and move the joint inward"
             elif axis.switches is None:
-                message = (
-                    f"internal limit active for {BIT_S * 1e3:.0f} ms: a limit switch, or the drive's own "
-                )
+                message = f"internal limit active for {BIT_S * 1e3:.0f} ms: a limit switch, or the drive's own "
                 message += "position, velocity or current limit"
                 what = 'reset, enable and move the joint inward; "switches" in feedback tells them apart (0x60FD)'
             else:
@@ -438,9 +432,7 @@ class Cia402Codec:
         who, found = f"node {axis.node_id}", []
         if axis.faulty:
             hint = error_hint(axis.codes[-1]) if axis.codes else "remove the cause, then reset"
-            found.append(
-                AxisFault(axis.index, "drive_fault", f"{who}: {axis.words()}", axis.status_word, hint)
-            )
+            found.append(AxisFault(axis.index, "drive_fault", f"{who}: {axis.words()}", axis.status_word, hint))
         elif self._commanding and not axis.enabled:
             message = f"{who} left operation enabled unasked: {axis.words()}"
             hint = "look at the drive's enable input, its supply and the emergency stop's circuit"
@@ -448,14 +440,10 @@ class Cia402Codec:
         if self._commanding and axis.at_limit and axis.commanded * axis.limit_side > 0.0:
             side = "upper" if axis.limit_side > 0 else "lower"
             message = f"{who}: commanded further into its internal limit at the {side} side"
-            found.append(
-                AxisFault(axis.index, "limit_switch", message, axis.status_word, "move the joint inward")
-            )
+            found.append(AxisFault(axis.index, "limit_switch", message, axis.status_word, "move the joint inward"))
         if self._watching and self._polls - axis.heard_poll > self._heartbeat_polls:
             message = f"{who}: no heartbeat for {self._heartbeat_timeout_ms} ms"
-            found.append(
-                AxisFault(axis.index, "heartbeat_lost", message, None, "check its supply and the bus cable")
-            )
+            found.append(AxisFault(axis.index, "heartbeat_lost", message, None, "check its supply and the bus cable"))
         return found
 
     def enabled(self) -> bool:
@@ -484,9 +472,7 @@ class Cia402Codec:
     def _stand(self, words: list[ControlWord]) -> list[CanFrame]:
         """Frames of axes that are commanded nowhere; those that are enabled keep the position that they were led to."""
         self._commanding = False
-        held = np.array(
-            [axis.enabled and word in ENABLING for axis, word in zip(self.axes, words, strict=True)]
-        )
+        held = np.array([axis.enabled and word in ENABLING for axis, word in zip(self.axes, words, strict=True)])
         orders = self._output.follow(self.feedback.positions, held)
         frames = []
         for axis, word in zip(self.axes, words, strict=True):

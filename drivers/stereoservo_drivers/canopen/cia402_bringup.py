@@ -188,9 +188,7 @@ class Cia402Bringup:
         for eds in {eds for _, eds in known} - self._dictionaries.keys():
             self._dictionaries[eds] = load_eds(eds)
         with ExitStack() as stack:
-            yield [
-                stack.enter_context(RemoteDrive(link, axis, self._dictionaries[eds])) for axis, eds in known
-            ]
+            yield [stack.enter_context(RemoteDrive(link, axis, self._dictionaries[eds])) for axis, eds in known]
 
     def _ignore(self) -> None:
         """What bring-up does to the drives is no fault."""
@@ -262,9 +260,7 @@ class Cia402Bringup:
             self._compare(drive, write)
         self.outputs.prepare(drive)
 
-    def _take_mode(
-        self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]
-    ) -> list[Write]:
+    def _take_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
         """Write mode, period and PDOs of a joint's drive; returns what is to be read back. Raises DriverError."""
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)

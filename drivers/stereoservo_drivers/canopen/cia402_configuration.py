@@ -104,9 +104,7 @@ class Setup:
 def capabilities(drive: RemoteDrive) -> Capabilities:
     """Ask a drive what it has. Raises DriverError (``sdo_timeout``)."""
     found = {key: drive.read_if_there(*key) for key in PROBED}
-    return Capabilities(
-        drive.read_if_there(0x6502), {key: value for key, value in found.items() if value is not None}
-    )
+    return Capabilities(drive.read_if_there(0x6502), {key: value for key, value in found.items() if value is not None})
 
 
 def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup:

@@ -127,9 +127,7 @@ def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
             )
 
 
-def _missing(
-    link: Link, missing: list[RemoteDrive], drives: list[RemoteDrive], options: CanOptions
-) -> DriverError:
+def _missing(link: Link, missing: list[RemoteDrive], drives: list[RemoteDrive], options: CanOptions) -> DriverError:
     configured = [drive.node_id for drive in drives]
     others = ask(link, [node for node in ALL_NODES if node not in configured], 0x1000, 0)
     absent = [drive.node_id for drive in missing]

@@ -184,9 +184,7 @@ class RemoteDrive:
                 **self._data(index, subindex, value),
             )
         try:
-            WritableStream(self._client, index, subindex, size).write(
-                value.to_bytes(size, "little", signed=signed)
-            )
+            WritableStream(self._client, index, subindex, size).write(value.to_bytes(size, "little", signed=signed))
         except (SdoAbortedError, SdoCommunicationError) as error:
             raise self._failed("writing", index, subindex, value, error, option) from error
 

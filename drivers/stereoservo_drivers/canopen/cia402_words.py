@@ -104,9 +104,7 @@ HEARTBEAT_LOST = 0x8130
 ERROR_PASSIVE = 0x8120
 
 _WIRING = "check motor and its cable for a short or a blocked joint; lower max_acceleration or the load"
-_SUPPLY = (
-    "check the supply's voltage under load and, for over-voltage, the brake chopper or a lower deceleration"
-)
+_SUPPLY = "check the supply's voltage under load and, for over-voltage, the brake chopper or a lower deceleration"
 _HEAT = "let it cool; lower speed, acceleration or duty; check ventilation"
 _ENCODER = "check the encoder's cable, shield and supply; commutation must be set up anew if it was changed"
 _BUS = "check cable, shield, termination (120 ohm at both ends, 60 ohm between CAN_H and CAN_L) and bitrate"

@@ -301,9 +301,7 @@ class CanJointDriver:
                 f"write_velocity() got shape {asked.shape}; this arm takes ({len(self.options.joint)},)",
             )
         if not np.isfinite(asked).all():
-            raise DriverError(
-                "not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite"
-            )
+            raise DriverError("not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite")
         self._require_no_fault()
         now_ns = time.monotonic_ns()
         sent, reasons = self.master.limited(asked)
@@ -347,9 +345,7 @@ class CanJointDriver:
             with contextlib.suppress(DriverError):  # as above
                 fault = gripper.poll(self.bus)
                 if fault is not None:
-                    told = MasterFault(
-                        fault.code, fault.message, axis=name, value=fault.value, hint=fault.hint
-                    )
+                    told = MasterFault(fault.code, fault.message, axis=name, value=fault.value, hint=fault.hint)
                     self.master.latch(told)
 
     def _require_no_fault(self) -> None:

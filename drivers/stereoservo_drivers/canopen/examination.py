@@ -119,9 +119,7 @@ def traffic_finding(options: CanOptions, received: list[CanFrame]) -> Examinatio
             "traffic", False, f"another master is on this bus: it sends {foreign}",
             "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
         )  # fmt: skip
-    return ExaminationFinding(
-        "traffic", True, f"{len(received)} frames in {LISTEN_S:g} s, none of another master"
-    )
+    return ExaminationFinding("traffic", True, f"{len(received)} frames in {LISTEN_S:g} s, none of another master")
 
 
 # -- in the cycle -----------------------------------------------------------------------------------------------
@@ -130,9 +128,7 @@ def traffic_finding(options: CanOptions, received: list[CanFrame]) -> Examinatio
 def _run(driver: ExaminedDriver, may_move: MayMove) -> Iterator[ExaminationFinding]:
     """Configure, observe the cycle, jog. Raises DriverError."""
     driver.configure()
-    yield ExaminationFinding(
-        "configuration", True, "every drive took its settings, and gave them back as written"
-    )
+    yield ExaminationFinding("configuration", True, "every drive took its settings, and gave them back as written")
     if isinstance(driver.bringup, OdriveBringup):
         yield from odrive_findings(driver.bringup)
     positions = yield from _watch(driver)
@@ -154,9 +150,7 @@ def odrive_findings(bringup: OdriveBringup) -> Iterator[ExaminationFinding]:
     """Findings on what is known of each axis's watchdog, limit and ramp."""
     for axis in bringup.codec.axes:
         well, told = bringup.safety[axis.node_id]
-        remedy = (
-            "" if well else "name flat_endpoints.json of its release in endpoints; or pull the cable once"
-        )
+        remedy = "" if well else "name flat_endpoints.json of its release in endpoints; or pull the cable once"
         yield ExaminationFinding(f"{axis.name} settings", True if well else None, told, remedy)
 
 
@@ -179,9 +173,7 @@ def _watch(driver: ExaminedDriver) -> Iterator[ExaminationFinding]:
     yield cycles_finding(cycles, missed, driver.bus.statistics.skipped - skipped)
     yield latency_finding(np.array(answered) * 1e-9, period_s)
     if cia402:
-        yield from heartbeat_findings(
-            driver.options, [frame for frames in received.values() for frame in frames]
-        )
+        yield from heartbeat_findings(driver.options, [frame for frames in received.values() for frame in frames])
     return np.array(positions)
 
 
@@ -228,9 +220,7 @@ def heartbeat_findings(options: CanOptions, received: list[CanFrame]) -> Iterato
     expected = WATCH_S * 1e3 / options.heartbeat_ms
     counts = [sum(frame.id == HEARTBEAT_ID + joint.node_id for frame in received) for joint in options.joint]
     rare = [
-        (joint, count)
-        for joint, count in zip(options.joint, counts, strict=True)
-        if count < HEARTBEAT_SHARE * expected
+        (joint, count) for joint, count in zip(options.joint, counts, strict=True) if count < HEARTBEAT_SHARE * expected
     ]
     for joint, count in rare:
         yield ExaminationFinding(
@@ -400,9 +390,7 @@ def resolution_finding(joint: CanJoint) -> ExaminationFinding:
     """Finding on the joint velocity of one velocity unit."""
     unit = _unit(joint)
     step = 1.0 / abs(JointScale.of(joint).velocity_units_per_unit)
-    message = (
-        f"one unit of velocity is {step:.2g} {unit}/s, one count {JointScale.of(joint).resolution:.2g} {unit}"
-    )
+    message = f"one unit of velocity is {step:.2g} {unit}/s, one count {JointScale.of(joint).resolution:.2g} {unit}"
     if step <= COARSE:
         return ExaminationFinding(f"{joint.name} units", True, message)
     return ExaminationFinding(
@@ -476,9 +464,7 @@ class JogTrace:
         asked, travel = abs(self.asked), math.copysign(1.0, self.asked) * self.travel
         low, high = (1.0 - TOLERANCE) * (asked - self.unsure), (1.0 + TOLERANCE) * (asked + self.unsure)
         apart = abs(self.reported - self.travel)
-        return (
-            self.unsure > 0.0 and low <= travel <= high and apart <= 2 * TOLERANCE * abs(travel) + self.unsure
-        )
+        return self.unsure > 0.0 and low <= travel <= high and apart <= 2 * TOLERANCE * abs(travel) + self.unsure
 
 
 def jog_finding(trace: JogTrace) -> ExaminationFinding:
@@ -504,9 +490,7 @@ def _finding_of_units(trace: JogTrace) -> ExaminationFinding:
     ratio = trace.travel / trace.asked if trace.asked else math.inf
     if trace.runs_away():
         remedy = _units_remedy(joint, ratio, at_least=True)
-        return ExaminationFinding(
-            name, False, f"asked for {asked}, moved {travel} before it was stopped", remedy
-        )
+        return ExaminationFinding(name, False, f"asked for {asked}, moved {travel} before it was stopped", remedy)
     if ratio > 1.0 + TOLERANCE:
         return ExaminationFinding(
             name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_remedy(joint, ratio)
@@ -538,9 +522,7 @@ def _finding_of_units(trace: JogTrace) -> ExaminationFinding:
     lag_s = trace.longest_lag / fastest
     message = f"asked for {asked}, moved {travel} by its own encoder, at most {lag_s * 1e3:.0f} ms behind"
     if lag_s > LAG_S:
-        return ExaminationFinding(
-            name, None, message, "velocity loop of the drive: gains, or its acceleration limit"
-        )
+        return ExaminationFinding(name, None, message, "velocity loop of the drive: gains, or its acceleration limit")
     return ExaminationFinding(
         name, True, f"{message}; where your eye saw less or more, gear_ratio is wrong by that factor, where it saw the "
         "other way, direction",

@@ -103,9 +103,7 @@ class Gripper:
 
     def compose(self, drive: RemoteDrive, has: Capabilities) -> Setup:
         """The safest configuration of its drive. Raises DriverError (``mode``)."""
-        if (has.modes is not None and not has.modes & 1 << PROFILE_POSITION - 1) or not has.has(
-            TARGET_POSITION
-        ):
+        if (has.modes is not None and not has.modes & 1 << PROFILE_POSITION - 1) or not has.has(TARGET_POSITION):
             told = "not told" if has.modes is None else f"0x{has.modes:08X}"
             raise DriverError(
                 "mode",
@@ -217,9 +215,7 @@ class Gripper:
                 continue
             self._heartbeat_ns, state = now_ns, frame.data[0] & 0x7F
             if state == NmtState.BOOT_UP:
-                found = self._fault(
-                    "rebooted", "booted: it has lost its configuration", state, "check its supply"
-                )
+                found = self._fault("rebooted", "booted: it has lost its configuration", state, "check its supply")
             elif state != NmtState.OPERATIONAL:
                 found = self._fault(
                     "left_operational", f"is {nmt_words(state)}", state, "does another master command it?"

@@ -280,9 +280,7 @@ class Master:
         trips = []
         for sample in self._cycle.states:
             cycle = self._cycle
-            trips.append(
-                self._monitors.jump.check(cycle.owed_ns, cycle.answered_ns, sample.positions.tolist())
-            )
+            trips.append(self._monitors.jump.check(cycle.owed_ns, cycle.answered_ns, sample.positions.tolist()))
             if self.mode is Mode.RUNNING:
                 trips.append(self._monitors.reversal.check(cycle_ns * 1e-9, self._sent, sample.positions))
         return trips

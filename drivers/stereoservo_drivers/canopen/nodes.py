@@ -169,9 +169,7 @@ def other_bitrate(options: Mapping[str, Any]) -> ExaminationFinding | None:
         return None
     stated = int(options["bitrate"])
     for rate in BITRATES:
-        settings = ChannelSettings(
-            options["interface"], options["channel"], rate, options["interface_options"]
-        )
+        settings = ChannelSettings(options["interface"], options["channel"], rate, options["interface_options"])
         nodes = [] if rate == stated else answering(settings)
         if nodes:
             return wrong_bitrate(nodes, rate, stated)
@@ -235,9 +233,7 @@ def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
     with RemoteDrive(link, DriveAxis(0, anything), load_eds(SHIPPED_EDS)) as drive:
         device = drive.read(0x1000)
         if device & 0xFFFF != CIA_402:
-            return ExaminationFinding(
-                f"node {node}", None, f"device profile {device & 0xFFFF}: no drive, left alone"
-            )
+            return ExaminationFinding(f"node {node}", None, f"device profile {device & 0xFFFF}: no drive, left alone")
         told: dict[str, Any] = {
             key: value
             for k, key in enumerate(IDENTITY)
@@ -311,9 +307,7 @@ MODE_NAMES = {1: "profile position", 3: "profile velocity", 4: "torque", 6: "hom
 _WIRING = "is it powered, is its cable in, are its bit rate and its node id those of the cell file?"
 
 
-def examine_nodes(
-    link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path
-) -> Iterator[ExaminationFinding]:
+def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> Iterator[ExaminationFinding]:
     """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
     answers = scan(link)
     grippers = {each.node_id: Gripper(options, each, cell_dir) for each in options.gripper}
@@ -333,16 +327,12 @@ def examine_nodes(
                     yield _gripper(drive, gripper)
                     continue
                 yield _modes(drive, options)
-                yield from limits_findings(
-                    axis.joint, drive.read_if_there(0x607D, 1), drive.read_if_there(0x607D, 2)
-                )
+                yield from limits_findings(axis.joint, drive.read_if_there(0x607D, 1), drive.read_if_there(0x607D, 2))
             except DriverError as error:
                 yield ExaminationFinding(axis.name, False, str(error))
     if unknown_nodes:
         words = ", ".join(str(node) for node in unknown_nodes)
-        yield ExaminationFinding(
-            "other nodes", None, f"{words} answer too, and no joint of the cell file has them"
-        )
+        yield ExaminationFinding("other nodes", None, f"{words} answer too, and no joint of the cell file has them")
 
 
 def _gripper(drive: RemoteDrive, gripper: Gripper) -> ExaminationFinding:
@@ -364,9 +354,7 @@ def _not_one(axis: DriveAxis, count: int, unknown_nodes: list[int]) -> Examinati
         return _duplicate(axis.name, axis.node_id, count)
     remedy = _WIRING
     if unknown_nodes:
-        remedy += (
-            f" Nodes {', '.join(map(str, unknown_nodes))} answer, which no joint has: is it one of them?"
-        )
+        remedy += f" Nodes {', '.join(map(str, unknown_nodes))} answer, which no joint has: is it one of them?"
     return ExaminationFinding(axis.name, False, "no answer", remedy)
 
 
@@ -374,9 +362,7 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
     name = drive.axis.name
     device = drive.read(0x1000)
     values = {what: drive.read_if_there(0x1018, k + 1) for k, what in enumerate(IDENTITY)}
-    reported = ", ".join(
-        f"{what} {value:#x}" if value is not None else f"no {what}" for what, value in values.items()
-    )
+    reported = ", ".join(f"{what} {value:#x}" if value is not None else f"no {what}" for what, value in values.items())
     message = f"answers once; device type {device:#010x}, {reported}"
     if device & 0xFFFF != CIA_402:
         return ExaminationFinding(
@@ -391,9 +377,7 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
     if wrong:
         asked = ", ".join(f"{what} is {getattr(joint, what):#x} in the cell file" for what, _ in wrong)
         mended = ", ".join(f"{what} = {value:#x}" for what, value in wrong if value is not None)
-        return ExaminationFinding(
-            name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}"
-        )
+        return ExaminationFinding(name, False, f"{message}; but {asked}", f"if this drive belongs here: {mended}")
     return ExaminationFinding(name, True, message)
 
 
@@ -427,11 +411,7 @@ def _state(drive: RemoteDrive) -> ExaminationFinding:
     if volts is not None:
         texts.append(f"supply {volts * 1e-3:.1f} V")
     switches = drive.read_if_there(0x60FD) or 0
-    texts += [
-        f"{what} limit switch active"
-        for bit, what in enumerate(("negative", "positive"))
-        if switches >> bit & 1
-    ]
+    texts += [f"{what} limit switch active" for bit, what in enumerate(("negative", "positive")) if switches >> bit & 1]
     texts.append(f"error register {register:#04x}" if register else "no error")
     if past:
         texts.append(f"history {', '.join(error_words(code) for code in past)}")
@@ -440,9 +420,7 @@ def _state(drive: RemoteDrive) -> ExaminationFinding:
         code = drive.read_if_there(0x603F) or (past[0] if past else 0)
         words = f" ({error_words(code)})" if code else ""
         remedy = error_hint(code) if code else "look its error up in the drive's manual"
-        return ExaminationFinding(
-            name, False, f"{message}{words}", f"{remedy}; then `stereoservo reset` clears it"
-        )
+        return ExaminationFinding(name, False, f"{message}{words}", f"{remedy}; then `stereoservo reset` clears it")
     return ExaminationFinding(name, None if switches & 3 else True, message)
 
 

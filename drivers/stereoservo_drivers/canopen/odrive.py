@@ -209,9 +209,7 @@ class OdriveCodec:
             return NOT_CYCLIC
         take, axis = self._takers[frame.id]
         if len(frame.data) != _DATA:
-            self._event(
-                axis, "mapping", f"{len(frame.data)} bytes in frame 0x{frame.id:03X}, not 8", frame.id
-            )
+            self._event(axis, "mapping", f"{len(frame.data)} bytes in frame 0x{frame.id:03X}, not 8", frame.id)
             return NOT_CYCLIC
         return take(axis, frame.data)
 

@@ -268,9 +268,7 @@ class OdriveBringup:
         for node, axis in self._axes.items():
             firmware, hardware = self.firmware[node], self._hardware[node]
             known = [r for r in self._releases if (r.fw_version, r.hw_version) == (firmware, hardware)]
-            told = (
-                f"watchdog, velocity limit and ramp are unknown (firmware {firmware}, hardware {hardware}): "
-            )
+            told = f"watchdog, velocity limit and ramp are unknown (firmware {firmware}, hardware {hardware}): "
             if not known:
                 told += "endpoints lists no flat_endpoints.json of this release"
                 self.safety[node] = (False, told)
@@ -299,9 +297,7 @@ class OdriveBringup:
         """Wait for a new heartbeat of every axis that reports idle."""
 
         def all_idle() -> bool:
-            return all(
-                frames and frames[-1].data[4:5] == bytes([odrive.IDLE]) for frames in received.values()
-            )
+            return all(frames and frames[-1].data[4:5] == bytes([odrive.IDLE]) for frames in received.values())
 
         with _listening(link, self._nodes, odrive.HEARTBEAT) as received:
             idle = until(link, all_idle, HEARTBEAT_WAIT_S, STEP_S)

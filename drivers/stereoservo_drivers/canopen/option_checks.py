@@ -58,9 +58,7 @@ def check_options(options: CanOptions) -> None:
         for key, value in joint.sdo.items():
             _check_sdo(joint, key, value)
     if options.heartbeat_timeout_ms < 2 * options.heartbeat_ms:
-        valid = (
-            f"at least {2 * options.heartbeat_ms}, twice heartbeat_ms: one that is late must not stop the arm"
-        )
+        valid = f"at least {2 * options.heartbeat_ms}, twice heartbeat_ms: one that is late must not stop the arm"
         raise _refusal("heartbeat_timeout_ms", options.heartbeat_timeout_ms, valid)
     if 0 < options.rpdo_deadline_ms < 2000.0 / options.rate_hz:
         valid = f"0 (no such timer) or at least {math.ceil(2000.0 / options.rate_hz)}, two cycles at rate_hz"
@@ -94,20 +92,14 @@ def _check_protocol(options: CanOptions) -> None:
     if options.endpoints and options.protocol != "odrive":
         raise _refusal("endpoints", list(options.endpoints), "left out: they are an ODrive's")
     if options.output and options.protocol != "cia402":
-        raise _refusal(
-            "output", [output.name for output in options.output], "left out: they are a CiA 402 drive's"
-        )
+        raise _refusal("output", [output.name for output in options.output], "left out: they are a CiA 402 drive's")
     if options.gripper and options.protocol != "cia402":
-        raise _refusal(
-            "gripper", [gripper.name for gripper in options.gripper], "left out: only CiA 402 drives are"
-        )
+        raise _refusal("gripper", [gripper.name for gripper in options.gripper], "left out: only CiA 402 drives are")
     nodes = [joint.node_id for joint in options.joint]
     for k, output in enumerate(options.output):
         who, before = f"output {output.name!r}", options.output[:k]
         if output.node_id not in nodes:
-            raise _refusal(
-                f"{who}: node_id", output.node_id, f"that of a joint: {', '.join(map(str, nodes))}"
-            )
+            raise _refusal(f"{who}: node_id", output.node_id, f"that of a joint: {', '.join(map(str, nodes))}")
         if output.name in (*(b.name for b in before), *(gripper.name for gripper in options.gripper)):
             raise _refusal("output name", output.name, "one that no other output or gripper has")
         if any((other.node_id, other.bit) == (output.node_id, output.bit) for other in before):
@@ -181,9 +173,7 @@ def _check_limits(joint: CanJoint) -> None:
     for option in ("position_min", "position_max"):
         value = getattr(joint, option)
         if abs(value) > LONGEST_TURN and not joint.multi_turn:
-            valid = (
-                f"radians, -2 pi to 2 pi; {_in_radians(value)}. A joint that turns further: multi_turn = true"
-            )
+            valid = f"radians, -2 pi to 2 pi; {_in_radians(value)}. A joint that turns further: multi_turn = true"
             raise _refusal(option, value, valid, joint)
     if joint.max_velocity > FASTEST_TURN:
         valid = f"rad/s, up to 4 pi; {_in_radians(joint.max_velocity)}"

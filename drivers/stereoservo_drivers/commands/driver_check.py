@@ -177,9 +177,7 @@ def _setup(name: str, options: dict[str, Any], pull: bool, folder: Path) -> Join
     except Exception as error:  # whatever a third party's module raises on import
         raise DriverCheckError("import", f"{name}: {type(error).__name__}: {error}") from error
     if not inspect.isclass(found):
-        raise DriverCheckError(
-            "import", f"{name} is {found!r}; a driver class, or a JointDriverSetup, is needed"
-        )
+        raise DriverCheckError("import", f"{name} is {found!r}; a driver class, or a JointDriverSetup, is needed")
     if not issubclass(found, JointDriverSetup):
         return GivenDriver(found, options, pull, folder)
     setup: JointDriverSetup = found()

@@ -49,9 +49,7 @@ def learn_corners(
     ] = None,
     pair: Annotated[
         tuple[Path, Path] | None,
-        typer.Option(
-            metavar="LEFT RIGHT", help="Images of the first two cameras of the cell file, in its order."
-        ),
+        typer.Option(metavar="LEFT RIGHT", help="Images of the first two cameras of the cell file, in its order."),
     ] = None,
     moved: Annotated[
         tuple[Path, Path] | None,
@@ -64,9 +62,7 @@ def learn_corners(
         bool,
         typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again."),
     ] = False,
-    frames: Annotated[
-        int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")
-    ] = 8,
+    frames: Annotated[int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")] = 8,
     most: Annotated[int, typer.Option(min=16, max=2000, help="Landmarks to keep.")] = 150,
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Draw what was matched, and of which kind it is.")
@@ -78,13 +74,9 @@ def learn_corners(
     if images is not None and pair is not None:
         raise LearnError("argument", "--images and --pair are two ways to give the images; give one of them")
     if moved is not None and moved_images is not None:
-        raise LearnError(
-            "argument", "--moved and --moved-images are two ways to say the same; give one of them"
-        )
+        raise LearnError("argument", "--moved and --moved-images are two ways to say the same; give one of them")
     if ask_to_move and (images is not None or pair is not None):
-        raise LearnError(
-            "argument", "--ask-to-move is for live cameras; files go with --moved or --moved-images"
-        )
+        raise LearnError("argument", "--ask-to-move is for live cameras; files go with --moved or --moved-images")
     for file in (out,) if picture is None else (out, picture):
         if file.exists() and not force:
             raise LearnError("exists", f"{file} exists; --force writes over it")
@@ -176,8 +168,7 @@ def _folder(cell: CellFile, folder: Path, frames: int) -> Sights:
         stills = sorted(
             file
             for file in folder.iterdir()
-            if file.suffix.lower() in SUFFIXES
-            and (file.stem == camera.name or file.stem.startswith(f"{camera.name}_"))
+            if file.suffix.lower() in SUFFIXES and (file.stem == camera.name or file.stem.startswith(f"{camera.name}_"))
         )
         video = folder / f"{camera.name}.avi"
         if stills:
@@ -216,9 +207,7 @@ def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
                 clock=MonotonicClock(), cell=cell.cell.name, runtime_dir=path.parent, cell_dir=path.parent,
                 camera=camera.name, mount=camera.mount,
             )  # fmt: skip
-            driver: CameraDriver = plugins.load(plugins.CAMERA_DRIVERS, camera.driver)(
-                camera.options, context
-            )
+            driver: CameraDriver = plugins.load(plugins.CAMERA_DRIVERS, camera.driver)(camera.options, context)
             opened[camera.name] = driver
             driver.configure()
             driver.activate()
@@ -241,9 +230,7 @@ def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
 def _take(name: str, arrived: Sequence[Any], seen: list[ImageArray], frames: int) -> None:
     for frame in arrived:
         if not isinstance(frame, Frame):
-            raise DriverError(
-                "no_images", f"camera {name!r} delivers observations; landmarks need its images"
-            )
+            raise DriverError("no_images", f"camera {name!r} delivers observations; landmarks need its images")
         if len(seen) < frames:
             seen.append(np.array(frame.image))
 

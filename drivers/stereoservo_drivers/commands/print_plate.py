@@ -159,9 +159,7 @@ def write_pdf(pages: Sequence[Page], path: Path) -> None:
                     case Disc(x, y, radius, ink):
                         axes.add_patch(Circle((x, y), radius, fc=str(1.0 - ink), lw=0, zorder=order))
                     case Box(x, y, width, height, ink):
-                        axes.add_patch(
-                            Rectangle((x, y), width, height, fc=str(1.0 - ink), lw=0, zorder=order)
-                        )
+                        axes.add_patch(Rectangle((x, y), width, height, fc=str(1.0 - ink), lw=0, zorder=order))
                     case Line(x0, y0, x1, y1, dashed):
                         style = (0, (DASH[0] / HAIRLINE, DASH[1] / HAIRLINE)) if dashed else "-"
                         line = Line2D([x0, x1], [y0, y1], lw=HAIRLINE * MM, color="0", ls=style, zorder=order)
@@ -345,9 +343,7 @@ class DotPlates:
         nearest = _nearest(face)
         dot = self.dot_mm
         if dot is None:
-            dot = (
-                2000.0 * face.radius * (1.0 if self.spacing_mm is None else self.spacing_mm / (1e3 * spacing))
-            )
+            dot = 2000.0 * face.radius * (1.0 if self.spacing_mm is None else self.spacing_mm / (1e3 * spacing))
         if not LEAST_DOT_MM <= dot < np.inf:
             raise PlateError(
                 "dot_size",
@@ -381,8 +377,7 @@ class DotPlates:
     def in_proportion(self) -> bool:
         """Whether dots and faces are scaled alike, so that the detector's patterns are unchanged."""
         return self.spacing_mm is None or all(
-            abs(mm.radius / one.radius - mm.positions[1, 0] / one.positions[1, 0])
-            < 1e-6 * mm.radius / one.radius
+            abs(mm.radius / one.radius - mm.positions[1, 0] / one.positions[1, 0]) < 1e-6 * mm.radius / one.radius
             for mm, one in zip(self.millimetres, self.faces, strict=True)
         )
 
@@ -393,9 +388,7 @@ class DotPlates:
         for face in self.millimetres:
             side = 2.0 * face.half_side
             discs = [Disc(x, y, face.radius, dot) for x, y in (face.positions + face.half_side).tolist()]
-            found.append(
-                Plate(f"face {face.name}", face.ids, side, (Box(0, 0, side, side, ground), *discs), True)
-            )
+            found.append(Plate(f"face {face.name}", face.ids, side, (Box(0, 0, side, side, ground), *discs), True))
         return found
 
     def cell_lines(self) -> list[str]:
@@ -539,20 +532,14 @@ def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence
             )
         if first.joins:  # a strip, so that only neighbours share an edge
             across, down = (across, 1) if across > down else (1, down)
-        here = [
-            plate
-            for plate in rest[: across * down]
-            if plate.side == first.side and plate.joins == first.joins
-        ]
+        here = [plate for plate in rest[: across * down] if plate.side == first.side and plate.joins == first.joins]
         here = here[: next((k for k, plate in enumerate(here) if plate is not rest[k]), len(here))]
         rest = rest[len(here) :]
         pages.append(_page(here, across, gap, paper, below))
     return pages
 
 
-def _page(
-    plates: Sequence[Plate], across: int, gap: float, paper: tuple[float, float], below: Sequence[str]
-) -> Page:
+def _page(plates: Sequence[Plate], across: int, gap: float, paper: tuple[float, float], below: Sequence[str]) -> Page:
     width, height = paper
     side = plates[0].side
     title = ", ".join(plate.name for plate in plates)
@@ -634,9 +621,7 @@ def _nearest(face: DotFace) -> float:
 
 
 def _range(dot_mm: float) -> str:
-    return (
-        f"{dot_mm:g} mm is {SMALLEST_DOT_PX:g} px at {dot_mm / SMALLEST_DOT_PX:.2f} m from a lens of 1000 px"
-    )
+    return f"{dot_mm:g} mm is {SMALLEST_DOT_PX:g} px at {dot_mm / SMALLEST_DOT_PX:.2f} m from a lens of 1000 px"
 
 
 def _which(names: Sequence[str]) -> str:

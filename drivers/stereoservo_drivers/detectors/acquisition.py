@@ -261,9 +261,7 @@ class Expectation:
         if not common.any():
             return np.inf
         off = places[self.rows[common]] - self.pixels[common]
-        return float(
-            np.mean(np.sum(off * np.linalg.solve(self.covariances[common], off[..., None])[..., 0], 1))
-        )
+        return float(np.mean(np.sum(off * np.linalg.solve(self.covariances[common], off[..., None])[..., 0], 1)))
 
 
 def expectations(prior: Prior, t_ns: int, max_age_s: float, every_id: IntArray) -> list[Expectation | None]:

@@ -177,9 +177,7 @@ class TagDetector:
         tags = list(self._ids)
         return {tags[k]: (corners[k], sigmas[k]) for k in np.flatnonzero(inside)}
 
-    def _found_at(
-        self, image: ImageArray, expected: Mapping[int, tuple[FloatArray, FloatArray]]
-    ) -> dict[int, _Found]:
+    def _found_at(self, image: ImageArray, expected: Mapping[int, tuple[FloatArray, FloatArray]]) -> dict[int, _Found]:
         """Tags whose pattern is right where it is expected: no search, and no other tag of this id can be as near."""
         found: dict[int, _Found] = {}
         if self.options.refinement != "pattern":
@@ -260,9 +258,7 @@ class TagDetector:
             finds = [f for f in finds if (np.linalg.norm(f.corners - corners, axis=1) <= gates).all()]
         return finds[0] if len(finds) == 1 else None
 
-    def _measured(
-        self, image: ImageArray, tag: int, quad: FloatArray, blur_px: float = FIRST_BLUR_PX
-    ) -> _Found | None:
+    def _measured(self, image: ImageArray, tag: int, quad: FloatArray, blur_px: float = FIRST_BLUR_PX) -> _Found | None:
         variance = self._floor_px**2
         if self.options.refinement == "pattern":
             fit = register_tag(image, quad, self._cells[tag], blur_px)

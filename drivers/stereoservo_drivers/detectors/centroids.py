@@ -351,11 +351,7 @@ def _find_dot(picture, box, sought, scratch, out):
     found = nearest_component(picture, box, threshold, sought, scratch)
     if found.label == 0:
         return NO_COMPONENT, none, nowhere
-    if (
-        min(found.left, found.top) < MARGIN
-        or found.right >= columns - MARGIN
-        or found.bottom >= rows - MARGIN
-    ):
+    if min(found.left, found.top) < MARGIN or found.right >= columns - MARGIN or found.bottom >= rows - MARGIN:
         return BORDER, none, nowhere
     background, noise = ring_level(picture, found)
     contrast = float(255 - low if dark else high) - background

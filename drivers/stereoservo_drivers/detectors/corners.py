@@ -109,9 +109,7 @@ class CornerDetector:
         landmarks = load_landmarks(context.cell_dir / self.options.landmarks)
         reference = landmarks.camera(context.camera)
         compile_kernels()
-        patches = ReferencePatches(
-            reference.picture, reference.pixels, self.options.window, reference.averaged
-        )
+        patches = ReferencePatches(reference.picture, reference.pixels, self.options.window, reference.averaged)
         rows = np.flatnonzero(patches.valid)
         if len(rows) < self.options.min_landmarks:
             raise DriverError(

@@ -255,9 +255,7 @@ class DotDetector:
         ``expected`` of all faces chooses among copies. ``origin`` (2,): the image's offset in a larger one.
         """
         options = self.options
-        spots = find_spots(
-            image, self._dark, options.min_contrast, options.lopsided, options.max_spots, self._scratch
-        )
+        spots = find_spots(image, self._dark, options.min_contrast, options.lopsided, options.max_spots, self._scratch)
         if origin is not None:
             spots[:, :2] += origin
         if taken is not None and len(taken) and len(spots):
@@ -378,11 +376,7 @@ def expect(face_dots, prior, expected, windows):
             shape = shapes[f * n + i]
             if good and not image_of_circle(H, patterns[f, i, 0], patterns[f, i, 1], radii[f], shape):
                 good = False
-            if (
-                good
-                and mine[i]
-                and (shape[6] < THINNEST or shape[5] + reaches[i] + SHAPE_MARGIN > MAX_HALF_WINDOW)
-            ):
+            if good and mine[i] and (shape[6] < THINNEST or shape[5] + reaches[i] + SHAPE_MARGIN > MAX_HALF_WINDOW):
                 good = False
         for i in range(n):
             if good and mine[i]:
@@ -457,12 +451,8 @@ def judge(face_dots, expected, status, gates, dots, used):
                 if present[k] and other < own:
                     used[i] = False
             count += 1 if used[i] else 0
-        count = (
-            settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, np.int64(4)) if count >= 4 else 0
-        )
-        if count == 0 or (
-            count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine, FEW_TOLERANCE)
-        ):
+        count = settle_face(patterns[f], radii[f], dots[a:b], mine, tolerance, np.int64(4)) if count >= 4 else 0
+        if count == 0 or (count <= 5 and not agree_with_prior(predicted[a:b], dots[a:b], mine, FEW_TOLERANCE)):
             mine[:] = False
             count = 0
         total += count
@@ -612,9 +602,7 @@ def patterns_of(
 
 def _printed(name: str) -> DotFace:
     if name not in FACES:
-        raise DriverError(
-            "option", f"beside: no face {name!r} is printed; there are {', '.join(FACES)}", face=name
-        )
+        raise DriverError("option", f"beside: no face {name!r} is printed; there are {', '.join(FACES)}", face=name)
     return FACES[name]
 
 

@@ -253,9 +253,7 @@ def _match_pair(
     return (
         found,
         unique,
-        PairReport(
-            *names, len(corners), len(matches), count, int(consistent.sum()), int(unique.sum()), rms, planar
-        ),
+        PairReport(*names, len(corners), len(matches), count, int(consistent.sum()), int(unique.sum()), rms, planar),
     )
 
 
@@ -347,9 +345,7 @@ def _unique(
     return unique
 
 
-def _rival(
-    picture: ImageArray, patch: ImageArray, at: FloatArray, line: FloatArray | None, half: int
-) -> float:
+def _rival(picture: ImageArray, patch: ImageArray, at: FloatArray, line: FloatArray | None, half: int) -> float:
     """Best correlation of ``patch`` elsewhere than ``at`` [px], within ``BAND_PX`` of ``line`` (3,); None:
     anywhere.
     """
@@ -392,9 +388,7 @@ def _motion(
     pyramid = build_pyramid(after, TEMPLATE_LEVELS)
     rows = np.flatnonzero(np.isfinite(pixels).all(axis=1))
     alike = settings.least_correlation - 0.05
-    result, good = seek(
-        patches, pyramid, rows, np.tile(np.eye(2), (len(rows), 1, 1)), pixels[rows], alike, coarse=0
-    )
+    result, good = seek(patches, pyramid, rows, np.tile(np.eye(2), (len(rows), 1, 1)), pixels[rows], alike, coarse=0)
     offsets = result.pixels - pixels[rows]
     sigmas = np.sqrt(0.5 * np.trace(result.covariances, axis1=1, axis2=2))
     near = np.linalg.norm(offsets, axis=1) <= np.minimum(STAYED_PX, STAYED_SIGMAS * sigmas + 0.1)

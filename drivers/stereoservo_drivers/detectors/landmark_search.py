@@ -70,9 +70,7 @@ class Surroundings:
         agreed: BoolArray = counted & (misses <= allowed)
         return agreed
 
-    def coherent(
-        self, A: FloatArray, found: FloatArray, use: BoolArray, least: int, *, one: bool
-    ) -> BoolArray:
+    def coherent(self, A: FloatArray, found: FloatArray, use: BoolArray, least: int, *, one: bool) -> BoolArray:
         """Mask (m,) of landmarks of ``use`` that ``AGREEING`` neighbours confirm, in connected groups of ``least``.
 
         ``one``: of each kind the largest group only: a rigid body is in one place.
@@ -159,9 +157,7 @@ def search_by_keypoints(
     matches = match_keypoints(reference, seen)
     first, second = reference.pixels[matches[:, 0]], seen.pixels[matches[:, 1]]
     away = np.linalg.norm(second - first, axis=1) >= shifted_px
-    for rows, warps, where in starts_from_planes(
-        find_planes(first[away], second[away]), patches.pixels, radius
-    ):
+    for rows, warps, where in starts_from_planes(find_planes(first[away], second[away]), patches.pixels, radius):
         if len(rows):
             result, good = seek(patches, pyramid, rows, warps, where, least_correlation)
             take_better(found, rows, result, good)
@@ -315,9 +311,7 @@ def local_warps(H: FloatArray, pixels: FloatArray) -> FloatArray:
     depth = pixels @ H[2, :2] + H[2, 2]
     mapped = map_pixels(H, pixels)
     with np.errstate(divide="ignore", invalid="ignore"):
-        result: FloatArray = (H[None, :2, :2] - mapped[:, :, None] * H[None, None, 2, :2]) / depth[
-            :, None, None
-        ]
+        result: FloatArray = (H[None, :2, :2] - mapped[:, :, None] * H[None, None, 2, :2]) / depth[:, None, None]
     return result
 
 

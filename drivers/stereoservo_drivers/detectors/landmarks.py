@@ -142,9 +142,7 @@ def load_landmarks(path: Path) -> Landmarks:
             raise _bad(path, f"has {size} bytes; at most {LARGEST_FILE} are read: is it a file of landmarks?")
         return decode_landmarks(path.read_bytes(), path)
     except OSError as error:
-        raise _bad(
-            path, f"cannot be read: {error.strerror}; `stereoservo learn-corners` writes one"
-        ) from error
+        raise _bad(path, f"cannot be read: {error.strerror}; `stereoservo learn-corners` writes one") from error
 
 
 def check_landmarks(landmarks: Landmarks, path: Path | str) -> None:
@@ -187,9 +185,7 @@ def _picture(encoded: npt.NDArray[Any]) -> ImageArray:
         raise ValueError("a reference picture is no PNG")
     width, height = (int.from_bytes(data[k : k + 4].tobytes(), "big") for k in (16, 20))
     if math.prod((width, height)) > LARGEST_PICTURE:
-        raise ValueError(
-            f"a reference picture has {width}x{height} px; at most {LARGEST_PICTURE} in all are read"
-        )
+        raise ValueError(f"a reference picture has {width}x{height} px; at most {LARGEST_PICTURE} in all are read")
     picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise ValueError("a reference picture is damaged")

@@ -123,10 +123,7 @@ def _sample_cubic(picture: ImageArray, u: float, v: float) -> tuple[float, float
     total = 0.0
     for row, weight in ((j - 1, b0), (j, b1), (j + 1, b2), (j + 2, b3)):
         total += weight * (
-            a0 * picture[row, i - 1]
-            + a1 * picture[row, i]
-            + a2 * picture[row, i + 1]
-            + a3 * picture[row, i + 2]
+            a0 * picture[row, i - 1] + a1 * picture[row, i] + a2 * picture[row, i + 1] + a3 * picture[row, i + 2]
         )
     squared = (a0 * a0 + a1 * a1 + a2 * a2 + a3 * a3) * (b0 * b0 + b1 * b1 + b2 * b2 + b3 * b3)
     return total, squared
@@ -265,9 +262,7 @@ class Warps(NamedTuple):
 
 
 @kernel
-def align_patches(
-    picture: ImageArray, templates: Fields, chosen: IntArray, iterations: int, warps: Fields
-) -> None:
+def align_patches(picture: ImageArray, templates: Fields, chosen: IntArray, iterations: int, warps: Fields) -> None:
     """Move ``warps`` of the ``chosen`` (m,) templates until they fit ``picture``, all in pixels of its level.
 
     With the fields of `TemplateArrays` and of `Warps`.
@@ -333,9 +328,7 @@ class ReferencePatches:
         covariances, correlations = np.zeros((len(chosen), 2, 2)), np.zeros(len(chosen))
         found = np.zeros(len(chosen), np.bool_)
         for above in range(coarse, -1, -1):
-            for t, i in sorted(
-                {(int(t) + above, int(i) + above) for t, i in zip(base_t, base_i, strict=True)}
-            ):
+            for t, i in sorted({(int(t) + above, int(i) + above) for t, i in zip(base_t, base_i, strict=True)}):
                 group = np.flatnonzero((base_t + above == t) & (base_i + above == i))
                 if t >= len(self._levels) or i >= len(pyramid):
                     continue

@@ -191,9 +191,7 @@ class EdgeDetector:
         """The part's pose by its edges, and those that agree with it; None where too few do."""
         for half in widths:
             lines, *_ = self._lines(image, pose, half, coarse=True)
-            better = (
-                pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
-            )
+            better = pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
             if better is None:
                 return None
             pose = better
@@ -387,9 +385,7 @@ def _solve(pose: PartPose, J: FloatArray, left: FloatArray, weights: FloatArray,
     return step
 
 
-def line_distances(
-    part: Part, pose: PartPose, lines: dict[int, MeasuredLine]
-) -> tuple[FloatArray, FloatArray]:
+def line_distances(part: Part, pose: PartPose, lines: dict[int, MeasuredLine]) -> tuple[FloatArray, FloatArray]:
     """Distances (n, 2) [px] of the ends of n measured lines from the part's edges in the pose, and their derivatives
     (n, 2, 7) by the pose, as `PartPose.slopes` has them.
     """
@@ -409,9 +405,7 @@ def line_distances(
     return distances, by_pose
 
 
-def pose_from_lines(
-    part: Part, pose: PartPose, lines: dict[int, MeasuredLine], scale_px: float
-) -> PartPose | None:
+def pose_from_lines(part: Part, pose: PartPose, lines: dict[int, MeasuredLine], scale_px: float) -> PartPose | None:
     """Pose of least distance from measured lines, those far from it (beside ``scale_px``) counted little; None where
     the part would come behind the camera.
     """
@@ -423,9 +417,7 @@ def pose_from_lines(
         weights = np.sqrt(1.0 / (1.0 + (worst / scale_px) ** 2)) * np.ones((1, 2))
         step = _solve(pose, J.reshape(-1, 7), distances.ravel(), weights.ravel(), scale_px)
         # A step beyond a quarter turn, or the part's distance, is no refinement.
-        step = step / max(
-            1.0, float(np.abs(step[:3]).max()) / 0.3, float(np.abs(step[3:6]).max()) / (0.3 * pose.t[2])
-        )
+        step = step / max(1.0, float(np.abs(step[:3]).max()) / 0.3, float(np.abs(step[3:6]).max()) / (0.3 * pose.t[2]))
         pose = pose.stepped(step)
         if float(np.abs(step).max()) < CONVERGED:
             break
@@ -543,9 +535,7 @@ def make_part(file: PartFile, refuse: Any = ValueError) -> Part:
     sides = np.zeros((len(edges), len(normals)))
     for row, faces in enumerate(edges.values()):
         sides[row, faces] = 1.0
-    part = Part(
-        np.array(ids, np.int64), points, np.array(normals), np.array(offsets), np.array(list(edges)), sides
-    )
+    part = Part(np.array(ids, np.int64), points, np.array(normals), np.array(offsets), np.array(list(edges)), sides)
     _require_crossings(part, refuse)
     return part
 

@@ -14,9 +14,7 @@ def verify_order(values: Mapping[str, float], specs: tuple[AuxiliarySpec, ...]) 
     for name, value in values.items():
         spec = known.get(name)
         if spec is None:
-            raise DriverError(
-                "auxiliary", f"no auxiliary {name!r}; there are: {', '.join(known) or 'none'}", name=name
-            )
+            raise DriverError("auxiliary", f"no auxiliary {name!r}; there are: {', '.join(known) or 'none'}", name=name)
         allowed = value in (0.0, 1.0) if spec.kind == "digital" else spec.low <= value <= spec.high
         if not allowed:
             raise DriverError(

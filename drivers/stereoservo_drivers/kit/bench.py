@@ -204,9 +204,7 @@ class JointBench:
         count = len(driver.describe().joints)
         self._verify_arrays(state, count)
         ahead_ns = state.t_ns - self.now_ns()
-        require(
-            ahead_ns <= FUTURE_NS, f"a sample is stamped {ahead_ns * 1e-6:.3g} ms in the future", STAMP_REMEDY
-        )
+        require(ahead_ns <= FUTURE_NS, f"a sample is stamped {ahead_ns * 1e-6:.3g} ms in the future", STAMP_REMEDY)
         before = self._last.get(id(driver))
         if before is not None:
             require(
@@ -222,9 +220,7 @@ class JointBench:
     def _verify_arrays(state: JointState, count: int) -> None:
         arrays: dict[str, Any] = {"positions": state.positions, "velocities": state.velocities}
         arrays |= {
-            name: value
-            for name in ("efforts", "following_errors")
-            if (value := getattr(state, name)) is not None
+            name: value for name in ("efforts", "following_errors") if (value := getattr(state, name)) is not None
         }
         for name, array in arrays.items():
             require(

@@ -78,9 +78,7 @@ class CartesianJointDriver:
         self._attitude = attitude
         self._frame = frame
         self._life = DriverLifecycle(f"joint driver {description.driver!r}")
-        ends = [
-            (j.position_min, j.position_max, j.velocity_max, j.acceleration_max) for j in description.joints
-        ]
+        ends = [(j.position_min, j.position_max, j.velocity_max, j.acceleration_max) for j in description.joints]
         self._low, self._high, self._fastest, self._acceleration = np.array(ends).T
         home = np.array(description.home) if description.home else 0.5 * (self._low + self._high)
         self._positions, self._pose = home, np.eye(4)
@@ -117,9 +115,7 @@ class CartesianJointDriver:
         self._life.require("write_velocity()", LifecycleState.ACTIVE)
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (6,) or not np.isfinite(asked).all():
-            raise DriverError(
-                "command", f"write_velocity() got {asked.tolist()}; six finite velocities are needed"
-            )
+            raise DriverError("command", f"write_velocity() got {asked.tolist()}; six finite velocities are needed")
         told = self._arm.read()
         self._follow(told)
         # Slides share one acceleration, turns another: half of it is there for each to brake before its limit.

@@ -35,9 +35,7 @@ def open_serial(url: str, baudrate: int) -> ByteStream:
     import serial  # only who talks to a real port needs it
 
     try:
-        stream: ByteStream = serial.serial_for_url(
-            url, baudrate=baudrate, timeout=0, write_timeout=0.1, exclusive=True
-        )
+        stream: ByteStream = serial.serial_for_url(url, baudrate=baudrate, timeout=0, write_timeout=0.1, exclusive=True)
     except (OSError, ValueError) as error:
         shown = Address(url)
         raise DriverError(

@@ -59,9 +59,7 @@ def describes_itself(bench: JointBench) -> str:
     require(bool(names) and len(set(names)) == len(names), f"joints are called {names}")
     for joint in description.joints:
         require(joint.position_min < joint.position_max, f"{joint.name}: empty range of positions")
-        require(
-            joint.velocity_max > 0 and joint.acceleration_max > 0, f"{joint.name}: limits must be above 0"
-        )
+        require(joint.velocity_max > 0 and joint.acceleration_max > 0, f"{joint.name}: limits must be above 0")
         require(
             joint.resolution < joint.position_max - joint.position_min,
             f"{joint.name}: resolution above its range",
@@ -230,9 +228,7 @@ def keeps_samples_apart(bench: JointBench) -> str:
     state = bench.read(driver)
     positions = state.positions.copy()
     bench.drive(driver, velocity, 0.2)
-    require(
-        np.array_equal(state.positions, positions), "a later read changes the arrays of an earlier sample"
-    )
+    require(np.array_equal(state.positions, positions), "a later read changes the arrays of an earlier sample")
     report = bench.write(driver, velocity)
     asked = velocity.copy()
     velocity[:] = 0.0
@@ -274,9 +270,7 @@ def states_its_resolution(bench: JointBench) -> str:
     bench.drive(driver, np.sign(slow) * creep, 0.2)
     states = bench.drive(driver, np.sign(slow) * creep, max(0.6, 60 * period))
     changes = np.abs(np.diff([state.positions for state in states], axis=0))
-    steps = np.array(
-        [np.median(column[column > 0.0]) if (column > 0.0).any() else 0.0 for column in changes.T]
-    )
+    steps = np.array([np.median(column[column > 0.0]) if (column > 0.0).any() else 0.0 for column in changes.T])
     if not steps.all():
         raise CheckNotRunError("a joint does not move when it is commanded to creep; its steps are unknown")
     allowed = np.maximum(1.6 * np.maximum(stated, FINEST), 3.0 * creep * period)
@@ -416,9 +410,7 @@ JOINT_CHECKS = (
         motion.refuses_bad_commands,
         "check shape and np.isfinite before anything is sent",
     ),
-    JointCheck(
-        "cuts velocities at the limits", motion.cuts_velocities, "clip to velocity_max and say it in reasons"
-    ),
+    JointCheck("cuts velocities at the limits", motion.cuts_velocities, "clip to velocity_max and say it in reasons"),
     JointCheck(
         "agrees with its velocities",
         agrees_with_its_velocities,
@@ -450,9 +442,7 @@ JOINT_CHECKS = (
         motion.orders_auxiliary,
         "kit.auxiliary.verify_order(); stop() holds auxiliary joints, too; require ACTIVE in write_auxiliary()",
     ),
-    JointCheck(
-        "keeps position limits", motion.keeps_position_limits, "at a limit, send velocities inward only"
-    ),
+    JointCheck("keeps position limits", motion.keeps_position_limits, "at a limit, send velocities inward only"),
     JointCheck(
         "tells faults of the device",
         motion.tells_faults_of_the_device,

@@ -236,9 +236,7 @@ def stops_when_commands_cease(bench: JointBench) -> str:
     return f"travelled {travel:.2g} rad or m with neither reads nor commands; a new command {told}"
 
 
-def _travel_in_silence(
-    bench: JointBench, driver: JointDriver, velocity: FloatArray
-) -> tuple[float, FloatArray]:
+def _travel_in_silence(bench: JointBench, driver: JointDriver, velocity: FloatArray) -> tuple[float, FloatArray]:
     """Largest travel from the last command on, with no call of the driver meanwhile, and where the joints stand (n,).
 
     Raises CheckFailedError where that is farther than the time-out and braking explain.
@@ -342,9 +340,7 @@ def keeps_position_limits(bench: JointBench) -> str:
     driver = bench.active()
     description = driver.describe()
     period = 1.0 / description.rate_hz
-    low, high = (
-        np.array([getattr(j, f"position_{end}") for j in description.joints]) for end in ("min", "max")
-    )
+    low, high = (np.array([getattr(j, f"position_{end}") for j in description.joints]) for end in ("min", "max"))
     outward = -np.sign(bench.slow(driver))
     limit = np.where(outward > 0.0, high, low)
     speed = 0.5 * np.array([joint.velocity_max for joint in description.joints])
@@ -386,9 +382,7 @@ def orders_auxiliary(bench: JointBench) -> str:
     before = driver.read_auxiliary()
     require(set(before) == {spec.name for spec in specs}, f"read_auxiliary() tells {before}")
     ends = {s.name: s.high if before[s.name] - s.low < s.high - before[s.name] else s.low for s in specs}
-    refused(
-        lambda: driver.write_auxiliary({"nobody": 0.0}), "an order to an auxiliary joint that is not there"
-    )
+    refused(lambda: driver.write_auxiliary({"nobody": 0.0}), "an order to an auxiliary joint that is not there")
     for spec in specs:
         too_far = {spec.name: spec.high + 1.0}
         refused(lambda too_far=too_far: driver.write_auxiliary(too_far), f"{too_far} beyond its limits")

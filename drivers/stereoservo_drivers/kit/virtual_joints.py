@@ -49,10 +49,7 @@ class VirtualLimits(NamedTuple):
         slides = zip(NAMES[:3], self.low, self.high, strict=True)
         turns = zip(NAMES[3:], self.turns, strict=True)
         return (
-            *(
-                JointSpec(name, "prismatic", low, high, speed[0], acceleration[0])
-                for name, low, high in slides
-            ),
+            *(JointSpec(name, "prismatic", low, high, speed[0], acceleration[0]) for name, low, high in slides),
             *(JointSpec(name, "revolute", -turn, turn, speed[1], acceleration[1]) for name, turn in turns),
         )
 
@@ -96,9 +93,7 @@ def turning_axes(positions: FloatArray, attitude: FloatArray) -> FloatArray:
     return axes
 
 
-def twist_of(
-    positions: FloatArray, velocities: FloatArray, attitude: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def twist_of(positions: FloatArray, velocities: FloatArray, attitude: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Velocity (3,) [m/s] of the tool's point and turn rate (3,) [rad/s], in the base frame, of virtual ``velocities``
     (6,).
     """

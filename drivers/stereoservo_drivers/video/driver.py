@@ -121,9 +121,7 @@ class VideoCameraDriver:
 
         Raises DriverError: what is wrong with the source, ``image_size``, ``open_timeout``, ``end_of_file``.
         """
-        self._life.require(
-            "configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED
-        )
+        self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED)
         if self._life.state is LifecycleState.CONFIGURED:
             return
         if self._over is not None:
@@ -299,9 +297,7 @@ def modes_told(ioctl: Ioctl) -> tuple[Mode, ...] | None:
             if kind != DISCRETE:
                 continue
 
-            def intervals(
-                k: int, data: bytearray, code: int = pixel_format, w: int = width, h: int = height
-            ) -> None:
+            def intervals(k: int, data: bytearray, code: int = pixel_format, w: int = width, h: int = height) -> None:
                 struct.pack_into("IIII", data, 0, k, code, w, h)
 
             for interval in _listed(ioctl, ENUM_FRAMEINTERVALS, 52, intervals):
@@ -382,9 +378,7 @@ def live_source(
 class Reader:
     """Reads ``source``, which must be unused, in a thread of its own. Every wait of its callers is bounded."""
 
-    def __init__(
-        self, source: LiveSource, place: Place, options: VideoOptions, camera: str, watch: Watch
-    ) -> None:
+    def __init__(self, source: LiveSource, place: Place, options: VideoOptions, camera: str, watch: Watch) -> None:
         self.abandoned = False
         self._source = source
         self._place = place

@@ -168,9 +168,7 @@ class MjpegSource:
                     "silent", f"nothing came for {self._options.read_timeout_s:g} s", retry=True
                 ) from error
             except (OSError, ValueError, http.client.HTTPException) as error:
-                raise self._place.error(
-                    "connection_lost", f"the connection broke ({error})", retry=True
-                ) from error
+                raise self._place.error("connection_lost", f"the connection broke ({error})", retry=True) from error
             t_ns = self._clock.now_ns()
             self._over = not data
             try:
@@ -202,9 +200,7 @@ class MjpegSource:
     def _decoded(self, part: MultipartPart, skipped: int) -> SourcePicture | None:
         told = part.headers.get("content-type", "image/jpeg").partition(";")[0].strip().lower()
         if told not in ("image/jpeg", "image/jpg"):
-            raise self._place.error(
-                "not_mjpeg", f"its parts are {told!r}; image/jpeg is read", content_type=told
-            )
+            raise self._place.error("not_mjpeg", f"its parts are {told!r}; image/jpeg is read", content_type=told)
         size = None if part.cut else jpeg_size(part.body)
         image = None
         if size is not None:
@@ -257,9 +253,7 @@ def authorization(url: SplitResult, challenge: str = "") -> str:
         return "Basic " + base64.b64encode(user + b":" + password).decode()
     plain = urlunsplit(url._replace(netloc=url.netloc.rpartition("@")[2]))
     known = urllib.request.HTTPPasswordMgrWithDefaultRealm()
-    known.add_password(
-        None, plain, user.decode("latin-1"), password.decode("latin-1")
-    )  # its bytes, see _Digest
+    known.add_password(None, plain, user.decode("latin-1"), password.decode("latin-1"))  # its bytes, see _Digest
     told = urllib.request.parse_keqv_list(urllib.request.parse_http_list(challenge.partition(" ")[2]))
     request = urllib.request.Request(plain)
     return f"Digest {_Digest(known).get_authorization(request, told)}"
@@ -281,13 +275,9 @@ class _Digest(urllib.request.AbstractDigestAuthHandler):
 
 def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
     if isinstance(error, TimeoutError):
-        return place.error(
-            "open_timeout", f"did not answer within {timeout_s:g} s (open_timeout_s)", retry=True
-        )
+        return place.error("open_timeout", f"did not answer within {timeout_s:g} s (open_timeout_s)", retry=True)
     if isinstance(error, ConnectionRefusedError):
-        return place.error(
-            "refused", "nobody listens there. Start the camera's server, or mend the port", retry=True
-        )
+        return place.error("refused", "nobody listens there. Start the camera's server, or mend the port", retry=True)
     if isinstance(error, socket.gaierror | UnicodeError):
         return place.error("unknown_host", f"its host has no address ({error})", retry=True)
     if isinstance(error, ssl.SSLError):
@@ -474,11 +464,7 @@ class MultipartParser:
         if boundary >= 0:
             boundary -= self._buffer[:boundary].endswith(b"\r")
             return self._complete(part, boundary, cut=length is not None)
-        if (
-            length is None
-            and self._buffer.endswith((_JPEG_END, _JPEG_END + b"\r\n"))
-            and jpeg_size(self._buffer)
-        ):
+        if length is None and self._buffer.endswith((_JPEG_END, _JPEG_END + b"\r\n")) and jpeg_size(self._buffer):
             return self._complete(part, self._buffer.rindex(_JPEG_END) + 2, cut=False)
         if len(self._buffer) > self._largest:
             raise MultipartError("frame_too_large", f"a picture above {self._largest} bytes without an end")

@@ -167,9 +167,7 @@ def _place(options: VideoOptions, cell_dir: Path) -> Place:
             raise _wrong("feature", options.feature, "is for LeRobot data sets, with `episode`")
         return place_of(source, cell_dir)
     if isinstance(source, int) or "://" in source or source.startswith("/dev/"):
-        raise _wrong(
-            "episode", options.episode, f"is for the folder of a LeRobot data set; source is {source}"
-        )
+        raise _wrong("episode", options.episode, f"is for the folder of a LeRobot data set; source is {source}")
     if options.start:
         raise _wrong("start", options.start, "an episode is played from its beginning: leave it out")
     path = cell_dir / source

@@ -210,8 +210,7 @@ class PlainVideo:
             check_size(place, options, int(size[0]), int(size[1]))
             self._said = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
             if options.start and (
-                0 < self._said <= options.start
-                or not self._capture.set(cv2.CAP_PROP_POS_FRAMES, float(options.start))
+                0 < self._said <= options.start or not self._capture.set(cv2.CAP_PROP_POS_FRAMES, float(options.start))
             ):
                 raise place.error("start", f"start = {options.start}; it has {self._said} frames")
         except DriverError:
@@ -307,9 +306,7 @@ class NumberedPictures:
         if not numbers:
             raise place.error("missing", f"there is no picture of this name in {place.path.parent}")
         if options.start and options.start not in numbers:
-            raise place.error(
-                "start", f"start = {options.start}; there are the numbers {numbers[0]} to {numbers[-1]}"
-            )
+            raise place.error("start", f"start = {options.start}; there are the numbers {numbers[0]} to {numbers[-1]}")
         self._next = options.start or numbers[0]
         self._last = numbers[-1]
         gap = next(
@@ -377,13 +374,9 @@ class EpisodePictures:
             info = self._episode.info
             wanted = options.feature or camera
             (key,) = lerobot.camera_features(info, place.path, [wanted]).values()
-            self._pictures = lerobot.pictures(
-                place.path, info, key, self._episode.rows, gray=options.channel == "gray"
-            )
+            self._pictures = lerobot.pictures(place.path, info, key, self._episode.rows, gray=options.channel == "gray")
         if options.rate_hz != info.fps:
-            raise place.error(
-                "rate", f"rate_hz = {options.rate_hz!r}; the data set has {info.fps!r} frames a second"
-            )
+            raise place.error("rate", f"rate_hz = {options.rate_hz!r}; the data set has {info.fps!r} frames a second")
         self.period_ns = self._episode.period_ns
 
     def read(self) -> Frame | None:

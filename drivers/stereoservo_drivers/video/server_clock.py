@@ -163,9 +163,7 @@ class ServerClock:
         if not math.isfinite(bound_ns):
             reason = "no answer of the server was timed, so that nothing bounds how long its pictures take"
         elif abs(slope) > WORST_DRIFT:
-            reason = (
-                f"its clock drifts by {1e6 * slope:.0f} ppm, at most {1e6 * WORST_DRIFT:.0f} are a clock's"
-            )
+            reason = f"its clock drifts by {1e6 * slope:.0f} ppm, at most {1e6 * WORST_DRIFT:.0f} are a clock's"
         elif self._held_until_ns is not None and received_ns < self._held_until_ns:
             reason = "all its pictures came later at once: its clock was set, or the way has become longer"
         elif self._late_ns is not None or self._late_one:

@@ -144,9 +144,7 @@ class CaptureSource:
         except ValueError as error:
             raise self._place.error("setting", str(error)) from error
         except OSError as error:
-            raise self._place.error(
-                "not_opened", f"takes no settings ({error.strerror})", retry=True
-            ) from error
+            raise self._place.error("not_opened", f"takes no settings ({error.strerror})", retry=True) from error
 
     def _check_size(self, ioctl: Ioctl) -> None:
         """Raises DriverError, with the device's modes, where it takes another size than asked."""
@@ -179,9 +177,7 @@ class CaptureSource:
                 "connection_lost", "gives no more pictures: unplugged, ended, or silent too long", retry=True
             )
         t_ns = self._clock.now_ns()
-        if (
-            self._place.kind == "device"
-        ):  # OpenCV passes on the kernel's time, of UVC cameras by the monotonic clock
+        if self._place.kind == "device":  # OpenCV passes on the kernel's time, of UVC cameras by the monotonic clock
             t_ns = received_ns(t_ns, t_ns - capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         whole, image = capture.retrieve()
         return SourcePicture(image, t_ns) if whole else None
@@ -375,9 +371,7 @@ def set_control(ioctl: Ioctl, name: str, value: int) -> int | None:
     if valid is None:
         return None
     if not valid.least <= value <= valid.most:
-        raise ValueError(
-            f"{name} = {value}; this device takes {valid.least} to {valid.most} in steps of {valid.step}"
-        )
+        raise ValueError(f"{name} = {value}; this device takes {valid.least} to {valid.most} in steps of {valid.step}")
     control = Control(id=CONTROLS[name], value=value)
     try:
         ioctl(SET_CONTROL, control)

@@ -33,9 +33,7 @@ class Watch:
         self._last_ns = None
         self._late = 0
 
-    def see(
-        self, image: ImageArray, t_received_ns: int, seq: int | None, skipped: int, *, look: bool
-    ) -> bool:
+    def see(self, image: ImageArray, t_received_ns: int, seq: int | None, skipped: int, *, look: bool) -> bool:
         """Count an image and set its :attr:`number`; False: it must be withheld.
 
         ``seq``: the source's number, None where it gives none: then what is missing is determined by the time since the

@@ -44,9 +44,7 @@ def projective_bundle(
         if wanted == lenses:
             break
         lenses = wanted
-        robust = solve(
-            robust.rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4
-        )
+        robust = solve(robust.rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4)
     # A flat target may leave the projective bundle with open directions that the metric one closes: no need
     # to walk such a valley to its end here.
     every = every.corrected(robust.data.joint_errors)
@@ -55,9 +53,7 @@ def projective_bundle(
         return solution, inliers
     if lenses == "none":
         return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
-    return refine_to_convergence(
-        straightened(solution.rig, every), every, "projective", options, "none", 1e-6
-    )
+    return refine_to_convergence(straightened(solution.rig, every), every, "projective", options, "none", 1e-6)
 
 
 def refine_to_convergence(
@@ -170,8 +166,7 @@ def refuse_poor_fit(
     if solution.determined.freedom <= 0:
         raise CalibrationError(
             "too_few_stops",
-            f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or "
-            "markers are needed",
+            f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or markers are needed",
             measurements=solution.rows,
             parameters=solution.charts.size,
         )

@@ -418,9 +418,7 @@ def _joint_statistics(
     )
 
 
-def _outliers(
-    trials: TrialData, rig: RigModel, every: Measurements, inliers: BoolArray
-) -> tuple[Outlier, ...]:
+def _outliers(trials: TrialData, rig: RigModel, every: Measurements, inliers: BoolArray) -> tuple[Outlier, ...]:
     lost = every.select(~inliers)
     if not len(lost.pixels):
         return ()

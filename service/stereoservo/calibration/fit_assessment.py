@@ -137,9 +137,7 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
             "joints moved one at a time from one configuration only: what sag, or joints that turn with others, do to "
             "several at once is untested"
         )
-        advice.append(
-            "stops of all joints at once (calibration.together) test it; do the markers stay in view there?"
-        )
+        advice.append("stops of all joints at once (calibration.together) test it; do the markers stay in view there?")
     _identified(model, report, depth_spread, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
     summary = f"residual {statistics.rms_px:.3g} px rms" + (

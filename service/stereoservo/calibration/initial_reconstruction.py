@@ -102,9 +102,7 @@ def metric_rig(rig: RigModel, plane: FloatArray, intrinsics: FloatArray, spans: 
 def _transformed(rig: RigModel, plane: FloatArray, intrinsics: FloatArray) -> RigModel:
     upgrade, back = projective_to_euclidean(plane, intrinsics), euclidean_to_projective(plane, intrinsics)
     points = rig.points @ upgrade.T
-    return RigModel(
-        rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:], rig.lenses
-    )
+    return RigModel(rig.kinds, upgrade @ rig.generators @ back, rig.cameras @ back, points / points[:, 3:], rig.lenses)
 
 
 def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -247,10 +245,7 @@ def _epipolar(
                 fits = np.abs(sampson_distances(weak, flat[0, seen], flat[k, seen])) <= INLIER_SIGMAS * sigma
                 return weak, fits, seen
             continue
-        fits = (
-            np.abs(sampson_distances(F, flat[0, seen], flat[k, seen]))
-            <= INLIER_SIGMAS * max(1.0, scale) * sigma
-        )
+        fits = np.abs(sampson_distances(F, flat[0, seen], flat[k, seen])) <= INLIER_SIGMAS * max(1.0, scale) * sigma
         best = max(best, float(fits.mean()))
         if best >= MIN_AGREEMENT:
             return fundamental_refine(F, flat[0, seen][fits], flat[k, seen][fits], sigma), fits, seen

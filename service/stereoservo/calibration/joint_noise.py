@@ -76,9 +76,7 @@ class StopRows(NamedTuple):
     rows: FloatArray
 
 
-def stop_rows(
-    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None = None
-) -> Iterator[StopRows]:
+def stop_rows(rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None = None) -> Iterator[StopRows]:
     """Rows of ``data``, sorted by :func:`by_stop`, one stop after the other."""
     corrections = data.corrections
     edges = [*np.flatnonzero(np.diff(data.stop, prepend=-1)).tolist(), len(data.stop)]
@@ -170,9 +168,7 @@ class StopEquations:
         return common, own.ravel()
 
 
-def stop_equations(
-    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
-) -> StopEquations:
+def stop_equations(rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None) -> StopEquations:
     """Normal equations of sorted ``data`` with joint noise; ``weights`` as for `normal_equations`.
 
     Of a stop's rows ``A`` and its own errors' ``U`` they are ``Aᵀ A - Aᵀ U (1 + Uᵀ U)⁻¹ Uᵀ A``.

@@ -81,9 +81,7 @@ def free_arm(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
 
 def _check_rigid(D: FloatArray) -> None:
     if D.ndim != 3 or D.shape[1:] != (4, 4) or not len(D):
-        raise CalibrationError(
-            "bad_data", f"displacements of shape {D.shape}; (s, 4, 4) with at least one are needed"
-        )
+        raise CalibrationError("bad_data", f"displacements of shape {D.shape}; (s, 4, 4) with at least one are needed")
     off = np.abs(D[:, :3, :3].transpose(0, 2, 1) @ D[:, :3, :3] - np.eye(3)).max(axis=(1, 2))
     off = np.maximum(off, np.abs(D[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1))
     wrong = ~(off <= RIGID) | ~(np.linalg.det(D[:, :3, :3]) > 0.0) | ~np.isfinite(D).all(axis=(1, 2))
@@ -210,9 +208,7 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
     every = measurements(trials, trials.visible, trials.positions)
     at = readings(trials.positions)
     # No two poses are one place of a gear.
-    at = Readings(
-        np.broadcast_to(np.arange(len(trials.positions))[:, None], trials.positions.shape), at.features
-    )
+    at = Readings(np.broadcast_to(np.arange(len(trials.positions))[:, None], trials.positions.shape), at.features)
     rig = _start(trials, every)
     lenses: LensModel = "none" if options.lens == "auto" else options.lens
     if priors:
@@ -261,9 +257,7 @@ def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _Erro
             inliers = with_whole_stops(every, inliers) if before is None else inliers
         total = max(total * factor, 1.0)
         every = replace(every, sigmas=stated * np.sqrt(total))
-        solution, inliers = refine_to_convergence(
-            solution.rig, every, "metric", options, lenses, ROUGHLY, inliers
-        )
+        solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, lenses, ROUGHLY, inliers)
         wanted = lens_wanted(solution) if options.lens == "auto" else lenses
         if wanted != lenses:
             solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, wanted, ROUGHLY)
@@ -303,9 +297,7 @@ def in_first_camera(solution: Solution) -> Solution:
     cameras[0] = scale * np.hstack([K, np.zeros((3, 1))])
     return replace(
         solution,
-        rig=replace(
-            rig, generators=frame @ rig.generators @ back, cameras=cameras, points=rig.points @ frame.T
-        ),
+        rig=replace(rig, generators=frame @ rig.generators @ back, cameras=cameras, points=rig.points @ frame.T),
         charts=replace(
             charts,
             cameras=tuple(basis @ back for basis in charts.cameras),
@@ -322,31 +314,22 @@ def frame_of_known_arm(model: CellModel, generators: FloatArray) -> FloatArray:
     """
     upgrade = model.projective_to_euclidean
     if upgrade is None:
-        raise CalibrationError(
-            "bad_data", f"the model is {model.stratum}; a metric one is needed", key="stratum"
-        )
+        raise CalibrationError("bad_data", f"the model is {model.stratum}; a metric one is needed", key="stratum")
     there = upgrade @ model.generators @ np.linalg.inv(upgrade)
     # H G = G' H, row by row; the last row of H is (0, 0, 0, 1).
     system = np.vstack(
-        [
-            np.kron(np.eye(4), one.T) - np.kron(other, np.eye(4))
-            for one, other in zip(generators, there, strict=True)
-        ]
+        [np.kron(np.eye(4), one.T) - np.kron(other, np.eye(4)) for one, other in zip(generators, there, strict=True)]
     )
     found, _, rank, _ = np.linalg.lstsq(system[:, :12], -system[:, 15], rcond=1e-9)
     if rank < 12:
-        raise CalibrationError(
-            "bad_data", f"the generators fix {rank} of 12 numbers of the frame", key="generators"
-        )
+        raise CalibrationError("bad_data", f"the generators fix {rank} of 12 numbers of the frame", key="generators")
     return np.vstack([found.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
 
 
 def _check_views(trials: TrialData) -> None:
     stops = trials.visible.any(axis=2).sum(axis=1)
     if (stops < LEAST_VIEWS).any():
-        counts = ", ".join(
-            f"{camera.name!r} {int(count)}" for camera, count in zip(trials.cameras, stops, strict=True)
-        )
+        counts = ", ".join(f"{camera.name!r} {int(count)}" for camera, count in zip(trials.cameras, stops, strict=True))
         raise CalibrationError(
             "too_few_stops",
             f"cameras see markers at so many poses: {counts}; each needs at least {LEAST_VIEWS}",
@@ -442,9 +425,7 @@ def _middle(generators: FloatArray) -> FloatArray:
     turns = generators[np.abs(generators[:, :3, :3]).any(axis=(1, 2))]
     if not len(turns):
         return np.zeros(3)
-    return np.asarray(
-        np.linalg.lstsq(turns[:, :3, :3].reshape(-1, 3), -turns[:, :3, 3].ravel(), rcond=1e-9)[0]
-    )
+    return np.asarray(np.linalg.lstsq(turns[:, :3, :3].reshape(-1, 3), -turns[:, :3, 3].ravel(), rcond=1e-9)[0])
 
 
 def _guesses() -> FloatArray:
@@ -453,9 +434,7 @@ def _guesses() -> FloatArray:
     z, angle = 1.0 - 2.0 * i / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * i
     ring = np.sqrt(1.0 - z**2)
     sphere = np.column_stack([ring * np.cos(angle), ring * np.sin(angle), z])
-    return np.concatenate(
-        [radius * Rotation.from_euler("x", k).apply(sphere) for k, radius in enumerate(RADII)]
-    )
+    return np.concatenate([radius * Rotation.from_euler("x", k).apply(sphere) for k, radius in enumerate(RADII)])
 
 
 def _linear(data: _Normalised, guess: FloatArray, m: int) -> tuple[float, FloatArray, FloatArray] | None:

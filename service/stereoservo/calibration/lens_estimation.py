@@ -367,9 +367,7 @@ def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float
     return float(inliers.sum()) / len(known)
 
 
-def _pair_lenses(
-    raw: FloatArray, sigmas: FloatArray, lenses: FloatArray, free: tuple[int, ...]
-) -> FloatArray | None:
+def _pair_lenses(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray, free: tuple[int, ...]) -> FloatArray | None:
     """Lenses (2, 4) of a pair, those of ``free`` fitted; None where distortion does not explain the misfit."""
     best, least, F = 0.0, np.inf, None
     for bend in GRID:
@@ -396,9 +394,7 @@ def _pair_lenses(
     return bent if _agreement(raw, noise, bent) > _agreement(raw, noise, lenses) + WORTH_SHARE else None
 
 
-def _coarse_fundamental(
-    raw: FloatArray, sigmas: FloatArray, lenses: FloatArray
-) -> tuple[FloatArray, float] | None:
+def _coarse_fundamental(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> tuple[FloatArray, float] | None:
     """F of undistorted matches and the median of their epipolar distances [sigmas]; None where none is found."""
     ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
     known = np.asarray(finite_rows(ideal).all(axis=0))

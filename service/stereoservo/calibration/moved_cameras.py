@@ -375,9 +375,7 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     return np.asarray(-chart @ np.linalg.lstsq(J, held, rcond=None)[0])
 
 
-def static_roots(
-    model: CellModel, matrices: FloatArray, lenses: FloatArray, views: Correspondences
-) -> FloatArray:
+def static_roots(model: CellModel, matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
     """Root (k, 2, 4 s) of the pixels' covariance by the static points' own, given the cameras."""
     count = len(model.scene_ids)
     found = np.zeros((len(views.camera), 2, 4 * count))
@@ -436,9 +434,7 @@ def with_moved_cameras(
     )
 
 
-def predicted_deviation(
-    model: CellModel, errors: list[CameraErrors], joints: FloatArray, points: FloatArray
-) -> float:
+def predicted_deviation(model: CellModel, errors: list[CameraErrors], joints: FloatArray, points: FloatArray) -> float:
     """Largest standard deviation [px], an axis, of a marker in the relocalized cameras of ``model``, where they see it.
 
     ``points`` (w, m, 4): the markers at ``joints`` (w, n). Where no camera sees any of them: infinite.
@@ -467,9 +463,7 @@ def predicted_deviation(
                 variances = np.einsum("kia,ab,kib->ki", rows, one.covariance[mine, mine], rows, optimize=True)
             else:
                 rows = model_jacobian(model, (c,), Moved(matrices, np.eye(4)), views, joints - model.zero)
-                variances = np.einsum(
-                    "kia,ab,kib->ki", rows, model.covariance.covariance, rows, optimize=True
-                )
+                variances = np.einsum("kia,ab,kib->ki", rows, model.covariance.covariance, rows, optimize=True)
             worst = max(worst, float(np.sqrt(variances.max())))
     return worst if some else np.inf
 

@@ -80,9 +80,7 @@ def _displacement_derivative(motions: Motions, stop: int, half: FloatArray, chan
 
 
 @kernel
-def _point_derivative(
-    H: FloatArray, change: FloatArray, M: FloatArray, world: FloatArray, shift: FloatArray
-) -> None:
+def _point_derivative(H: FloatArray, change: FloatArray, M: FloatArray, world: FloatArray, shift: FloatArray) -> None:
     """Point ``M`` (4,) displaced by ``H`` (4, 4) into ``world`` (4,), and its derivative by the generators into
     ``shift`` (4, p).
     """
@@ -90,10 +88,7 @@ def _point_derivative(
         world[r] = H[r, 0] * M[0] + H[r, 1] * M[1] + H[r, 2] * M[2] + H[r, 3] * M[3]
         for a in range(shift.shape[1]):
             shift[r, a] = (
-                change[r, 0, a] * M[0]
-                + change[r, 1, a] * M[1]
-                + change[r, 2, a] * M[2]
-                + change[r, 3, a] * M[3]
+                change[r, 0, a] * M[0] + change[r, 1, a] * M[1] + change[r, 2, a] * M[2] + change[r, 3, a] * M[3]
             )
 
 
@@ -107,9 +102,7 @@ def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: Fl
         for row in range(2):
             total = 0.0
             for r in range(4):
-                total += outer[row, r] * (
-                    H[r, 0] * D4[0] + H[r, 1] * D4[1] + H[r, 2] * D4[2] + H[r, 3] * D4[3]
-                )
+                total += outer[row, r] * (H[r, 0] * D4[0] + H[r, 1] * D4[1] + H[r, 2] * D4[2] + H[r, 3] * D4[3])
             own[row, a] = total
 
 
@@ -223,9 +216,7 @@ def _rows_into(
 
 
 @kernel
-def _markers_into(
-    core: FloatArray, own: FloatArray, marker: IntArray, cross: FloatArray, square: FloatArray
-) -> None:
+def _markers_into(core: FloatArray, own: FloatArray, marker: IntArray, cross: FloatArray, square: FloatArray) -> None:
     """Accumulate the markers' blocks: ``cross`` (m, q, p + 1) by ``core`` (2 k, p + 1), ``square`` (m, q, q)."""
     q, width = own.shape[1], core.shape[1]
     for row in range(len(core)):
@@ -288,9 +279,7 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
             np.ascontiguousarray(generator_basis.transpose(1, 2, 0)),
             _starts(charts.generators),
         )
-        seen = Sightings(
-            data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here]
-        )
+        seen = Sightings(data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here])
         markers = Markers(np.ascontiguousarray(rig.points), point_basis)
         _rows_into(motions, projections, markers, seen, core, own)
         yield here, Rows(core, own, data.marker[here])
@@ -333,9 +322,7 @@ def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
     rows = []
     camera_at, lens_at = charts.start(1), charts.start(2)
     sigmas = np.array([ties.skew, ties.aspect, ties.centre, ties.centre])
-    for matrix, basis, lens, lens_basis in zip(
-        rig.cameras, charts.cameras, rig.lenses, charts.lenses, strict=True
-    ):
+    for matrix, basis, lens, lens_basis in zip(rig.cameras, charts.cameras, rig.lenses, charts.lenses, strict=True):
         if len(basis):
             (fx, fy, skew, cu, cv), slopes = intrinsics_and_slopes(matrix, basis)
             centre_slopes = lens_basis[:, 1:3]
@@ -351,9 +338,7 @@ def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
     return np.vstack([np.zeros((0, charts.size + 1)), *rows])
 
 
-def normal_equations(
-    rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None
-) -> NormalEquations:
+def normal_equations(rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None) -> NormalEquations:
     """Accumulate the normal equations of sorted ``data``; ``weights`` of squared residuals (2 k,) for robust
     losses. Priors of lenses are never weighted down.
     """
@@ -461,15 +446,11 @@ class ArrowFactor:
         out[: m * q, core] = self.cross.reshape(m * q, width)
         out[m * q :, core] = self.core
         rows = np.arange(m * q)
-        out[rows[:, None], width - 1 + (rows // max(q, 1))[:, None] * q + np.arange(q)] = self.own.reshape(
-            m * q, q
-        )
+        out[rows[:, None], width - 1 + (rows // max(q, 1))[:, None] * q + np.arange(q)] = self.own.reshape(m * q, q)
         return out
 
 
-def arrow_factor(
-    rig: RigModel, charts: Charts, data: Measurements, more: FloatArray | None = None
-) -> ArrowFactor:
+def arrow_factor(rig: RigModel, charts: Charts, data: Measurements, more: FloatArray | None = None) -> ArrowFactor:
     """Orthogonal factor of the Jacobian and the residuals, priors of lenses included, in chunks.
 
     To the accuracy of QR on the whole Jacobian, for no product squares its condition; time and memory linear in the

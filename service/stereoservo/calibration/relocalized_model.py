@@ -292,9 +292,7 @@ def _refocused(displaced: CameraGroup, free: CameraGroup, noise: float) -> bool:
         gain, freedom = displaced.chi2 - free.chi2, displaced.degrees_of_freedom - free.degrees_of_freedom
         larger = max(noise, free.chi2 / free.degrees_of_freedom)
         return bool(gain > chi2_distribution.isf(TAIL, freedom) * larger)
-    passes = [
-        one.chi2 <= chi2_distribution.isf(TAIL, one.degrees_of_freedom) * noise for one in (displaced, free)
-    ]
+    passes = [one.chi2 <= chi2_distribution.isf(TAIL, one.degrees_of_freedom) * noise for one in (displaced, free)]
     return passes == [False, True]
 
 
@@ -496,9 +494,7 @@ def _outliers(
             if out.any():
                 rms = float(np.sqrt((error[out] ** 2).mean()))
                 found.append(
-                    OutlierObservation(
-                        model.cameras[c].name, int(marker), int(out.sum()), int(same.sum()), rms
-                    )
+                    OutlierObservation(model.cameras[c].name, int(marker), int(out.sum()), int(same.sum()), rms)
                 )
     return tuple(found)
 
@@ -526,15 +522,11 @@ def _refuse_few(
         raise too_few([model.cameras[c].name for c in group], count, ids, needed, what)
 
 
-def _refuse_outliers(
-    model: CellModel, views: Correspondences, group: tuple[int, ...], keep: BoolArray
-) -> None:
+def _refuse_outliers(model: CellModel, views: Correspondences, group: tuple[int, ...], keep: BoolArray) -> None:
     share = float((~keep).mean())
     if share > MAX_OUTLIERS:
         wrong = tuple(int(i) for i in np.unique(views.ids[~keep]))
-        raise not_explained(
-            [model.cameras[c].name for c in group], np.inf, np.inf, 0, wrong, share, MAX_OUTLIERS
-        )
+        raise not_explained([model.cameras[c].name for c in group], np.inf, np.inf, 0, wrong, share, MAX_OUTLIERS)
 
 
 LIMIT_PX = 1.0
@@ -629,9 +621,7 @@ def relocalize(
         msgspec.structs.replace(camera, matrix=matrices[c]) if c in matrices else camera
         for c, camera in enumerate(model.cameras)
     )
-    new = msgspec.structs.replace(
-        model, epoch=epoch, created=created, cameras=cameras, refined_from=0, in_place_of=0
-    )
+    new = msgspec.structs.replace(model, epoch=epoch, created=created, cameras=cameras, refined_from=0, in_place_of=0)
     errors = [one.errors for one in found]
     new = msgspec.structs.replace(new, covariance=with_moved_cameras(model, errors, matrices))
     joints = _workspace(model, observations, workspace)
@@ -640,11 +630,7 @@ def relocalize(
         raise too_uncertain(list(moved), predicted_px, limit_px, len(observations.poses))
     return RelocalizedModel(
         new,
-        {
-            model.cameras[c].name: _moved_camera(model, one, k)
-            for one in found
-            for k, c in enumerate(one.cameras)
-        },
+        {model.cameras[c].name: _moved_camera(model, one, k) for one in found for k, c in enumerate(one.cameras)},
         sum(one.chi2 for one in found),
         sum(one.degrees_of_freedom for one in found),
         predicted_px,
@@ -761,6 +747,4 @@ def _moved_camera(model: CellModel, one: CameraGroup, k: int) -> MovedCamera:
     old, lens = facing(camera.matrix[None], mine), camera.lens[None]
     motion_px = predicted(facing(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
     moved_px = float(np.sqrt(np.nanmean((motion_px**2).sum(axis=1))))
-    return describe_moved_camera(
-        model, camera.name, one.how, camera.matrix, one.matrices[k], mine.points, moved_px
-    )
+    return describe_moved_camera(model, camera.name, one.how, camera.matrix, one.matrices[k], mine.points, moved_px)

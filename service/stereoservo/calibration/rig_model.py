@@ -180,9 +180,7 @@ class Measurements:
         reported = replace(self, offsets=self.offsets - self.corrections, joint_errors=None)
         if errors is None or self.joint_noise is None:
             return reported
-        return replace(
-            reported, offsets=reported.offsets + errors.offsets(self.joint_noise), joint_errors=errors
-        )
+        return replace(reported, offsets=reported.offsets + errors.offsets(self.joint_noise), joint_errors=errors)
 
     def with_joint_noise(self, noise: JointNoise | None) -> Measurements:
         """The measurements as reported, with another noise of the joint readings."""
@@ -259,10 +257,7 @@ def full_charts(
         left = camera_basis(rig.cameras[0], "left_metric", stratum) if stratum == "metric" else none
         matrices = (
             left,
-            *(
-                camera_basis(matrix, gauge if c == 0 else "other", stratum)
-                for c, matrix in enumerate(rig.cameras[1:])
-            ),
+            *(camera_basis(matrix, gauge if c == 0 else "other", stratum) for c, matrix in enumerate(rig.cameras[1:])),
         )
     return Charts(
         tuple(
@@ -340,9 +335,7 @@ def expected_pixels(rig: RigModel, offsets: FloatArray) -> FloatArray:
     shape = (len(rig.cameras), len(offsets), len(rig.points))
     camera, stop, marker = (index.ravel() for index in np.indices(shape))
     blank = np.zeros((len(camera), 2))
-    return predicted(rig, Measurements(offsets, camera, stop, marker, blank, np.ones(len(camera)))).reshape(
-        *shape, 2
-    )
+    return predicted(rig, Measurements(offsets, camera, stop, marker, blank, np.ones(len(camera)))).reshape(*shape, 2)
 
 
 def _through(lens: FloatArray, ideal: FloatArray) -> FloatArray:
@@ -387,9 +380,7 @@ def own_acting_rig(model: CellModel) -> RigModel:
 
 def _in_acting_order(rig: RigModel, model: CellModel) -> RigModel:
     order = list(acting_order(model))
-    return RigModel(
-        tuple(rig.kinds[j] for j in order), rig.generators[order], rig.cameras, rig.points, rig.lenses
-    )
+    return RigModel(tuple(rig.kinds[j] for j in order), rig.generators[order], rig.cameras, rig.points, rig.lenses)
 
 
 def _rig(model: CellModel, frame: FloatArray) -> RigModel:

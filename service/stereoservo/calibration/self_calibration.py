@@ -143,9 +143,7 @@ def fit_model(
             raise
         result, notes = absorbed, (note, *review_notes(chain, absorbed, refit, options))
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
-    report = msgspec.structs.replace(
-        result.report, notes=(*result.report.notes, *notes), untested=untested(chain)
-    )
+    report = msgspec.structs.replace(result.report, notes=(*result.report.notes, *notes), untested=untested(chain))
     return completed(CalibrationFit(model, report), trials)
 
 
@@ -322,9 +320,7 @@ class _Start(NamedTuple):
 
     def with_joint_noise(self, noise: JointNoise) -> _Start:
         """The same with noise of the joint readings."""
-        return self._replace(
-            every=self.every.with_joint_noise(noise), clean=self.clean.with_joint_noise(noise)
-        )
+        return self._replace(every=self.every.with_joint_noise(noise), clean=self.clean.with_joint_noise(noise))
 
 
 class _Bundles(NamedTuple):
@@ -451,9 +447,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     """Projective bundle, stratum, final bundle. Raises CalibrationError."""
     report_progress("rigid bundle", 0.6)
     trials, every = start.trials, start.every
-    solution, inliers = projective_bundle(
-        start.linked.rig, start.clean, every, start.lenses, options, start.decided
-    )
+    solution, inliers = projective_bundle(start.linked.rig, start.clean, every, start.lenses, options, start.decided)
     refuse_poor_fit(trials, solution, every, inliers, options)
     report_progress("metric bundle", 0.8)
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
@@ -586,9 +580,7 @@ def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
         return None
 
 
-def _from_other_lenses(
-    trials: TrialData, epoch: int, created: str, options: FitOptions
-) -> CalibrationFit | None:
+def _from_other_lenses(trials: TrialData, epoch: int, created: str, options: FitOptions) -> CalibrationFit | None:
     """The first fit, of those that start from lenses over the whole range, that its noise explains and whose lenses
     are plausible; None where there is none.
     """

@@ -58,9 +58,7 @@ class _Way(NamedTuple):
 
 def with_shutter_offsets(model: CellModel, way: WayObservations | None) -> CellModel:
     """The model with the offsets that the ways between its stops show, where they were kept."""
-    return (
-        model if way is None else msgspec.structs.replace(model, shutter_offsets=shutter_offsets(model, way))
-    )
+    return model if way is None else msgspec.structs.replace(model, shutter_offsets=shutter_offsets(model, way))
 
 
 def shutter_offsets(model: CellModel, way: WayObservations) -> tuple[ShutterOffset, ...]:
@@ -153,9 +151,7 @@ def _aligned(series: list[_Series]) -> tuple[float, float] | None:
         step = float((v * y).sum()) / square
         offset = float(np.clip(offset + step, -LONGEST_S, LONGEST_S))
         scale = 1.4826 * float(np.median(np.abs(y - step * v)))
-        deviation = (
-            float(np.sqrt((v * v * (y - step * v) ** 2).sum())) / square
-        )  # jitter grows with the speed
+        deviation = float(np.sqrt((v * v * (y - step * v) ** 2).sum())) / square  # jitter grows with the speed
         for k, way in enumerate(series):
             use = _beyond_play(way, offset)
             every = _apart(way, offset, np.ones(len(use), dtype=bool))
@@ -182,7 +178,5 @@ def _apart(way: _Series, offset: float, use: BoolArray) -> FloatArray:
 def _speeds(way: _Series, offset: float, use: BoolArray) -> FloatArray:
     times, positions, stamps, _ = way
     at = (stamps + offset)[use]
-    speed = (np.interp(at + SLOPE_S, times, positions) - np.interp(at - SLOPE_S, times, positions)) / (
-        2.0 * SLOPE_S
-    )
+    speed = (np.interp(at + SLOPE_S, times, positions) - np.interp(at - SLOPE_S, times, positions)) / (2.0 * SLOPE_S)
     return np.asarray(speed - speed.mean()) if len(speed) else speed

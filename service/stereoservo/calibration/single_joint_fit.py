@@ -78,12 +78,8 @@ def linear_generator(
         weight = 1.0 / (sigmas[c, there, marker][keep] * (points[there, marker][keep] @ P[2]))
         rows = (P[None, :2] - target[:, :, None] * P[None, 2:]) * weight[:, None, None]
         moment = rows[:, :, :, None] * source[keep][:, None, None, :]
-        parts = (
-            [np.sin(step[keep]), 2.0 * np.sin(0.5 * step[keep]) ** 2] if kind == "revolute" else [step[keep]]
-        )
-        blocks.append(
-            np.concatenate([(part[:, None, None, None] * moment).reshape(-1, 16) for part in parts], axis=1)
-        )
+        parts = [np.sin(step[keep]), 2.0 * np.sin(0.5 * step[keep]) ** 2] if kind == "revolute" else [step[keep]]
+        blocks.append(np.concatenate([(part[:, None, None, None] * moment).reshape(-1, 16) for part in parts], axis=1))
         rights.append(-np.einsum("kij,kj->ki", rows, source[keep]).ravel())
     system, right = np.concatenate(blocks), np.concatenate(rights)
     if not right.size:  # no two stops far apart show a marker in common
@@ -93,11 +89,7 @@ def linear_generator(
     solution = _robust_least_squares(system, right)
     try:
         matrix = solution[:16].reshape(4, 4)
-        return (
-            nearest_rotation_generator(matrix)
-            if kind == "revolute"
-            else nearest_translation_generator(matrix)
-        )
+        return nearest_rotation_generator(matrix) if kind == "revolute" else nearest_translation_generator(matrix)
     except GeometryError:
         return None  # no rotation in sight: the other start may see one
 
@@ -190,9 +182,7 @@ def _robust_least_squares(system: FloatArray, right: FloatArray, rounds: int = 8
     for _ in range(rounds):
         scaled = system / scale * weights[:, None]
         before, solution = solution, np.linalg.lstsq(scaled, right * weights, rcond=1e-12)[0] / scale
-        if float(np.linalg.norm((solution - before) * scale)) < 1e-4 * float(
-            np.linalg.norm(solution * scale)
-        ):
+        if float(np.linalg.norm((solution - before) * scale)) < 1e-4 * float(np.linalg.norm(solution * scale)):
             break
         error = np.abs(system @ solution - right)
         typical = float(np.median(error))
@@ -419,9 +409,7 @@ def fit_single_joint(
             maximum=largest,
         )
     shown = np.asarray(observations.usable[:, :, :m].any(axis=(0, 1)))
-    return JointTrial(
-        joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan)
-    )
+    return JointTrial(joint, stops, groups, base, best.generators[0], np.where(shown[:, None], best.points[:m], np.nan))
 
 
 def _common_markers(observations: VirtualObservations, angles: FloatArray) -> int:
@@ -625,9 +613,7 @@ def _unit(trials: TrialData, joint: int) -> str:
     return "rad" if trials.joint_kinds[joint] == "revolute" else "m"
 
 
-def link_joints(
-    trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray
-) -> RigModel:
+def link_joints(trials: TrialData, cameras: FloatArray, separate: list[JointTrial], zero: FloatArray) -> RigModel:
     """Rig of all joints, base to tip: generators transformed from their trials' bases to one zero (5.21), one
     marker structure (5.53).
 

@@ -35,9 +35,7 @@ SETTLED = 1e-3
 """Length of a step [standard deviations] at which a point has converged."""
 
 
-def with_static_points(
-    model: CellModel, static: StaticObservations | None
-) -> tuple[CellModel, tuple[str, ...]]:
+def with_static_points(model: CellModel, static: StaticObservations | None) -> tuple[CellModel, tuple[str, ...]]:
     """The model with its static points, and notes on those that cannot be reconstructed."""
     if static is None:
         return model, ()
@@ -62,9 +60,7 @@ def with_static_points(
     ), tuple(notes)
 
 
-def _scene_point(
-    model: CellModel, pixels: FloatArray, sigmas: FloatArray
-) -> tuple[FloatArray, FloatArray] | str:
+def _scene_point(model: CellModel, pixels: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray] | str:
     """Point (4,) of scale 1 and its covariance (4, 4), given the cameras, from raw pixels (c, 2), NaN where
     missing; or the reason why there is none.
     """
@@ -81,9 +77,7 @@ def _scene_point(
     except GeometryError as broken:
         return str(broken)
     height = float(point @ model.plane_at_infinity)
-    if not abs(height) > LEAST_HEIGHT * float(np.linalg.norm(point)) * float(
-        np.linalg.norm(model.plane_at_infinity)
-    ):
+    if not abs(height) > LEAST_HEIGHT * float(np.linalg.norm(point)) * float(np.linalg.norm(model.plane_at_infinity)):
         return "it is as good as at infinity"
     point = point / height
     # Three directions that keep the height.

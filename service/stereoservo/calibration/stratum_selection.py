@@ -81,9 +81,7 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
         joint_errors=None,
     )
     now = _solved(single, own)
-    centroids = [
-        _centroid(single, float(end)) for end in (displacement[still].min(), displacement[still].max())
-    ]
+    centroids = [_centroid(single, float(end)) for end in (displacement[still].min(), displacement[still].max())]
     best: Solution | None = None
     for direction in DIRECTIONS:
         start = replace(single, generators=twist_about(direction, centroids, span)[None])
@@ -191,9 +189,7 @@ class StratumSelector:
             return False
         self.bent = self.bent or lens_wanted(solution) != solution.lenses
         # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
-        self.hopeless = any(
-            abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve
-        )
+        self.hopeless = any(abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve)
         self.reserve.append((solution, plane))
         return False
 
@@ -241,15 +237,9 @@ class StratumSelector:
         for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _solve_to_convergence(solution, data)
             deviation = (
-                max(_relative_deviations(final).values())
-                if final.determined.rank == final.charts.size
-                else np.inf
+                max(_relative_deviations(final).values()) if final.determined.rank == final.charts.size else np.inf
             )
-            if (
-                final.converged
-                and deviation <= LOOSE_SPREAD
-                and not self._worse(final, PLAUSIBLE_TAIL, projective)
-            ):
+            if final.converged and deviation <= LOOSE_SPREAD and not self._worse(final, PLAUSIBLE_TAIL, projective):
                 self.notes.append(
                     f"the {final.stratum} stratum is taken because the projective bundle leaves directions open; "
                     f"{self._unidentified(final) or 'its spread is small'}"
@@ -319,9 +309,7 @@ def _as_many(ratio: float) -> str:
 
 def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:
     """The bundle solved again with a much larger limit of evaluations."""
-    return solve(
-        solution.rig, data, solution.stratum, lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS
-    )
+    return solve(solution.rig, data, solution.stratum, lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS)
 
 
 def _relative_deviations(solution: Solution) -> dict[str, float]:
@@ -455,8 +443,6 @@ def _metric_starts(
             yield initial_reconstruction.metric_rig(rig, plane, linear, spans), plane
         for focal in initial_reconstruction.NOMINAL_FOCALS:
             yield (
-                initial_reconstruction.metric_rig(
-                    rig, plane, initial_reconstruction.nominal_intrinsics(focal), spans
-                ),
+                initial_reconstruction.metric_rig(rig, plane, initial_reconstruction.nominal_intrinsics(focal), spans),
                 plane,
             )

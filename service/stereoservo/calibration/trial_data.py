@@ -152,8 +152,7 @@ def check_trials(trials: TrialData) -> None:
     if n < 1 or len(trials.joint_kinds) != n:
         raise CalibrationError(
             "bad_data",
-            f"{n} joint names and {len(trials.joint_kinds)} kinds; one kind for each of at least one joint "
-            "is needed",
+            f"{n} joint names and {len(trials.joint_kinds)} kinds; one kind for each of at least one joint is needed",
         )
     if trials.images < 0:
         raise CalibrationError("bad_data", f"images is {trials.images}; 0 or more is needed", key="images")
@@ -209,14 +208,11 @@ def check_trials(trials: TrialData) -> None:
         )
     if not np.isfinite(trials.positions).all():
         stop = int(np.argwhere(~np.isfinite(trials.positions))[0, 0])
-        raise CalibrationError(
-            "bad_data", f"positions of stop {stop} are not finite", key="positions", stop=stop
-        )
+        raise CalibrationError("bad_data", f"positions of stop {stop} are not finite", key="positions", stop=stop)
     if trials.trials.min() < -1 or trials.trials.max() >= n:
         raise CalibrationError(
             "bad_data",
-            f"trial indices reach from {trials.trials.min()} to {trials.trials.max()}; -1 to {n - 1} are "
-            "joints",
+            f"trial indices reach from {trials.trials.min()} to {trials.trials.max()}; -1 to {n - 1} are joints",
             key="trials",
         )
     _check_sizes(trials)
@@ -280,15 +276,11 @@ def _check_way(trials: TrialData, way: WayObservations) -> None:
     for key, shape in shapes.items():
         array = getattr(way, key)
         if array.shape != shape:
-            raise CalibrationError(
-                "bad_data", f"way_{key} has shape {array.shape}; {shape} is needed", key="way"
-            )
+            raise CalibrationError("bad_data", f"way_{key} has shape {array.shape}; {shape} is needed", key="way")
         if key != "pixels" and not np.isfinite(array).all():
             raise CalibrationError("bad_data", f"way_{key} holds numbers that are not finite", key="way")
     if f and not 0 <= int(way.cameras.min()) <= int(way.cameras.max()) < len(trials.cameras):
-        raise CalibrationError(
-            "bad_data", f"way_cameras: 0 to {len(trials.cameras) - 1} are cameras", key="way"
-        )
+        raise CalibrationError("bad_data", f"way_cameras: 0 to {len(trials.cameras) - 1} are cameras", key="way")
 
 
 def _check_sizes(trials: TrialData) -> None:
@@ -337,9 +329,7 @@ def _check_pixels(trials: TrialData) -> None:
                 marker=trials.marker_ids[marker],
             )
         with np.errstate(invalid="ignore"):
-            outside = (trials.pixels[c] < -0.5) | (
-                trials.pixels[c] > np.array([camera.width, camera.height]) - 0.5
-            )
+            outside = (trials.pixels[c] < -0.5) | (trials.pixels[c] > np.array([camera.width, camera.height]) - 0.5)
         share = float(outside.any(axis=-1)[seen].mean()) if seen.any() else 0.0
         if share > MAX_OUTSIDE:
             raise CalibrationError(
@@ -398,11 +388,7 @@ def _static_arrays(static: StaticObservations | None) -> dict[str, npt.NDArray[A
 
 
 def _way_arrays(way: WayObservations | None) -> dict[str, npt.NDArray[Any]]:
-    return (
-        {}
-        if way is None
-        else {WAY + field: getattr(way, field) for field in WayObservations.__struct_fields__}
-    )
+    return {} if way is None else {WAY + field: getattr(way, field) for field in WayObservations.__struct_fields__}
 
 
 def _way(arrays: dict[str, npt.NDArray[Any]]) -> WayObservations | None:
@@ -439,9 +425,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
     """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``), whatever the bytes."""
     with decoding(lambda cause: _bad(path, f"is not a file of trial data: {cause}"), (CalibrationError,)):
         arrays = read_archive(data, MAX_TRIALS_BYTES)
-        missing = [
-            name for name in ("header", "positions", "trials", "pixels", "sigmas") if name not in arrays
-        ]
+        missing = [name for name in ("header", "positions", "trials", "pixels", "sigmas") if name not in arrays]
         if missing:
             raise ValueError(f"array {missing[0]!r} is missing")
         header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_Header)
@@ -460,9 +444,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             loads=_loads(arrays),
             static=_static(arrays),
             way=_way(arrays),
-            generators=arrays[GENERATORS].astype(np.float64, casting="same_kind")
-            if GENERATORS in arrays
-            else None,
+            generators=arrays[GENERATORS].astype(np.float64, casting="same_kind") if GENERATORS in arrays else None,
         )
         try:
             check_trials(trials)

@@ -148,9 +148,7 @@ def _stated(variances: FloatArray, spreads: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(variances / (1.0 - share), NONE_SEEN * np.sqrt(spreads)))
 
 
-def joint_noise_of(
-    random: FloatArray, repeatable: FloatArray, posture: FloatArray, at: Readings
-) -> JointNoise:
+def joint_noise_of(random: FloatArray, repeatable: FloatArray, posture: FloatArray, at: Readings) -> JointNoise:
     """Noise at stops with the readings ``at``, of joints with errors of these deviations (n,)."""
     places = at.places
     own, shared = np.tile(random**2, (len(places), 1)), np.full(places.shape, -1)
@@ -291,9 +289,7 @@ def _condensed(reduced: ReducedRows) -> ReducedRows:
     below = beside[first:] - moved @ ahead[:known]
     weak = len(values) - known
     rows = np.vstack([ahead[known : known + weak], below])
-    X = np.vstack(
-        [np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]]
-    )
+    X = np.vstack([np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]])
     pixels = np.eye(len(rows))
     pixels[weak:, weak:] += moved @ moved.T
     slopes = np.vstack([np.zeros((weak, reduced.joints)), reduced.slopes[first:]])
@@ -388,9 +384,7 @@ def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[
         free = ((here.variances > 0.0) | (score > 0.0)) & (np.diag(information) > 0.0)
         scaled = information / np.outer(size, size)
         step = np.zeros_like(score)
-        step[free] = (
-            np.linalg.pinv(scaled[np.ix_(free, free)], rcond=1e-8) @ (score / size)[free] / size[free]
-        )
+        step[free] = np.linalg.pinv(scaled[np.ix_(free, free)], rcond=1e-8) @ (score / size)[free] / size[free]
         better = None
         for share in (1.0, 0.5, 0.2):
             tried = np.maximum(here.variances + share * step, 0.0)

@@ -41,9 +41,7 @@ def auxiliary(
     emit(state, "  ".join(f"{name} {value:g}" for name, value in state.auxiliary.items()), json)
 
 
-def _arrived(
-    client: Client, ordered: dict[str, float], near: dict[str, float], wait_s: float
-) -> StateMessage:
+def _arrived(client: Client, ordered: dict[str, float], near: dict[str, float], wait_s: float) -> StateMessage:
     """The state once all are where they were ordered, or have stood for a while, or ``wait_s`` have passed."""
     until = time.monotonic() + wait_s
     state = stood = client.status()

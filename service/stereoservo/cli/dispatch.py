@@ -87,9 +87,7 @@ class LazyGroup(TyperGroup):
             lacking = plugins.missing_extra(error)
             if lacking is None:
                 raise
-            return _command(
-                cmd_name, _broken("missing_extra", f"`{cmd_name}` cannot run: {lacking}"), ANYTHING
-            )
+            return _command(cmd_name, _broken("missing_extra", f"`{cmd_name}` cannot run: {lacking}"), ANYTHING)
         return _command(cmd_name, function)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
@@ -104,9 +102,7 @@ class LazyGroup(TyperGroup):
         """The groups of ``--help``: no command is imported for it whose text can be read from its source."""
         places = _places()
         for heading, names in grouped(self.list_commands(ctx)):
-            commands = [
-                (name, _described(name, places[name]) or self.get_command(ctx, name)) for name in names
-            ]
+            commands = [(name, _described(name, places[name]) or self.get_command(ctx, name)) for name in names]
             with formatter.section(heading):
                 formatter.write_dl([(name, command.get_short_help_str(WHOLE)) for name, command in commands])
             example = next((EXAMPLES[name] for name in names if name in EXAMPLES), "")
@@ -186,9 +182,7 @@ def _version(value: bool) -> None:
 
 @app.callback()
 def root(
-    version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version."
-    ),
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     """Closes the loop between two uncalibrated cameras and a robot arm."""
 
@@ -200,9 +194,7 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
     """
     as_json = "--json" in arguments
     try:
-        code = get_command(app).main(
-            args=arguments, prog_name="stereoservo", standalone_mode=False, obj=raised
-        )
+        code = get_command(app).main(args=arguments, prog_name="stereoservo", standalone_mode=False, obj=raised)
     except KeyboardInterrupt:
         fail(CommandError("interrupted", "interrupted"), as_json)
         return EXIT_INTERRUPTED

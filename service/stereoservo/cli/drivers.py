@@ -17,8 +17,7 @@ def drivers(json: JsonOption = False) -> None:
     groups["laws"] = [replace(law, error=LAWS.errors.get(law.name, law.error)) for law in groups["laws"]]
     tree = {
         kind: [
-            {"name": p.name, "value": p.value, "distribution": p.distribution, "error": p.error or None}
-            for p in found
+            {"name": p.name, "value": p.value, "distribution": p.distribution, "error": p.error or None} for p in found
         ]
         for kind, found in groups.items()
     }

@@ -53,9 +53,7 @@ def examine(
     ] = None,
     detector: Annotated[
         Path | None,
-        typer.Option(
-            help="Of a LeRobot data set: the file that names the detector. Default: detector.toml in it."
-        ),
+        typer.Option(help="Of a LeRobot data set: the file that names the detector. Default: detector.toml in it."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -67,17 +65,13 @@ def examine(
     if dataset.is_dir() and is_data_set(dataset):
         views = read_data_set(dataset, units, cameras, detector)
     elif any(one is not None for one in (units, cameras, detector)):
-        raise CommandError(
-            "dataset", f"--units, --cameras and --detector are for LeRobot data sets; {dataset} is none"
-        )
+        raise CommandError("dataset", f"--units, --cameras and --detector are for LeRobot data sets; {dataset} is none")
     elif dataset.is_dir():
         views = read_folder(dataset)
     elif dataset.is_file():
         views = read_flight(dataset)
     else:
-        raise CommandError(
-            "dataset", f"{dataset} is no flight recording (*.mcap), folder or LeRobot data set"
-        )
+        raise CommandError("dataset", f"{dataset} is no flight recording (*.mcap), folder or LeRobot data set")
     report = examine_views(views)
     emit(report, _text(report), json)
 
@@ -106,9 +100,7 @@ def _text(report: RecordingReport) -> str:
         lost = "drops cannot be told" if one.dropped is None else f"{one.dropped} dropped"
         lines.append(f"  camera {name}: {one.frames} frames, {lost}{rms}{offset}")
     if report.joints:
-        lines.append(
-            "  by joint [px rms]: " + ", ".join(f"{name} {rms:.3f}" for name, rms in report.joints.items())
-        )
+        lines.append("  by joint [px rms]: " + ", ".join(f"{name} {rms:.3f}" for name, rms in report.joints.items()))
     if len(report.episodes) > 1:
         lines += [_of_episode(report, name, rms) for name, rms in report.episodes.items()]
     lines += [f"* {cause.message}" for cause in report.causes] or ["nothing has happened"]
@@ -247,12 +239,9 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
             image = decoded()
             size, before = (image.shape[1], image.shape[0]), size
             if before not in (None, size):
-                raise CommandError(
-                    "dataset", f"LeRobot data set {folder}: {key}: a picture of {size} after {before}"
-                )
+                raise CommandError("dataset", f"LeRobot data set {folder}: {key}: a picture of {size} after {before}")
             markers = {
-                marker: (u, v, max(sigma, least))
-                for marker, (u, v, sigma) in detected(look, name, row, image).items()
+                marker: (u, v, max(sigma, least)) for marker, (u, v, sigma) in detected(look, name, row, image).items()
             }
             seen[float(stamps[row])] = -1, int(rows.episode[row]), markers
         found = sum(bool(markers) for _, _, markers in seen.values())
@@ -356,15 +345,12 @@ class GatheredFrames:
         self.sizes = sizes
         self.seen: dict[tuple[str, float], tuple[int, int, dict[int, tuple[float, float, float]]]] = {}
 
-    def of(
-        self, path: Path, line: int, row: Mapping[str, str], key: str
-    ) -> dict[int, tuple[float, float, float]]:
+    def of(self, path: Path, line: int, row: Mapping[str, str], key: str) -> dict[int, tuple[float, float, float]]:
         camera, stamp = row.get("camera", ""), _number(path, line, row, key)
         if camera not in self.sizes:
             raise _wrong(path, line, "camera", camera, f"one of {', '.join(self.sizes)}")
         number, episode = (
-            _whole(path, line, row, name) if row.get(name) else none
-            for name, none in (("number", -1), ("episode", 0))
+            _whole(path, line, row, name) if row.get(name) else none for name, none in (("number", -1), ("episode", 0))
         )
         return self.seen.setdefault((camera, stamp), (number, episode, {}))[2]
 
@@ -378,9 +364,7 @@ def gathered_views(
     keys = sorted(frames.seen, key=lambda one: (one[1], cameras.index(one[0])))
     inside = [k for k in keys if stamps[0] <= k[1] <= stamps[-1] and (timed or k[1] in stamps)]
     if len(inside) < len(keys):
-        note(
-            f"{len(keys) - len(inside)} of {len(keys)} frames are left out: no joints or poses at their stamps"
-        )
+        note(f"{len(keys) - len(inside)} of {len(keys)} frames are left out: no joints or poses at their stamps")
     ids = tuple(sorted({i for key in inside for i in frames.seen[key][2]}))
     column = {marker: k for k, marker in enumerate(ids)}
     pixels, sigmas = np.full((len(inside), len(ids), 2), np.nan), np.ones((len(inside), len(ids)))
@@ -408,17 +392,13 @@ def _joints(
         name, _, unit = column.partition("[")
         unit = unit.removesuffix("]") or "rad"
         if unit not in UNITS:
-            raise CommandError(
-                "dataset", f"{path}: column {column!r}; units are {', '.join(UNITS)}, elbow[deg]"
-            )
+            raise CommandError("dataset", f"{path}: column {column!r}; units are {', '.join(UNITS)}, elbow[deg]")
         names.append(name.strip())
         kinds.append(UNITS[unit][0])
         scales.append(UNITS[unit][1])
     if not names:
         raise CommandError("dataset", f"{path} has no column of a joint beside {key!r}")
-    values = np.array(
-        [[_number(path, k, row, column) for column in columns] for k, row in enumerate(rows, 2)]
-    )
+    values = np.array([[_number(path, k, row, column) for column in columns] for k, row in enumerate(rows, 2)])
     return tuple(names), tuple(kinds), values[order] * np.array(scales), None
 
 
@@ -427,12 +407,8 @@ def _poses(
 ) -> tuple[tuple[str, ...], tuple[Kind, ...], FloatArray, FloatArray]:
     lacking = [name for name in POSE_COLUMNS if name not in rows[0]]
     if lacking:
-        raise CommandError(
-            "dataset", f"{path} lacks columns {', '.join(lacking)}; {','.join(POSE_COLUMNS)} are needed"
-        )
-    values = np.array(
-        [[_number(path, k, row, name) for name in POSE_COLUMNS] for k, row in enumerate(rows, 2)]
-    )
+        raise CommandError("dataset", f"{path} lacks columns {', '.join(lacking)}; {','.join(POSE_COLUMNS)} are needed")
+    values = np.array([[_number(path, k, row, name) for name in POSE_COLUMNS] for k, row in enumerate(rows, 2)])
     lengths = np.linalg.norm(values[:, 3:], axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT)
     if len(wrong):
@@ -490,9 +466,7 @@ def _pictures(folder: Path, rows: Rows, key: str) -> GatheredFrames:
         seen.update(detected(detectors[camera], camera, line, image))
         found[camera] += bool(seen)
     for camera in cameras:
-        note(
-            f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for row in rows)} pictures"
-        )
+        note(f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for row in rows)} pictures")
     return frames
 
 
@@ -504,9 +478,7 @@ def detected(
     spread = np.sqrt(0.5 * np.trace(shown.covariances, axis1=1, axis2=2))
     return {
         int(marker): (u, v, sigma)
-        for marker, (u, v), sigma in zip(
-            shown.ids.tolist(), shown.pixels.tolist(), spread.tolist(), strict=True
-        )
+        for marker, (u, v), sigma in zip(shown.ids.tolist(), shown.pixels.tolist(), spread.tolist(), strict=True)
     }
 
 
@@ -585,6 +557,4 @@ def _whole(path: Path, line: int, row: Mapping[str, str], column: str, least: in
 
 
 def _wrong(path: Path, line: int, column: str, value: str, valid: str) -> CommandError:
-    return CommandError(
-        "dataset", f"{path}, line {line}, column {column}: {value!r}; needed: {valid}", line=line
-    )
+    return CommandError("dataset", f"{path}, line {line}, column {column}: {value!r}; needed: {valid}", line=line)

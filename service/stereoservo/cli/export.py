@@ -126,9 +126,7 @@ def export(
         _export_flight(file, output if output is not None else file.with_suffix(".foxglove.mcap"), json)
 
 
-def _export_cameras(
-    file: Path, opencv: Path | None, ros: Path | None, kalibr: Path | None, json: bool
-) -> None:
+def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: Path | None, json: bool) -> None:
     from stereoservo.calibration.camera_rig import exchange  # OpenCV and YAML: for this alone
     from stereoservo.calibration.camera_rig.rig_calibration import load_rig
 
@@ -189,9 +187,7 @@ def _export_flight(file: Path, target: Path, json: bool) -> None:
     emit(figures, "\n".join(lines), json)
 
 
-def _export_model(
-    file: Path, urdf: Path | None, dh: bool, length: str, cell_path: Path | None, json: bool
-) -> None:
+def _export_model(file: Path, urdf: Path | None, dh: bool, length: str, cell_path: Path | None, json: bool) -> None:
     model = load_model(file)
     cell = None if cell_path is None else load_cell_file(cell_path)
     known = _known_length(length, model, cell)
@@ -205,9 +201,7 @@ def _export_model(
             from stereoservo.kinematics.inverse.recognition import structure  # statistics: for this alone
 
             holds = structure(model)
-            told["structure"] = [
-                {**asdict(one), "joints": [model.joint_names[j] for j in one.joints]} for one in holds
-            ]
+            told["structure"] = [{**asdict(one), "joints": [model.joint_names[j] for j in one.joints]} for one in holds]
             lines += [_words(one, model) for one in holds]
         if urdf is not None:
             arm = metric_arm(model, known)
@@ -358,9 +352,7 @@ class _File:
         if message.topic not in self._channels:
             schema = schema_of(message.content)
             if schema.name not in self._schemas:
-                self._schemas[schema.name] = self._writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
+                self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
             self._channels[message.topic] = self._writer.register_channel(
                 message.topic, schema.message, self._schemas[schema.name]
             )
@@ -463,7 +455,5 @@ def _add_pictures(file: _File, video: Path, shift_ns: int) -> None:
             if not done:
                 continue
             t_ns = frame.t_shutter_ns + shift_ns
-            content = CompressedImage(
-                timestamp=stamp(t_ns), frame_id=frame.camera, data=jpeg.tobytes(), format="jpeg"
-            )
+            content = CompressedImage(timestamp=stamp(t_ns), frame_id=frame.camera, data=jpeg.tobytes(), format="jpeg")
             file.publish(Published(f"/camera/{frame.camera}/image", t_ns, content))

@@ -46,9 +46,7 @@ if TYPE_CHECKING:
 FRAMES = 20
 
 
-def read_images(
-    cell: str, endpoint: str | None, images: Path, at_s: float, frames: int
-) -> tuple[SetPoints, ...]:
+def read_images(cell: str, endpoint: str | None, images: Path, at_s: float, frames: int) -> tuple[SetPoints, ...]:
     """Set-points of every recorded camera; reports them on stderr.
 
     Raises CommandError, SetPointError, ImageFileError, DriverError, PluginError, CellFileError, NotRunningError.
@@ -120,9 +118,7 @@ LinesOption = Annotated[
 ]
 PlanesOption = Annotated[
     str | None,
-    typer.Option(
-        metavar="A-B-C,...", help="Faces, each by ids of points on it; others then than now will do."
-    ),
+    typer.Option(metavar="A-B-C,...", help="Faces, each by ids of points on it; others then than now will do."),
 ]
 JointOption = Annotated[
     list[str] | None,
@@ -140,17 +136,13 @@ ImagesOption = Annotated[
         help="Set-points out of pictures recorded by `record --images`, at rest.",
     ),
 ]
-AtOption = Annotated[
-    float, typer.Option("--at", help="With --images: seconds from their beginning.", min=0.0)
-]
+AtOption = Annotated[float, typer.Option("--at", help="With --images: seconds from their beginning.", min=0.0)]
 FramesOption = Annotated[
     int, typer.Option("--frames", help="With --images: frames a camera to average.", min=1, max=1000)
 ]
 PointsOption = Annotated[
     Path | None,
-    typer.Option(
-        "--points", metavar="FILE", help='JSON: {"points": {"marker": [x, y, z, w]}, "model_epoch": N}.'
-    ),
+    typer.Option("--points", metavar="FILE", help='JSON: {"points": {"marker": [x, y, z, w]}, "model_epoch": N}.'),
 ]
 DisplacementOption = Annotated[
     Path | None,
@@ -184,12 +176,8 @@ LawOption = Annotated[
     str | None,
     typer.Option(help=f"Installed here: {', '.join(plugins.names(plugins.LAWS))} (default: the cell's)."),
 ]
-PointSourceOption = Annotated[
-    str | None, typer.Option(help="Where points come from: triangulated or predicted.")
-]
-JacobianOption = Annotated[
-    str | None, typer.Option(help="current, desired, mean or fixed-depth, for laws in images.")
-]
+PointSourceOption = Annotated[str | None, typer.Option(help="Where points come from: triangulated or predicted.")]
+JacobianOption = Annotated[str | None, typer.Option(help="current, desired, mean or fixed-depth, for laws in images.")]
 CentreOption = Annotated[
     str | None,
     typer.Option(metavar="IDS", help="Markers whose middle moves on the line (default: all of the goal)."),
@@ -203,9 +191,7 @@ ProfileOption = Annotated[
 ]
 PostureOption = Annotated[
     int | None,
-    typer.Option(
-        metavar="N", help="End in the posture that `stereoservo ik` lists as number N (law trajectory)."
-    ),
+    typer.Option(metavar="N", help="End in the posture that `stereoservo ik` lists as number N (law trajectory)."),
 ]
 GainOption = Annotated[float | None, typer.Option(help="Gain [1/s].")]
 AdaptiveGainOption = Annotated[
@@ -407,8 +393,7 @@ def plan_table(plan: PlanReport) -> str:
     rows += [_row(approach) for approach in plan.approaches]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines += [
-        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
     return "\n".join(lines)
 

@@ -55,9 +55,7 @@ def home(
     cell: CellArgument,
     by_vision: Annotated[
         bool,
-        typer.Option(
-            "--by-vision", help="By the pictures of the home posture; tells by what each zero is off."
-        ),
+        typer.Option("--by-vision", help="By the pictures of the home posture; tells by what each zero is off."),
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="With --by-vision: only tell the zeros; nothing moves.")
@@ -73,13 +71,9 @@ def home(
     encoders read.
     """
     if check and not by_vision:
-        raise CommandError(
-            "usage", "--check goes with --by-vision; without pictures `home` has nothing to tell"
-        )
+        raise CommandError("usage", "--check goes with --by-vision; without pictures `home` has nothing to tell")
     if by_vision and endpoint is not None:
-        raise CommandError(
-            "usage", "--by-vision reads the cell's model: run it on the cell's host, without --endpoint"
-        )
+        raise CommandError("usage", "--by-vision reads the cell's model: run it on the cell's host, without --endpoint")
     arm = learnt_arm(cell, operator) if by_vision else None
     with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
         if arm is not None:
@@ -205,9 +199,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     at = readings + found.offset
     slack = arm.cell.safety.position_margin + AGREES * found.deviations
     low, high = arm.limits[:, 0] - slack, arm.limits[:, 1] + slack
-    turns = np.array(
-        [[0.0, 1.0, -1.0] if kind == "revolute" else [0.0] * 3 for kind in arm.model.joint_kinds]
-    )
+    turns = np.array([[0.0, 1.0, -1.0] if kind == "revolute" else [0.0] * 3 for kind in arm.model.joint_kinds])
     turned = at[:, None] + 2.0 * np.pi * turns
     inside = ((turned >= low[:, None]) & (turned <= high[:, None])).any(axis=1)
     return [

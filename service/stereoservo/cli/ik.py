@@ -87,11 +87,7 @@ def posture(cell: str, target: dict[str, Any], number: int, operator: str | None
     found = postures_of(arm, target)
     solutions = found.images.solutions
     if not 1 <= number <= len(solutions):
-        told = (
-            _why_none(arm, found)
-            if not solutions
-            else f"1 to {len(solutions)} are valid: see `stereoservo ik`"
-        )
+        told = _why_none(arm, found) if not solutions else f"1 to {len(solutions)} are valid: see `stereoservo ik`"
         raise CommandError("usage", f"--posture {number}: {told}")
     return dict(zip(arm.model.joint_names, solutions[number - 1].q.tolist(), strict=True))
 
@@ -155,15 +151,12 @@ def _images(arm: LearntArm, target: dict[str, Any]) -> tuple[FloatArray, FloatAr
         seen, stated = goal.target.set_points, goal.sigmas
     else:
         seen = {
-            camera: {int(k): tuple(v) for k, v in points.items()}
-            for camera, points in target["set_points"].items()
+            camera: {int(k): tuple(v) for k, v in points.items()} for camera, points in target["set_points"].items()
         }
     names = [camera.name for camera in model.cameras]
     unknown = sorted(set(seen) - set(names))
     if unknown:
-        raise CommandError(
-            "unknown_camera", f"the model has no camera {', '.join(unknown)}; it has {', '.join(names)}"
-        )
+        raise CommandError("unknown_camera", f"the model has no camera {', '.join(unknown)}; it has {', '.join(names)}")
     for c, name in enumerate(names):
         for m, marker in enumerate(model.marker_ids):
             if marker in seen.get(name, {}):
@@ -206,9 +199,7 @@ def _text(arm: LearntArm, found: Postures, rows: list[dict[str, Any]]) -> str:
     """The table for people."""
     answer = found.found
     how = f"{answer.case.replace('_', ' ')}, {'searched' if answer.case == 'numerical' else 'in closed form'}"
-    lines = [
-        f"{len(rows)} postures on model {arm.model.epoch} ({how}); {len(answer.beyond_limits)} beyond the limits"
-    ]
+    lines = [f"{len(rows)} postures on model {arm.model.epoch} ({how}); {len(answer.beyond_limits)} beyond the limits"]
     if not rows:
         return lines[0]
     names = arm.model.joint_names
@@ -233,9 +224,7 @@ def _way_text(row: dict[str, Any]) -> str:
         return "the arm is there"
     kinds = {"JOINT_LIMIT": "joint limits", "KEEP_OUT": "keep-outs", "FIELD_OF_VIEW": "the images' borders",
              "FACE_HIDDEN": "a face turned away", "BEHIND_CAMERA": "a camera's plane"}  # fmt: skip
-    near = [
-        f"{kinds[a.code]} {a.room:.3g} {a.unit} ({a.subject})" for a in row["approaches"] if a.code in kinds
-    ]
+    near = [f"{kinds[a.code]} {a.room:.3g} {a.unit} ({a.subject})" for a in row["approaches"] if a.code in kinds]
     return f"{row['seconds']:.1f} s from here; room on the way: " + ("; ".join(near) or "no limit is near")
 
 

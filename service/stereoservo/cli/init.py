@@ -34,9 +34,7 @@ def init(
     camera: Annotated[list[str] | None, typer.Option(help="Camera names (default: left, right).")] = None,
     option: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KEY=VALUE", help="An option of the joint driver, its value as in TOML; repeatable."
-        ),
+        typer.Option(metavar="KEY=VALUE", help="An option of the joint driver, its value as in TOML; repeatable."),
     ] = None,
     source: Annotated[
         str | None,
@@ -52,9 +50,7 @@ def init(
     """Write a cell file with every joint's limits and comments on what to set."""
     cell = name or file.stem
     if not CELL_NAME.fullmatch(cell):
-        raise CommandError(
-            "argument", f"cell name {cell!r}: letters, digits, '_' and '-' are valid, up to 64 (--name)"
-        )
+        raise CommandError("argument", f"cell name {cell!r}: letters, digits, '_' and '-' are valid, up to 64 (--name)")
     if file.exists() and not force:
         raise CommandError("exists", f"{file} exists already; --force writes over it")
     if source is not None:
@@ -80,9 +76,7 @@ def init(
         ) from error
     described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
         {},
-        DriverContext(
-            MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0]
-        ),
+        DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0]),
     ).describe()
     detector_name = detector if described.delivers == "frames" else ""
     sections = [CameraSection(name, camera_driver, detector_name) for name in cameras]
@@ -105,9 +99,7 @@ def _copy(source: str, file: Path, cell: str, contradicted: object) -> None:
     path = shipped_or_path(source)
     load_cell_file(path)
     text = path.read_text(encoding="utf-8")
-    renamed, count = re.subn(
-        r'(?m)^(\[cell\]\s*\n(?:[^\[\n]*\n)*?name\s*=\s*)"[^"]*"', rf'\g<1>"{cell}"', text
-    )
+    renamed, count = re.subn(r'(?m)^(\[cell\]\s*\n(?:[^\[\n]*\n)*?name\s*=\s*)"[^"]*"', rf'\g<1>"{cell}"', text)
     if count != 1:
         raise CommandError("file", f'{path}: no line name = "…" under [cell], which is changed in a copy')
     try:
@@ -128,9 +120,7 @@ def toml_options(given: list[str]) -> str:
         except tomllib.TOMLDecodeError:
             line = f"{key} = {json_text(value)}"
         if not found or not OPTION_KEY.fullmatch(key):
-            raise CommandError(
-                "argument", f"--option {Address(text)!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0"
-            )
+            raise CommandError("argument", f"--option {Address(text)!r}; KEY=VALUE is valid, e.g. port=/dev/ttyUSB0")
         lines.append(line)
     try:
         tomllib.loads("\n".join(lines))
@@ -215,9 +205,7 @@ def cell_text(
     base = base or joints.home or [_base(joint.position_min, joint.position_max) for joint in joints.joints]
     lines += [f"{joint.name} = {round(q, 4)!r}" for joint, q in zip(joints.joints, base, strict=True)]
     lines += ["", "# [calibration.range]           # state it where something stands in the way [rad or m]"]
-    lines += [
-        f"# {joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints
-    ]
+    lines += [f"# {joint.name} = {_range(joint.position_min, joint.position_max)!r}" for joint in joints.joints]
     return "\n".join(lines) + "\n"
 
 

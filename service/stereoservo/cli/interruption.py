@@ -59,9 +59,7 @@ def ending(seconds: float) -> Iterator[Ending]:
             os.write(STDERR, b"asked twice: ended at once\n")
             os._exit(EXIT_FORCED)
         found.asked = True
-        faulthandler.dump_traceback_later(
-            seconds, exit=True, file=STDERR
-        )  # needs neither this thread nor the GIL
+        faulthandler.dump_traceback_later(seconds, exit=True, file=STDERR)  # needs neither this thread nor the GIL
         found.wake()
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -19,9 +19,7 @@ EVERY_S = 0.1
 
 def jog(
     cell: CellArgument,
-    velocities: Annotated[
-        list[str], typer.Argument(metavar="JOINT=VELOCITY...", help="[rad/s] or [m/s] by joint.")
-    ],
+    velocities: Annotated[list[str], typer.Argument(metavar="JOINT=VELOCITY...", help="[rad/s] or [m/s] by joint.")],
     seconds: Annotated[float, typer.Option(help="For how long; Ctrl-C ends it sooner.", min=0.0)] = 1.0,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,

@@ -107,8 +107,6 @@ def cancel(
     with Client(cell, endpoint=endpoint, operator=operator) as client:
         goal_id = goal_id or client.status().goal
         if not goal_id:
-            raise CommandError(
-                "no_goal", f"no goal is active in cell {client.cell!r}: there is nothing to cancel"
-            )
+            raise CommandError("no_goal", f"no goal is active in cell {client.cell!r}: there is nothing to cancel")
         reply = client.cancel(goal_id)
     emit(reply, f"goal {goal_id}: {reply.message}", json)

@@ -77,11 +77,7 @@ def emit(result: Any, text: str, as_json: bool) -> None:
 
 def coloured(text: str, colour: str, stream: TextIO) -> str:
     """The text in bold and that colour where the stream is a terminal, unless ``NO_COLOR`` is set."""
-    return (
-        typer.style(text, fg=colour, bold=True)
-        if stream.isatty() and not os.environ.get("NO_COLOR")
-        else text
-    )
+    return typer.style(text, fg=colour, bold=True) if stream.isatty() and not os.environ.get("NO_COLOR") else text
 
 
 def note(message: str) -> None:
@@ -146,9 +142,7 @@ def marker_ids(text: str, what: str) -> list[int]:
     try:
         return [int(part) for part in text.split(",")]
     except ValueError as error:
-        raise CommandError(
-            "argument", f"{what} {text!r}: marker ids with commas, 10,11,12, are valid"
-        ) from error
+        raise CommandError("argument", f"{what} {text!r}: marker ids with commas, 10,11,12, are valid") from error
 
 
 def read_file(path: Path) -> bytes:

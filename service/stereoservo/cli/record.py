@@ -33,9 +33,7 @@ def record(
     seconds: Annotated[float, typer.Option(help="For how long (default: until Ctrl-C).", min=0.0)] = math.inf,
     images: Annotated[
         bool,
-        typer.Option(
-            "--images", help="With what the cameras deliver, without loss, in NAME.images beside it."
-        ),
+        typer.Option("--images", help="With what the cameras deliver, without loss, in NAME.images beside it."),
     ] = False,
     endpoint: EndpointOption = None,
     operator: OperatorOption = None,

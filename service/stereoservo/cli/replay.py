@@ -31,15 +31,12 @@ def replay(
             raise
         result, incomplete = error.result, str(error)
         if not error.cut:
-            raise CommandError(
-                "recording", f"{incomplete}: {_verdict(result)}", **_figures(result)
-            ) from error
+            raise CommandError("recording", f"{incomplete}: {_verdict(result)}", **_figures(result)) from error
     figures = _figures(result) | {"complete": not incomplete, "incomplete": incomplete}
     if result.identical is False:
         raise CommandError(
             "differs",
-            f"{file}: step {result.first_difference} differs, largest relative error "
-            f"{result.max_relative_error:.3g}",
+            f"{file}: step {result.first_difference} differs, largest relative error {result.max_relative_error:.3g}",
             **figures,
         )
     text = f"{result.steps} steps, {result.checkpoints} checkpoints, {result.gaps} gaps: {_verdict(result)}"

@@ -28,9 +28,7 @@ def run(
     record: Annotated[
         str, typer.Option("--record", metavar="FILE", help="Record the flight; 'auto' names the file itself.")
     ] = "",
-    seed: Annotated[
-        int, typer.Option("--seed", help="Seed for simulated drivers.", min=0, max=(1 << 63) - 1)
-    ] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed for simulated drivers.", min=0, max=(1 << 63) - 1)] = 0,
     json: JsonOption = False,
 ) -> None:
     """Run a cell until SIGTERM or Ctrl-C; either ends it with the arm stopped."""
@@ -44,9 +42,7 @@ def run(
     file = record if record in ("", "auto") else str(Path(record).absolute())
     if file not in ("", "auto") and Path(file).exists():
         raise CommandError("exists", f"{file} exists already; a recording is not written over")
-    ended_by = run_cell(
-        path, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready
-    )
+    ended_by = run_cell(path, seed=seed, dry_run=dry_run, commissioning=commissioning, record=file, on_ready=ready)
     if ended_by == signal.SIGINT:
         raise KeyboardInterrupt
     emit({"cell": str(path), "ended_by": signal.Signals(ended_by).name if ended_by else ""}, "", json)

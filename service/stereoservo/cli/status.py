@@ -98,9 +98,7 @@ def describe(state: StateMessage) -> str:
         f"  markers {_markers(state)}",
     ]
     if state.halt is not None:
-        lines.append(
-            f"  halt    {state.halt.words}, {time.strftime('%H:%M:%S', time.localtime(state.halt.t_wall))}"
-        )
+        lines.append(f"  halt    {state.halt.words}, {time.strftime('%H:%M:%S', time.localtime(state.halt.t_wall))}")
     lines += _health(state)
     if state.efforts or state.following_errors:
         lines.append("  loads   " + _loads(state))
@@ -109,8 +107,7 @@ def describe(state: StateMessage) -> str:
     if state.goal:
         progress_text = progress_words(state)
         lines.append(
-            f"  goal    {state.goal} ({state.law or 'joints'})"
-            + (f": {progress_text}" if progress_text else "")
+            f"  goal    {state.goal} ({state.law or 'joints'})" + (f": {progress_text}" if progress_text else "")
         )
     lines += [
         f"  {reason.level:7} {' '.join(filter(None, (reason.code, reason.subject)))}: {reason.hint}"
@@ -120,9 +117,7 @@ def describe(state: StateMessage) -> str:
         lines.append(f"  refine  {state.refinement.text}")
     lines += [f"  note    {text}" for text in state.notes]
     if state.refused_messages:
-        lines.append(
-            f"  refused {state.refused_messages} messages that could not be taken since the gateway's start"
-        )
+        lines.append(f"  refused {state.refused_messages} messages that could not be taken since the gateway's start")
     if not state.servo_alive:
         lines.append("  the servo process is silent")
     return "\n".join(lines)
@@ -132,9 +127,7 @@ def _joints(state: StateMessage) -> str:
     """Text: positions of the joints and their age, or that they are unknown."""
     if not state.joints:
         return f"unknown: {_silence('sample', state.joints_age_s)}"
-    positions = "  ".join(
-        f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items()
-    )
+    positions = "  ".join(f"{name} {value:+.4f} ({math.degrees(value):+.1f}°)" for name, value in state.joints.items())
     return positions + _age(state.joints_age_s)
 
 
@@ -195,9 +188,7 @@ def _loads(state: StateMessage) -> str:
     }
     if used:
         name = max(used, key=used.__getitem__)
-        words.append(
-            f"following {name} {state.following_errors[name]:+.2g} of {state.following_limits[name]:.2g}"
-        )
+        words.append(f"following {name} {state.following_errors[name]:+.2g} of {state.following_limits[name]:.2g}")
     if not state.effort_limits and not state.following_limits:
         words.append("(no contact is watched for: not learnt yet, or off)")
     return "  ".join(words)

@@ -22,9 +22,7 @@ NOT_TAKEN = (
 )
 
 
-def stop(
-    context: typer.Context, cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False
-) -> None:
+def stop(context: typer.Context, cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption = False) -> None:
     """Stop the arm: it brakes and holds until `resume`. Not an emergency stop; see docs/safety.md."""
     raised: RaisedStop | None = context.obj
     if raised is None:  # another host's cell, or one without a slot

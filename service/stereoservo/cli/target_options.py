@@ -55,9 +55,7 @@ def target_tree(
             "--follow or --file is needed",
         )
     if (relative_to or common or lines or planes) and not name:
-        raise CommandError(
-            "usage", "--relative-to, --common, --lines and --planes go with NAME, a taught goal"
-        )
+        raise CommandError("usage", "--relative-to, --common, --lines and --planes go with NAME, a taught goal")
     if name:
         tree: dict[str, Any] = {"kind": "taught", "name": name}
         if relative_to is not None:
@@ -92,9 +90,7 @@ def _id_groups(text: str, what: str, least: int, most: int) -> list[list[int]]:
         groups = []
     if not groups or any(not least <= len(group) <= most for group in groups):
         count, example = (
-            (f"{least}", "400-401,402-407")
-            if least == most
-            else (f"{least} or more", "400-401-406,402-403-408")
+            (f"{least}", "400-401,402-407") if least == most else (f"{least} or more", "400-401-406,402-403-408")
         )
         raise CommandError("argument", f"{what} {text!r}: groups of {count} ids are valid, {example} say")
     return groups
@@ -116,9 +112,7 @@ def adaptive(text: str) -> dict[str, float]:
     except ValueError:
         values = []
     if len(values) not in (2, 3):
-        raise CommandError(
-            "argument", f"--adaptive-gain {text!r}: NEAR:FAR or NEAR:FAR:SLOPE is valid, 4:0.8:30 say"
-        )
+        raise CommandError("argument", f"--adaptive-gain {text!r}: NEAR:FAR or NEAR:FAR:SLOPE is valid, 4:0.8:30 say")
     return dict(zip(("near", "far", "slope"), values, strict=False))
 
 
@@ -162,7 +156,5 @@ def _streamed(line: StreamLine, where: str) -> StreamedTarget:
     if line.set_points is not None:
         return FeatureTarget(line.set_points, line.model_epoch)
     if line.points is None or line.model_epoch is None:
-        raise CommandError(
-            "stream", f"{where}: points are in the frame of a model; model_epoch is needed with them"
-        )
+        raise CommandError("stream", f"{where}: points are in the frame of a model; model_epoch is needed with them")
     return PointTarget(line.points, line.model_epoch)

@@ -53,9 +53,7 @@ def teach(
     """Store what the cameras see now as a goal, with all other markers in view; or make one from drawings."""
     if drawing is not None:
         if tool is not None:
-            raise CommandError(
-                "usage", "--tool goes with what the cameras see; in a drawing, its tool is named"
-            )
+            raise CommandError("usage", "--tool goes with what the cameras see; in a drawing, its tool is named")
         request = read_drawing(drawing, name)
         with Client(cell, endpoint=endpoint, operator=operator) as client:
             reply = client.synthesise(request)

@@ -36,9 +36,7 @@ def web(
         typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell."),
     ] = None,
     port: Annotated[int, typer.Option(help="TCP port; 0: a free one.", min=0, max=65535)] = 8080,
-    address: Annotated[
-        str, typer.Option(help="Address to listen on; any but loopback needs --tls.")
-    ] = "127.0.0.1",
+    address: Annotated[str, typer.Option(help="Address to listen on; any but loopback needs --tls.")] = "127.0.0.1",
     tls: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address."),
@@ -65,9 +63,7 @@ def web(
     With --flight it plays a recording, and commands nothing.
     """
     if (cell is None) == (flight is None):
-        raise CommandError(
-            "usage", "one of CELL, a live cell, and --flight FILE, a recording, is to be given"
-        )
+        raise CommandError("usage", "one of CELL, a live cell, and --flight FILE, a recording, is to be given")
     if flight is not None and (operate is not None or endpoint is not None):
         raise CommandError("usage", "--flight shows a recording: --operate and --endpoint are of a live CELL")
     context = _tls_context(address, tls)
@@ -142,9 +138,7 @@ async def _serve(
         found = await server.start(address, port, context, names)
     except OSError as error:
         await asyncio.to_thread(server.link.close)
-        raise CommandError(
-            "listen", f"{address}:{port}: {error.strerror or error}; choose another --port"
-        ) from error
+        raise CommandError("listen", f"{address}:{port}: {error.strerror or error}; choose another --port") from error
     try:
         shown = f"[{address}]" if ":" in address else address
         url = f"{'http' if context is None else 'https'}://{shown}:{found}/"
@@ -173,7 +167,5 @@ def _tls_context(address: str, directory: Path | None) -> ssl.SSLContext | None:
     try:
         context.load_cert_chain(directory / "cert.pem", directory / "key.pem")
     except (OSError, ssl.SSLError) as error:
-        raise CommandError(
-            "tls", f"{directory}: cert.pem and key.pem, in PEM, are needed: {error}"
-        ) from error
+        raise CommandError("tls", f"{directory}: cert.pem and key.pem, in PEM, are needed: {error}") from error
     return context

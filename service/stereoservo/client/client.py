@@ -118,8 +118,7 @@ class Client(Connection):
         self.wait_state(lambda state: state.lifecycle in ("active", "fault"), "active", timeout_s)
         if self.status().lifecycle == "fault":
             raise ClientError(
-                "the joint driver failed while it was enabled: "
-                + "; ".join(r.hint for r in self.status().reasons)
+                "the joint driver failed while it was enabled: " + "; ".join(r.hint for r in self.status().reasons)
             )
 
     def disable(self) -> Reply:
@@ -207,9 +206,7 @@ class Client(Connection):
 
         Raises RefusedError.
         """
-        return self.request(
-            "goal", self.goal_key, encode(msgspec.structs.replace(goal, check=True)), GOAL_TIMEOUT_S
-        )
+        return self.request("goal", self.goal_key, encode(msgspec.structs.replace(goal, check=True)), GOAL_TIMEOUT_S)
 
     def send(self, goal: Goal) -> GoalHandle:
         """Send a goal made by the caller; returns once it was planned and accepted."""
@@ -315,9 +312,7 @@ class Client(Connection):
         ]
         if features:
             kinds.append((f"{self.keys.prefix}/features/*", FeaturesMessage, 256))
-        subscribers = [
-            (self._session.declare_subscriber(key, RingChannel(size)), kind) for key, kind, size in kinds
-        ]
+        subscribers = [(self._session.declare_subscriber(key, RingChannel(size)), kind) for key, kind, size in kinds]
         last_heard_s = time.monotonic()
         try:
             while True:

@@ -74,13 +74,9 @@ class EventWatch:
         try:
             boot = self._connection.status().boot
         except NoReplyError as error:
-            raise DaemonLostError(
-                f"the daemon of cell {self._connection.cell!r} no longer answers"
-            ) from error
+            raise DaemonLostError(f"the daemon of cell {self._connection.cell!r} no longer answers") from error
         if boot != self._boot:
-            raise DaemonLostError(
-                f"the gateway of cell {self._connection.cell!r} was started anew; ask for the state"
-            )
+            raise DaemonLostError(f"the gateway of cell {self._connection.cell!r} was started anew; ask for the state")
         self._alive = time.monotonic()
 
     def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:

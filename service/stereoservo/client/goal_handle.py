@@ -66,9 +66,7 @@ class Lease:
         self._id = goal_id
         self._ended = threading.Event()
         if lease_s is not None:
-            threading.Thread(
-                target=self._renew, args=(lease_s / 3.0,), name=f"lease {goal_id}", daemon=True
-            ).start()
+            threading.Thread(target=self._renew, args=(lease_s / 3.0,), name=f"lease {goal_id}", daemon=True).start()
 
     def _renew(self, every_s: float) -> None:
         while not self._ended.wait(every_s):
@@ -96,9 +94,7 @@ class GoalHandle:
         self._ended = False
         self._lease = Lease(connection, goal.id, goal.lease_s)
 
-    def wait(
-        self, timeout_s: float = 600.0, progress: Callable[[EventMessage], None] | None = None
-    ) -> GoalResult:
+    def wait(self, timeout_s: float = 600.0, progress: Callable[[EventMessage], None] | None = None) -> GoalResult:
         """Wait for its terminal event. ``progress`` is called with every event of it, as when the arm is held.
 
         Raises TimedOutError (the goal continues), DaemonLostError.

@@ -79,12 +79,8 @@ def client_config(endpoint: str, tls: Path | None = None) -> dict[str, Any]:
         }
         for path in files.values():
             if not path.is_file():
-                raise SessionError(
-                    f"{path}: no such file; a TLS directory holds ca.pem, cert.pem and key.pem"
-                )
-        config["transport"]["link"]["tls"] = {key: str(path) for key, path in files.items()} | {
-            "enable_mtls": True
-        }
+                raise SessionError(f"{path}: no such file; a TLS directory holds ca.pem, cert.pem and key.pem")
+        config["transport"]["link"]["tls"] = {key: str(path) for key, path in files.items()} | {"enable_mtls": True}
     return config | client_mode([endpoint])
 
 

@@ -145,9 +145,7 @@ def _translation(
         if abs(scale) > DEGENERATE_RATIO * norm(centre):
             scale_primitive(screw, H, 1.0 / scale)
             x, y, z, w = product(H, centre[0], centre[1], centre[2], centre[3])
-            found.amount[0] = (
-                displacement[0] * x + displacement[1] * y + displacement[2] * z + displacement[3] * w
-            )
+            found.amount[0] = displacement[0] * x + displacement[1] * y + displacement[2] * z + displacement[3] * w
             found.status[0] = MOVES
             return
     drop_primitive(screw, H)
@@ -278,9 +276,7 @@ def product(H: FloatArray, x: float, y: float, z: float, w: float) -> tuple[floa
 
 
 @kernel
-def transposed_product(
-    H: FloatArray, x: float, y: float, z: float, w: float
-) -> tuple[float, float, float, float]:
+def transposed_product(H: FloatArray, x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
     """``Hᵀ (x, y, z, w)ᵀ``."""
     return (
         H[0, 0] * x + H[1, 0] * y + H[2, 0] * z + H[3, 0] * w,

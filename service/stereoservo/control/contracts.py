@@ -157,12 +157,9 @@ class LawContract:
     def test_the_command_does_not_depend_on_the_projective_frame(self, cell: VirtualCell) -> None:
         options = Options(1.0, DT_S, damping=0.0)
         velocities = [
-            self.run(*self.problem(VirtualCell(frame, cell.q)), options).velocity
-            for frame in (cell.frame, np.eye(4))
+            self.run(*self.problem(VirtualCell(frame, cell.q)), options).velocity for frame in (cell.frame, np.eye(4))
         ]
-        np.testing.assert_allclose(
-            velocities[0], velocities[1], rtol=0, atol=1e-6 * np.abs(velocities[1]).max()
-        )
+        np.testing.assert_allclose(velocities[0], velocities[1], rtol=0, atol=1e-6 * np.abs(velocities[1]).max())
 
     def test_it_reduces_its_own_error(self, cell: VirtualCell) -> None:
         """Finite differences along the velocity: the error decreases; for a law without components, the error in the
@@ -178,9 +175,7 @@ class LawContract:
             assert np.abs(after).sum() < np.abs(step.error).sum()
             assert (np.abs(after) <= np.abs(step.error) + 1e-6).all()
         else:
-            gone = ((moved.pixels - task.set_points) ** 2).sum() - (
-                (scene.pixels - task.set_points) ** 2
-            ).sum()
+            gone = ((moved.pixels - task.set_points) ** 2).sum() - ((scene.pixels - task.set_points) ** 2).sum()
             assert gone < 0.0
 
     def test_it_rests_at_its_goal(self, cell: VirtualCell) -> None:
@@ -220,9 +215,7 @@ class LawContract:
     def _rates(scene: Scene, task: Task, velocity: FloatArray) -> tuple[float, float]:
         """Rotation rate [rad/s] of the body and speed of its centre in the frame's coordinates."""
         twist = np.tensordot(velocity, scene.operators, axes=1)
-        return float(np.sqrt(max(0.0, -0.5 * np.trace(twist @ twist)))), float(
-            np.linalg.norm(twist @ task.centre)
-        )
+        return float(np.sqrt(max(0.0, -0.5 * np.trace(twist @ twist)))), float(np.linalg.norm(twist @ task.centre))
 
     def test_a_goal_without_a_pose_moves_only_laws_that_need_none(self, cell: VirtualCell) -> None:
         scene, task = self.problem(cell, known=False)

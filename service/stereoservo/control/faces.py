@@ -84,9 +84,7 @@ def find_faces(
     centres = np.ascontiguousarray(camera_centres, dtype=np.float64)
     m = len(points)
     if points.shape != (m, 4) or seen.shape != (len(centres), m):
-        raise ValueError(
-            f"points {points.shape} and seen {seen.shape}; (m, 4) and ({len(centres)}, m) are needed"
-        )
+        raise ValueError(f"points {points.shape} and seen {seen.shape}; (m, 4) and ({len(centres)}, m) are needed")
     if not np.isfinite(points).all():
         raise ValueError("points must be finite; give the markers of the model, all of them")
     if not 0.0 < sigma_px < np.inf:
@@ -96,9 +94,7 @@ def find_faces(
     return select_faces(find_groups(points, given, sigma_px, turns, limit), points, centres, seen)
 
 
-def select_faces(
-    groups: MarkerGroups, points: FloatArray, camera_centres: FloatArray, seen: FloatArray
-) -> Faces:
+def select_faces(groups: MarkerGroups, points: FloatArray, camera_centres: FloatArray, seen: FloatArray) -> Faces:
     """The faces among the coplanar ``groups`` of a body at ``points`` (m, 4), of which the cameras see ``seen`` (c, m).
 
     Regular bodies have coplanar markers that are no face: chamfers, diagonals. Groups of four and more come first,
@@ -126,9 +122,7 @@ class Sights(NamedTuple):
     cameras: IntArray
 
 
-def sights_along(
-    faces: Faces, points: FloatArray, displacements: FloatArray, camera_centres: FloatArray
-) -> Sights:
+def sights_along(faces: Faces, points: FloatArray, displacements: FloatArray, camera_centres: FloatArray) -> Sights:
     """Which faces of the body at ``points`` (m, 4) the cameras see along its ``displacements`` (K, 4, 4).
 
     Samples without a lead, or with fewer cameras than a law needs, are sections that are controlled by kinematics
@@ -249,9 +243,7 @@ def seen_whole(starts: IntArray, members: IntArray, seen: FloatArray) -> IntArra
 
 
 @kernel
-def covering_groups(
-    starts: IntArray, members: IntArray, sides: IntArray, rank: IntArray, markers: int
-) -> IntArray:
+def covering_groups(starts: IntArray, members: IntArray, sides: IntArray, rank: IntArray, markers: int) -> IntArray:
     """Which groups, in the order of their ``rank`` (g,), are faces: those that add markers not in a previous one.
 
     First those of four and more with no marker on one side, then all others of four and more, if they add three new
@@ -577,6 +569,4 @@ def _choose_face(
     known_faces: Fields, shown: Fields, goal: Fields, camera_centres: FloatArray, before: Fields
 ) -> tuple[int, IntArray, int, FloatArray]:
     """`choose_face_step` for Python, with the fields of all records."""
-    return choose_face_step(
-        Faces(*known_faces), ShownBody(*shown), BodyGoal(*goal), camera_centres, Triangle(*before)
-    )
+    return choose_face_step(Faces(*known_faces), ShownBody(*shown), BodyGoal(*goal), camera_centres, Triangle(*before))

@@ -119,15 +119,11 @@ def predict(track: TargetTrack, t_s: float) -> tuple[FloatArray, FloatArray, Flo
     Later than ``gap_s`` after its last observation a marker stays at its position at that time, with rate 0: a silent
     client moves nothing.
     """
-    return predict_track(
-        track.positions, track.rates, track.stamps_s, track.tracked, t_s, track.settings.gap_s
-    )
+    return predict_track(track.positions, track.rates, track.stamps_s, track.tracked, t_s, track.settings.gap_s)
 
 
 @kernel
-def update_track(
-    track: Fields, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: Fields
-) -> bool:
+def update_track(track: Fields, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: Fields) -> bool:
     """Add one observation to a track's arrays; returns whether a marker jumped. See `observe`.
 
     ``track``: the fields of `TargetTrack` from ``positions`` to ``tracked``; ``constants``: those of `TrackSettings`.
@@ -188,9 +184,7 @@ def _given(pixels: FloatArray, wanted: FloatArray, c: int, p: int) -> bool:
 @kernel
 def _position_variance(covariance: FloatArray, c: int, p: int, dt: float, density: float) -> float:
     variance: float = (
-        covariance[c, p, 0]
-        + dt * (2.0 * covariance[c, p, 1] + dt * covariance[c, p, 2])
-        + density * dt * dt * dt / 3.0
+        covariance[c, p, 0] + dt * (2.0 * covariance[c, p, 1] + dt * covariance[c, p, 2]) + density * dt * dt * dt / 3.0
     )
     return variance
 

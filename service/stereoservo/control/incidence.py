@@ -171,9 +171,7 @@ def feature_form(
     heights = (points * plane_at_infinity).sum(axis=1)
     finite = np.abs(heights) > FINITE * sizes
     if not finite.any():
-        raise GeometryError(
-            "degenerate", f"{name}: the fixed {what} lies at infinity; one finite point is needed"
-        )
+        raise GeometryError("degenerate", f"{name}: the fixed {what} lies at infinity; one finite point is needed")
     first = int(finite.argmax())
     form = np.zeros((3, 4))
     form[0] = points[first] / heights[first]
@@ -325,14 +323,10 @@ def incidence_freedoms(
 
     Raises GeometryError as `mobility.mobility` does.
     """
-    E = body_frame(
-        scene.operators, scene.matrices, scene.points, plane_at_infinity, H_projective_to_euclidean
-    )
+    E = body_frame(scene.operators, scene.matrices, scene.points, plane_at_infinity, H_projective_to_euclidean)
     rigid = np.ascontiguousarray(rigid_motions(E))
     if anywhere:
-        scene = scene._replace(
-            operators=attainable_motions(E, scene.operators), composition=Composition.SIMULTANEOUS
-        )
+        scene = scene._replace(operators=attainable_motions(E, scene.operators), composition=Composition.SIMULTANEOUS)
     operators = np.concatenate([scene.operators, rigid])
     free = scene._replace(operators=operators, composition=Composition.SIMULTANEOUS)
     form = np.ascontiguousarray(invert4(E)[:3])
@@ -342,9 +336,7 @@ def incidence_freedoms(
     options = Options(1.0)
     found: list[Freedom | None] = []
     for k in range(len(task.kinds)):
-        alone = IncidenceTask(
-            task.kinds[k : k + 1], task.markers[k : k + 1], task.fixed[k : k + 1], task.tolerance_px
-        )
+        alone = IncidenceTask(task.kinds[k : k + 1], task.markers[k : k + 1], task.fixed[k : k + 1], task.tolerance_px)
         step = incidence_step(scene, alone, options)
         body = incidence_step(free, alone, options, metric=cost)
         # At a maximum of the error, or at its goal, the required motion is undetermined.

@@ -83,9 +83,7 @@ class LawRegistry(Mapping[str, Law]):
 
     def surest_first(self) -> tuple[str, ...]:
         """All names, ordered by how reliably a law arrives: on a straight line, by the goal's pose, by its pixels."""
-        return tuple(
-            sorted(self, key=lambda name: (self[name].path != "straight", not self[name].needs_pose))
-        )
+        return tuple(sorted(self, key=lambda name: (self[name].path != "straight", not self[name].needs_pose)))
 
     def sources(self) -> dict[str, str]:
         """Source of every law: its distribution with its version, and a hash of its source file."""
@@ -109,9 +107,7 @@ class LawRegistry(Mapping[str, Law]):
 
 def source_hash(law: Law) -> str:
     """Sixteen hexadecimal digits of the SHA-256 of the file that defines the law's step."""
-    return hashlib.sha256(pathlib.Path(inspect.getfile(inspect.unwrap(law.step))).read_bytes()).hexdigest()[
-        :16
-    ]
+    return hashlib.sha256(pathlib.Path(inspect.getfile(inspect.unwrap(law.step))).read_bytes()).hexdigest()[:16]
 
 
 def _checked(law: Any) -> Law:
@@ -122,9 +118,7 @@ def _checked(law: Any) -> Law:
     if unknown:
         raise ValueError(f"takes the option {unknown[0]!r}; there are: {', '.join(OPTIONS)}")
     if len(law.components) != len(law.units):
-        raise ValueError(
-            f"names {len(law.components)} components and {len(law.units)} units; each component needs one"
-        )
+        raise ValueError(f"names {len(law.components)} components and {len(law.units)} units; each component needs one")
     return law
 
 

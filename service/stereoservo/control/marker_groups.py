@@ -119,9 +119,7 @@ def find_groups(
     altitudes = triangle_altitudes(points, form, triples)
     order = np.argsort(-altitudes, kind="stable")
     order = order[altitudes[order] >= SPANS]
-    members, facts, roundness = coplanar_groups(
-        points, covariances, triples[order], altitudes[order], distances, limit
-    )
+    members, facts, roundness = coplanar_groups(points, covariances, triples[order], altitudes[order], distances, limit)
     eligible = np.flatnonzero((facts[:, 3] > 3) | (facts[:, 4:].min(axis=1, initial=m) == 0))
     if m > exhaustive:
         rank = np.lexsort((-roundness[eligible], -facts[eligible, 3]))

@@ -73,9 +73,7 @@ def body_frame(
     towards = multiply(flat.T, (centre - float((centre * plane_at_infinity).sum()) * middle)[:, None])[:, 0]
     size = _length(towards, Q)
     if not (size > 0.0 and radius > 1e-9 * size):
-        raise GeometryError(
-            "degenerate", "the body has no size, or a camera stands in its middle", radius=radius
-        )
+        raise GeometryError("degenerate", "the body has no size, or a camera stands in its middle", radius=radius)
     z = towards / size
     if float((P[2] * (flat * z).sum(axis=1)).sum()) * float(m[2]) > 0.0:
         z = -z
@@ -113,9 +111,7 @@ def _directions(plane_at_infinity: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.delete(reflection, k, axis=1))
 
 
-def _estimated_metric(
-    generators: FloatArray, matrices: FloatArray, middle: FloatArray, flat: FloatArray
-) -> FloatArray:
+def _estimated_metric(generators: FloatArray, matrices: FloatArray, middle: FloatArray, flat: FloatArray) -> FloatArray:
     """Scalar product ``Q`` (3, 3) of directions ``flat`` (4, 3), up to scale: ``RᵀQ + QR = 0`` for rotations ``R``."""
     rows = []
     for G in generators:
@@ -249,9 +245,7 @@ def mobility(
     _refuse_line(fields)
     rank, capacity, values, V, made = _drivable(E, operators, points, units)
     shares = _lengths(multiply(made.T, fields / _lengths(fields)))
-    missing = tuple(
-        Freedom(_describe(E, X, points, camera), X, 0.0) for X in _left_over(named, fields, made, rank)
-    )
+    missing = tuple(Freedom(_describe(E, X, points, camera), X, 0.0) for X in _left_over(named, fields, made, rank))
     block = joints_to_block(_motions(E, operators, points), units, capacity, WEAK) if n else np.zeros(0)
     J = image_jacobian(operators, matrices, points) * units
     pixels = _lengths(multiply(J.reshape(-1, n), V)) / np.sqrt(J.shape[0] * J.shape[1])

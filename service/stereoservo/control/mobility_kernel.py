@@ -114,10 +114,7 @@ def point_jacobian(operators: FloatArray, points: FloatArray, form: FloatArray) 
                 )
             for r in range(3):
                 rows[3 * p + r, j] = size * (
-                    form[r, 0] * moved[0]
-                    + form[r, 1] * moved[1]
-                    + form[r, 2] * moved[2]
-                    + form[r, 3] * moved[3]
+                    form[r, 0] * moved[0] + form[r, 1] * moved[1] + form[r, 2] * moved[2] + form[r, 3] * moved[3]
                 )
     return rows
 

@@ -86,9 +86,7 @@ def _closed_form(rate: float, amount: float) -> tuple[float, float]:
 
 
 @kernel
-def exponential_into(
-    G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray
-) -> None:
+def exponential_into(G: FloatArray, amount: float, square: FloatArray, cube: FloatArray, H: FloatArray) -> None:
     """Write ``exp(amount G)`` to ``H`` (4, 4): in closed form for a rotation or translation (4.27, 3.21), else by the
     series.
 
@@ -109,9 +107,7 @@ def exponential_into(
 
 
 @kernel
-def _exponential_pair_into(
-    screws: JointScrews, j: int, amount: float, H: FloatArray, inverse: FloatArray
-) -> None:
+def _exponential_pair_into(screws: JointScrews, j: int, amount: float, H: FloatArray, inverse: FloatArray) -> None:
     """Write ``exp(amount Ĥ_j)`` and its inverse to ``H`` and ``inverse``, (4, 4) each."""
     rate = screws.rates[j]
     if math.isnan(rate):
@@ -131,9 +127,7 @@ def _exponential_pair_into(
 
 
 @kernel
-def displacement_into(
-    screws: JointScrews, composition: int, step: FloatArray, H: FloatArray, work: FloatArray
-) -> None:
+def displacement_into(screws: JointScrews, composition: int, step: FloatArray, H: FloatArray, work: FloatArray) -> None:
     """Write the displacement by ``step`` to ``H`` (4, 4). ``work`` (5, 4, 4): scratch; its last (4, 4) contains the sum
     of operators that move simultaneously afterwards.
     """

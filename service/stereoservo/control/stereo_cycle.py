@@ -125,12 +125,7 @@ def _add_point(
         d = matrices[c, 2, 0] * m0 + matrices[c, 2, 1] * m1 + matrices[c, 2, 2] * m2 + matrices[c, 2, 3] * m3
         scale = 1.0 / d if d != 0.0 else math.nan
         for r in range(2):
-            x = (
-                matrices[c, r, 0] * m0
-                + matrices[c, r, 1] * m1
-                + matrices[c, r, 2] * m2
-                + matrices[c, r, 3] * m3
-            )
+            x = matrices[c, r, 0] * m0 + matrices[c, r, 1] * m1 + matrices[c, r, 2] * m2 + matrices[c, r, 3] * m3
             pixel = x * scale
             for i in range(4):
                 g[c, r, i] = share * (matrices[c, r, i] - pixel * matrices[c, 2, i]) * scale
@@ -143,30 +138,10 @@ def _add_point(
         y2 = E[nth, 2, 0] * z0 + E[nth, 2, 1] * z1 + E[nth, 2, 2] * z2 + E[nth, 2, 3] * z3
         y3 = E[nth, 3, 0] * z0 + E[nth, 3, 1] * z1 + E[nth, 3, 2] * z2 + E[nth, 3, 3] * z3
         z0, z1, z2, z3 = y0, y1, y2, y3
-        y0 = (
-            generators[j, 0, 0] * z0
-            + generators[j, 0, 1] * z1
-            + generators[j, 0, 2] * z2
-            + generators[j, 0, 3] * z3
-        )
-        y1 = (
-            generators[j, 1, 0] * z0
-            + generators[j, 1, 1] * z1
-            + generators[j, 1, 2] * z2
-            + generators[j, 1, 3] * z3
-        )
-        y2 = (
-            generators[j, 2, 0] * z0
-            + generators[j, 2, 1] * z1
-            + generators[j, 2, 2] * z2
-            + generators[j, 2, 3] * z3
-        )
-        y3 = (
-            generators[j, 3, 0] * z0
-            + generators[j, 3, 1] * z1
-            + generators[j, 3, 2] * z2
-            + generators[j, 3, 3] * z3
-        )
+        y0 = generators[j, 0, 0] * z0 + generators[j, 0, 1] * z1 + generators[j, 0, 2] * z2 + generators[j, 0, 3] * z3
+        y1 = generators[j, 1, 0] * z0 + generators[j, 1, 1] * z1 + generators[j, 1, 2] * z2 + generators[j, 1, 3] * z3
+        y2 = generators[j, 2, 0] * z0 + generators[j, 2, 1] * z1 + generators[j, 2, 2] * z2 + generators[j, 2, 3] * z3
+        y3 = generators[j, 3, 0] * z0 + generators[j, 3, 1] * z1 + generators[j, 3, 2] * z2 + generators[j, 3, 3] * z3
         v0 = B[nth, 0, 0] * y0 + B[nth, 0, 1] * y1 + B[nth, 0, 2] * y2 + B[nth, 0, 3] * y3
         v1 = B[nth, 1, 0] * y0 + B[nth, 1, 1] * y1 + B[nth, 1, 2] * y2 + B[nth, 1, 3] * y3
         v2 = B[nth, 2, 0] * y0 + B[nth, 2, 1] * y1 + B[nth, 2, 2] * y2 + B[nth, 2, 3] * y3

@@ -159,8 +159,7 @@ def packed_type(
     fields: list[Any] = [(name, np.dtype(kind)) for name, kind, *_ in numbers._fields_]
     fields += [(name, np.dtype(kind), (MAX_CAMERAS,)) for name, kind in parts.items()]
     fields += [
-        (name, others.get(name, np.float64), (math.prod(shape_of(shape, MOST)),))
-        for name, shape in arrays.items()
+        (name, others.get(name, np.float64), (math.prod(shape_of(shape, MOST)),)) for name, shape in arrays.items()
     ]
     return np.dtype(fields, align=True)
 

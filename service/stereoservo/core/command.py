@@ -50,9 +50,7 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
     feature_age_s = (work.now_ns - newest_ns) * 1e-9
     work.added = 0
     if work.compensates != 0:
-        looks = work.joints_found == TAKEN and (
-            work.needs_features == 0 or feature_age_s <= work.bounds[FRESH]
-        )
+        looks = work.joints_found == TAKEN and (work.needs_features == 0 or feature_age_s <= work.bounds[FRESH])
         work.added = int(add_friction(block, room, looks))
     if work.added == 0:
         raw[:] = velocity
@@ -276,14 +274,10 @@ class SafetyLimits:
                     f"keep-out {name!r}: every low must be below its high, got {boxes[k].tolist()}"
                 )
             if not np.isfinite(boxes[k]).any():
-                raise SafetyConfigurationError(
-                    f"keep-out {name!r} bounds no joint: the arm would have nowhere to be"
-                )
+                raise SafetyConfigurationError(f"keep-out {name!r} bounds no joint: the arm would have nowhere to be")
         for name in ("position_margin", "joint_timeout_s", "coast_s", "features_fresh_s"):
             if not getattr(self, name) >= 0.0:
-                raise SafetyConfigurationError(
-                    f"{name} is {getattr(self, name)}; zero or more is needed", name=name
-                )
+                raise SafetyConfigurationError(f"{name} is {getattr(self, name)}; zero or more is needed", name=name)
 
 
 class SafetyInputs(msgspec.Struct, frozen=True, eq=False):
@@ -373,9 +367,7 @@ def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
         (context.now_ns - block.numbers.last_joints_ns) * 1e-9, (context.now_ns - work.features_ns) * 1e-9,
         bool(work.needs_features), work.speed_scale, bool(work.paused),
     )  # fmt: skip
-    found = LimitsFound(
-        bool(work.finite), work.allowed_scale, work.scale, work.scaled_by, work.share, work.shared_by
-    )
+    found = LimitsFound(bool(work.finite), work.allowed_scale, work.scale, work.scaled_by, work.share, work.shared_by)
     return explained(inputs, limits, command, found, given["acted"])
 
 
@@ -447,9 +439,7 @@ def _stale(inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) ->
     return brake
 
 
-def _tell_non_finite(
-    raw: FloatArray, positions: FloatArray, limits: SafetyLimits, reasons: list[Reason]
-) -> None:
+def _tell_non_finite(raw: FloatArray, positions: FloatArray, limits: SafetyLimits, reasons: list[Reason]) -> None:
     for j, name in enumerate(limits.joint_names):
         for what, value in (("command", raw[j]), ("measured position", positions[j])):
             if not math.isfinite(value):
@@ -466,9 +456,7 @@ def _tell_non_finite(
                 )
 
 
-def _tell_positions(
-    acted: list[float], inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]
-) -> None:
+def _tell_positions(acted: list[float], inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) -> None:
     margin = limits.position_margin
     for j, code in enumerate(int(one) for one in acted):
         if not code:
@@ -583,9 +571,7 @@ def _position_caps(
         if best < 0:
             continue
         if best_above:
-            cap = -stoppable_speed(
-                behind[best] - (keep_outs[k, best, 1] + margin), acceleration_max[best], dt
-            )
+            cap = -stoppable_speed(behind[best] - (keep_outs[k, best, 1] + margin), acceleration_max[best], dt)
             if cap > low[best]:
                 low[best] = cap
                 low_by[best] = k
@@ -668,9 +654,7 @@ class LimitsFound(NamedTuple):
 
 
 @kernel
-def limit_velocity(
-    wanted: Wanted, by: Bounds, limited: FloatArray, acted: FloatArray
-) -> tuple[bool, LimitsFound]:
+def limit_velocity(wanted: Wanted, by: Bounds, limited: FloatArray, acted: FloatArray) -> tuple[bool, LimitsFound]:
     """Apply staleness, braking, velocity, position, keep-out and acceleration limits, in this order. Returns whether
     there is anything to report, and the `LimitsFound`.
 

@@ -135,8 +135,7 @@ class Numbers(ctypes.Structure):
     shared_by: int
     limited: int
     _fields_ = [
-        (name, ctypes.c_double if kind == "float" else ctypes.c_int64)
-        for name, kind in __annotations__.items()
+        (name, ctypes.c_double if kind == "float" else ctypes.c_int64) for name, kind in __annotations__.items()
     ]
 
 
@@ -342,12 +341,8 @@ class Workspace:
         self.velocity: FloatArray = given["velocity"]
         self.result: FloatArray = given["result"][: 1 + 3 * self._counts["joints"]]
         self.pixels: FloatArray = given["pixels"]
-        self.prediction = Prediction(
-            given["operators"], given["points"], given["predicted"], given["jacobian"]
-        )
-        self.of_frame = Prediction(
-            given["operators"], given["points"], given["predicted"][:1], given["jacobian"][:1]
-        )
+        self.prediction = Prediction(given["operators"], given["points"], given["predicted"], given["jacobian"])
+        self.of_frame = Prediction(given["operators"], given["points"], given["predicted"][:1], given["jacobian"][:1])
         self.frame_q: FloatArray = given["frame_q"]
         self.unseen_px: FloatArray = given["unseen_px"]
 
@@ -444,9 +439,7 @@ class StepContext:
     ``moved_arrays``: the model with the target body at its current pose.
     """
 
-    def __init__(
-        self, state: CoreState, settings: CoreSettings, derived: Derived, inputs: StepInputs
-    ) -> None:
+    def __init__(self, state: CoreState, settings: CoreSettings, derived: Derived, inputs: StepInputs) -> None:
         self.state, self.settings, self.derived = state, settings, derived
         self.events: list[Event] = []
         self.goals_read: list[str] = []

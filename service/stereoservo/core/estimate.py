@@ -185,9 +185,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     context.derived.room.limit_loads(loads)
     state.readiness = fitted_readiness(model)
     offsets = stated_offsets(model)
-    state.cameras = [
-        CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras
-    ]
+    state.cameras = [CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras]
     share_sights(state)
     state.block.numbers.round_due = 0
     for name in SETTLED_FRAMES:
@@ -633,9 +631,7 @@ def _compare(
 
 
 @kernel
-def _fold_in(
-    block: Record, room: Record, k: int, used: BoolArray, common: FloatArray
-) -> tuple[int, int, float]:
+def _fold_in(block: Record, room: Record, k: int, used: BoolArray, common: FloatArray) -> tuple[int, int, float]:
     """Update the filtered innovations by those of frame ``k``, each by its weight; rejected ones change nothing.
     Returns the numbers of accepted and rejected innovations, and the sum of squares of the accepted ones [px²].
 

@@ -107,9 +107,7 @@ def _advance(context: StepContext) -> None:
 
 def _not_acknowledged(source: AwaitingAcknowledgement, context: StepContext) -> None:
     hint = f"goal {source.id} was reached and not acknowledged in {source.acknowledge_s:g} s: is its client alive?"
-    reason = Reason(
-        "NOT_ACKNOWLEDGED", "hold", source.id, source.acknowledge_s, source.acknowledge_s, "s", hint
-    )
+    reason = Reason("NOT_ACKNOWLEDGED", "hold", source.id, source.acknowledge_s, source.acknowledge_s, "s", hint)
     context.state.source = Holding()
     context.emit("warning", id=source.id, message=hint, reasons=(reason,))
     cancel_queue(context, (reason,), hint)

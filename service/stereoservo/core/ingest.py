@@ -154,9 +154,7 @@ def take_sample(block: Record, room: Record, told: bool) -> bool:
             work.sample[: 4 * n].reshape((4, n)),
             (work.joints_ns - memory.last_joints_ns) * 1e-9,
         )
-        sound = _sound(
-            values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], work.active_before != 0
-        )
+        sound = _sound(values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], work.active_before != 0)
         if sound:
             memory.history_count = _append_sample(
                 Samples(memory.history_ns, kept), memory.history_count, work.joints_ns, values[0],
@@ -236,11 +234,7 @@ def _sound(
             and math.isfinite(values[3, j])
         ):
             return False
-    return not (
-        active
-        and count > 0
-        and _jumped(values[0], kept[(count - 1) % kept.shape[0]], velocity_max, elapsed_s)
-    )
+    return not (active and count > 0 and _jumped(values[0], kept[(count - 1) % kept.shape[0]], velocity_max, elapsed_s))
 
 
 # -- the driver -------------------------------------------------------------------------------------------------
@@ -301,11 +295,7 @@ def frame_timeout_s(settings: CoreSettings) -> float:
 def put_inputs(context: StepContext) -> None:
     """Write the step's inputs into the workspace."""
     inputs, room = context.inputs, context.derived.room
-    has_sent = (
-        inputs.sent is not None
-        and inputs.sent.shape == room.sent.shape
-        and bool(np.isfinite(inputs.sent).all())
-    )
+    has_sent = inputs.sent is not None and inputs.sent.shape == room.sent.shape and bool(np.isfinite(inputs.sent).all())
     if has_sent:
         room.sent[:] = inputs.sent
     frames = newest_frames(inputs) if inputs.observations else ()

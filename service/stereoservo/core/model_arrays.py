@@ -92,10 +92,7 @@ def _require_numbers(model: CellModel) -> None:
         ("scene points", model.scene_points, (scene, 4)),
         ("plane at infinity", model.plane_at_infinity, (4,)),
         *((f"a matrix of camera {camera.name}", camera.matrix, (3, 4)) for camera in model.cameras),
-        *(
-            (f"a lens of camera {camera.name}", camera.lens, (lens_size(model.cameras),))
-            for camera in model.cameras
-        ),
+        *((f"a lens of camera {camera.name}", camera.lens, (lens_size(model.cameras),)) for camera in model.cameras),
     ]
     if model.joint_accuracy is not None:
         errors = msgspec.structs.astuple(model.joint_accuracy)
@@ -140,9 +137,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
     """Kernel arrays of ``model``. Raises ValueError naming the part that does not fit the cell."""
     require_fitting(model, settings)
     by_name = {camera.name: camera for camera in model.cameras}
-    matrices = np.ascontiguousarray(
-        [by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64
-    )
+    matrices = np.ascontiguousarray([by_name[camera.name].matrix for camera in settings.cameras], dtype=np.float64)
     centres = np.array([camera_centre(P) for P in matrices])
     scene = np.ascontiguousarray(model.scene_points, dtype=np.float64).reshape(-1, 4)
     scene_pixels, _ = project_points(matrices, scene)
@@ -171,9 +166,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         groups=groups_of(model),
         sights=len(model.marker_ids) * len(matrices),
         joint_accuracy=accuracy,
-        joint_variances=np.zeros(len(model.zero))
-        if accuracy is None
-        else accuracy.stated**2 + accuracy.posture**2,
+        joint_variances=np.zeros(len(model.zero)) if accuracy is None else accuracy.stated**2 + accuracy.posture**2,
     )
 
 

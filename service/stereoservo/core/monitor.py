@@ -354,9 +354,7 @@ def _account_loads(sample: Loads, history: LoadHistory, situation: Situation, li
             high[0, j], high[1, j] = max(high[0, j], efforts[j]), max(high[1, j], following[j])
         effort_excess[:, j] = 0.0
         following_excess[:, j] = 0.0
-        mean[j] = (
-            efforts[j] if forgets else mean[j] + elapsed_s / (elapsed_s + REST_S) * (efforts[j] - mean[j])
-        )
+        mean[j] = efforts[j] if forgets else mean[j] + elapsed_s / (elapsed_s + REST_S) * (efforts[j] - mean[j])
     return beyond
 
 

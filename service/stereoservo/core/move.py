@@ -166,9 +166,7 @@ def goal_of(source: Source) -> str:
 def paused(state: CoreState) -> bool:
     """Whether the active source must wait: in hold, after a stop, and for a law while cameras are relocalized."""
     return (
-        state.held
-        or state.stopped
-        or (state.reanchoring is not None and MOTION_SOURCES[type(state.source)].runs_law)
+        state.held or state.stopped or (state.reanchoring is not None and MOTION_SOURCES[type(state.source)].runs_law)
     )
 
 

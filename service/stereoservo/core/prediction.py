@@ -375,9 +375,7 @@ def points_now(
     return triangulated(arrays, pixels, weights, points) if source == "triangulated" else points
 
 
-def triangulated(
-    arrays: ModelArrays, pixels: FloatArray, weights: FloatArray, predicted: FloatArray
-) -> FloatArray:
+def triangulated(arrays: ModelArrays, pixels: FloatArray, weights: FloatArray, predicted: FloatArray) -> FloatArray:
     """Marker points (m, 4) of unit height by triangulation; markers seen by fewer than two cameras as ``predicted``."""
     found, ok = triangulate(arrays.matrices, pixels, weights, 3)
     return np.where(ok[:, None], with_unit_height(found, arrays.plane_at_infinity), predicted)

@@ -178,8 +178,7 @@ def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, 
         return NO_HEALTH
     reanchoring = "" if state.reanchoring is None else state.reanchoring.phase
     facts = [
-        (s.chi2, s.rms_px, s.worst, s.worst_px, s.timing.product, s.timing.square)
-        for s in state.watching.sightings
+        (s.chi2, s.rms_px, s.worst, s.worst_px, s.timing.product, s.timing.square) for s in state.watching.sightings
     ]
     places = None if not any(state.mobile) else ["" if m is None else m.place for m in state.mobile]
     told = (model.epoch, diagnosis, masked, reanchoring, facts, places)
@@ -188,9 +187,7 @@ def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, 
     return derived.health[1]
 
 
-def _health_now(
-    context: StepContext, verdict: ModelDiagnosis, masked: tuple[int, ...], reanchoring: str
-) -> Health:
+def _health_now(context: StepContext, verdict: ModelDiagnosis, masked: tuple[int, ...], reanchoring: str) -> Health:
     state = context.state
     assert state.model is not None
     ids = (*state.model.marker_ids, *state.model.scene_ids)

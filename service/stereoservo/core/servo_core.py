@@ -216,9 +216,7 @@ class ServoCore:
         state.driver_request = ""
         self._prepare(context)
         put_inputs(context)
-        decides = bool(
-            self._attends or inputs.requests or inputs.stop or inputs.now_ns > self._lease_until_ns
-        )
+        decides = bool(self._attends or inputs.requests or inputs.stop or inputs.now_ns > self._lease_until_ns)
         if observe(context, decides=decides) or decides:
             self._decide(context)
         if context.ingested is NOTHING and not isinstance(state.source, BY_KERNELS):

@@ -281,9 +281,7 @@ def _limit_settings(cell: CellFile, joints: JointDriverDescription, speed_cap: f
         position_min=np.array([max(j.position_min, limits[j.name].min) for j in joints.joints]),
         position_max=np.array([min(j.position_max, limits[j.name].max) for j in joints.joints]),
         velocity_max=np.array([min(j.velocity_max, limits[j.name].velocity) for j in joints.joints]),
-        acceleration_max=np.array(
-            [min(j.acceleration_max, limits[j.name].acceleration) for j in joints.joints]
-        ),
+        acceleration_max=np.array([min(j.acceleration_max, limits[j.name].acceleration) for j in joints.joints]),
         position_margin=cell.safety.position_margin,
         keep_outs=np.array(
             [[k.ranges.get(name, (-np.inf, np.inf)) for name in names] for k in cell.safety.keep_out]
@@ -362,9 +360,7 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
         coarse = 2.0 * ARRIVAL_STEPS * joints.joints[spread_joint].resolution
         base, margin = section.base[spread.joint], cell.safety.position_margin + max(SLACK, coarse)
         room = min(limit.max - margin - base, base - limit.min - margin)
-        wanted = spread.range or section.range.get(
-            spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind]
-        )
+        wanted = spread.range or section.range.get(spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind])
         if spread.range is not None and spread.range > room:
             raise CellFileError(
                 cell.cell.name,

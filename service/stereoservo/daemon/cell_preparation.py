@@ -71,9 +71,7 @@ def describe_cell(
     }
     joint_context = DriverContext(**common, mount=cell.camera[0].mount)  # type: ignore[arg-type]
     with _named(cell_path, "joints.options"):
-        joint_driver = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(
-            cell.joints.options, joint_context
-        )
+        joint_driver = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)(cell.joints.options, joint_context)
         joints: JointDriverDescription = joint_driver.describe()
     if joints.auxiliary and not isinstance(joint_driver, AuxiliaryDriver):
         raise DriverError(
@@ -111,9 +109,7 @@ def make_plan(cell_path: Path, runtime: Path, state: Path, options: PlanOptions)
     except CellFileError as error:  # without the cell file's path
         if error.path == str(cell_path):
             raise
-        raise CellFileError(
-            cell_path, error.key, str(error).partition(f"{error.key}: ")[2] or str(error)
-        ) from error
+        raise CellFileError(cell_path, error.key, str(error).partition(f"{error.key}: ")[2] or str(error)) from error
     return plan
 
 

@@ -77,9 +77,7 @@ class RunPlan(msgspec.Struct, frozen=True):
     def settings(self) -> CoreSettings:
         """The core's settings. Raises CellFileError where cell file and drivers contradict each other."""
         cap = COMMISSIONING_SPEED if self.commissioning else 1.0
-        return core_settings(
-            self.cell, self.joints, self.cameras, speed_cap=cap, watch_following=not self.dry_run
-        )
+        return core_settings(self.cell, self.joints, self.cameras, speed_cap=cap, watch_following=not self.dry_run)
 
 
 class Received(msgspec.Struct, frozen=True, tag="received"):
@@ -130,9 +128,7 @@ class ServoState(msgspec.Struct, frozen=True, eq=False):
     """Stamp of the shutter of each camera's newest frame, but of none of the future."""
 
 
-def newest_stamps(
-    inputs: StepInputs, joints_ns: int, frames_ns: dict[str, int]
-) -> tuple[int, dict[str, int]]:
+def newest_stamps(inputs: StepInputs, joints_ns: int, frames_ns: dict[str, int]) -> tuple[int, dict[str, int]]:
     """Stamps of the newest joint sample and of each camera's newest frame [ns], given those before this step.
 
     A stamp of the future tells no age.
@@ -224,9 +220,7 @@ def _apart(data: bytes, head: struct.Struct, words: int) -> tuple[str, int, tupl
     length, k, *stamps = head.unpack_from(data)
     at = head.size + length + -length % 8
     if len(data) != at + 8 * words * k:
-        raise ValueError(
-            f"{len(data)} bytes; {k} markers and a name of {length} bytes have {at + 8 * words * k}"
-        )
+        raise ValueError(f"{len(data)} bytes; {k} markers and a name of {length} bytes have {at + 8 * words * k}")
     return data[head.size : head.size + length].decode(), k, tuple(stamps), bytearray(data[at:])
 
 

@@ -116,9 +116,7 @@ def warm_up_first() -> None:
     for step, request in enumerate((jog, jog, jog, move, move), 1):
         inputs = _inputs(step, pixels, model)
         core.step(
-            msgspec.structs.replace(
-                inputs, model_update=None, requests=(request,), driver_active=True, compiling=True
-            )
+            msgspec.structs.replace(inputs, model_update=None, requests=(request,), driver_active=True, compiling=True)
         )
     rows_of(*(np.zeros(0, np.int64),) * 3)  # at the stops of trials, with the joints there
     joints_at(core.state.history, 0)
@@ -167,8 +165,7 @@ def _warm_up_goals() -> None:
         target = FeatureTarget(
             {
                 name: {
-                    marker: (float(u) + 3.0, float(v) - 2.0)
-                    for marker, (u, v) in zip(MARKERS, pixels[c], strict=True)
+                    marker: (float(u) + 3.0, float(v) - 2.0) for marker, (u, v) in zip(MARKERS, pixels[c], strict=True)
                 }
                 for c, name in enumerate(CAMERAS)
             }
@@ -228,9 +225,7 @@ def _warm_up_following(mount: Mount) -> None:
     others = model.marker_points + np.array([0.15, 0.1, 0.1, 0.0])
     ids = MARKERS if mount == "eye_in_hand" else OTHERS
     shown = {name: _by_marker(OTHERS, seen) for name, seen in zip(CAMERAS, _seen(model, others), strict=True)}
-    wanted = {
-        name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, _example_pixels(model), strict=True)
-    }
+    wanted = {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, _example_pixels(model), strict=True)}
     at = tuple(float(height) for height in model.marker_points[0])
     corner = IncidenceSpec(
         "point-on-point", Feature(markers=(MARKERS[0],)), Feature(points=((at[0], at[1], at[2], at[3]),))
@@ -277,9 +272,7 @@ def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
 def _inputs(step: int, pixels: FloatArray, model: CellModel, ids: tuple[int, ...] = MARKERS) -> StepInputs:
     """Inputs of a step: the arm at rest, a frame (c, m, 2) of every camera, the model in the second step."""
     now_ns = 1_000_000_000 + step * PERIOD_NS
-    frames = tuple(
-        _observation(name, ids, seen, step, now_ns) for name, seen in zip(CAMERAS, pixels, strict=True)
-    )
+    frames = tuple(_observation(name, ids, seen, step, now_ns) for name, seen in zip(CAMERAS, pixels, strict=True))
     return StepInputs(
         now_ns=now_ns,
         period_ns=PERIOD_NS,
@@ -289,9 +282,7 @@ def _inputs(step: int, pixels: FloatArray, model: CellModel, ids: tuple[int, ...
     )
 
 
-def _observation(
-    camera: str, ids: tuple[int, ...], pixels: FloatArray, step: int, now_ns: int
-) -> CameraObservation:
+def _observation(camera: str, ids: tuple[int, ...], pixels: FloatArray, step: int, now_ns: int) -> CameraObservation:
     covariances = np.tile(0.01 * np.eye(2), (len(ids), 1, 1))
     shutter_ns = now_ns - PERIOD_NS // 2
     return CameraObservation(camera, step, shutter_ns, now_ns, np.array(ids), pixels.copy(), covariances)
@@ -315,9 +306,7 @@ def _project(matrix: FloatArray, points: FloatArray) -> FloatArray:
 
 def example_model() -> CellModel:
     axes = np.array([(0, 0, 1), (0, 1, 0), (0, 1, 0), (1, 0, 0), (0, 1, 0), (1, 0, 0)], dtype=float)
-    feet = np.array(
-        [(-0.8, 0, 1.6), (-0.7, 0, 1.5), (-0.4, 0, 1.5), (-0.2, 0, 1.4), (-0.1, 0, 1.3), (0, 0.05, 1.25)]
-    )
+    feet = np.array([(-0.8, 0, 1.6), (-0.7, 0, 1.5), (-0.4, 0, 1.5), (-0.2, 0, 1.4), (-0.1, 0, 1.3), (0, 0.05, 1.25)])
     generators = np.zeros((6, 4, 4))
     for generator, (x, y, z), foot in zip(generators, axes, feet, strict=True):
         generator[:3, :3] = [(0, -z, y), (z, 0, -x), (-y, x, 0)]
@@ -365,9 +354,7 @@ def example_settings() -> CoreSettings:
         cameras=tuple(
             CameraSettings(name, WIDTH, HEIGHT, 30.0, "eye_to_hand", MARKERS, mobile=True) for name in CAMERAS
         ),
-        limits=LimitSettings(
-            -2 * ones, 2 * ones, ones, 4 * ones, 0.01, np.zeros((0, 6, 2)), (), 0.5, 0.1, 1.0
-        ),
+        limits=LimitSettings(-2 * ones, 2 * ones, ones, 4 * ones, 0.01, np.zeros((0, 6, 2)), (), 0.5, 0.1, 1.0),
         trials=None,
         home=None,
         rate_hz=250.0,
@@ -471,9 +458,7 @@ def compiled() -> tuple[Overload, ...] | None:
 
 def _cached_overloads() -> tuple[Overload, ...] | None:
     try:
-        record = _Compiled(
-            *pickle.loads(_record_path().read_bytes())
-        )  # in numba's cache, which is read likewise
+        record = _Compiled(*pickle.loads(_record_path().read_bytes()))  # in numba's cache, which is read likewise
     except Exception:  # not there, or damaged: whatever unpickling raises
         return None
     if record.machine != _machine():
@@ -636,9 +621,7 @@ def warm_up_laws(*, own: bool = True) -> None:
             continue
         try:
             law.step(scene, task, Options(1.0, 0.004, rotation_rate=1e-3, translation_rate=1e-3))
-        except (
-            Exception
-        ) as error:  # a third party's law that cannot step: listed with its error, the others continue
+        except Exception as error:  # a third party's law that cannot step: listed with its error, the others continue
             LAWS.disable(name, f"its step raised {type(error).__name__}: {error}")
 
 

@@ -269,9 +269,7 @@ class LockstepCell:
         self.core = ServoCore(self.settings)
         self.links: LockstepLinks = MemoryLinks(recording) if links is None else links
         self.links.run_cameras = self._run_cameras
-        self.servo = ServoProcess(
-            self.core, self.joints, self.links, self.clock, rate_hz=self.settings.rate_hz
-        )
+        self.servo = ServoProcess(self.core, self.joints, self.links, self.clock, rate_hz=self.settings.rate_hz)
         self._pacing = ClockPacing(self.period_ns, now=self.clock.now_ns, sleep=self.clock.sleep)
         self.servo.configure()
         self._loops = [self._open_camera(c) for c in range(len(self.cameras))]
@@ -298,9 +296,7 @@ class LockstepCell:
 
     def _open_camera(self, c: int) -> _ScheduledCamera:
         description = self.descriptions[c]
-        pipeline = CameraPipeline(
-            self.cameras[c], self.detectors[c], self.links.vision(description.name), self.clock
-        )
+        pipeline = CameraPipeline(self.cameras[c], self.detectors[c], self.links.vision(description.name), self.clock)
         loop = _ScheduledCamera(
             pipeline, lambda kind, message: self.reports.append((kind, message)), self.clock,
             camera=description.name, poll_s=min(poll_interval_s(description.rate_hz), self.period_ns * 1e-9),
@@ -334,9 +330,7 @@ class LockstepCell:
         since = self.events[-1].seq if self.events else 0
         self.request(command, operator)
         number = self._request_number
-        return self.wait_for(
-            lambda event: event.kind == "reply" and event.request == number, REPLY_TIMEOUT_S, since
-        )
+        return self.wait_for(lambda event: event.kind == "reply" and event.request == number, REPLY_TIMEOUT_S, since)
 
     def request(self, command: Command, operator: str = "lockstep") -> None:
         """Send a command without waiting for its reply."""

@@ -65,9 +65,7 @@ class PlantProcess:
         self._beat = beat
         self.session = clock.now_ns()
         joints = len(self._description.joints)
-        self._done = Orders(
-            self.session, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan)
-        )
+        self._done = Orders(self.session, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan))
         """The newest orders that were obeyed."""
         self._values = np.zeros((4, joints))
         self._remarks = Remarks()
@@ -107,8 +105,7 @@ class PlantProcess:
         return (
             orders.velocity_number != done.velocity_number  # nothing else is new
             and (orders.call, orders.stops) == (done.call, done.stops)
-            and (orders.auxiliary_number, orders.auxiliary_stops)
-            == (done.auxiliary_number, done.auxiliary_stops)
+            and (orders.auxiliary_number, orders.auxiliary_stops) == (done.auxiliary_number, done.auxiliary_stops)
             and not (orders.velocities.any() or done.velocities.any())
             and 0 <= self._clock.now_ns() - self._ordered_ns < self._repeat_ns
         )

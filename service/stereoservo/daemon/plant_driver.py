@@ -74,9 +74,7 @@ class Orders(msgspec.Struct, eq=False):
         """From a record for so many joints."""
         session, call, active, stops, velocity, auxiliary, halts = _ORDERS.unpack_from(record)
         values = np.frombuffer(record, dtype=np.float64, offset=_ORDERS.size)
-        return cls(
-            session, call, bool(active), stops, velocity, auxiliary, halts, values[:joints], values[joints:]
-        )
+        return cls(session, call, bool(active), stops, velocity, auxiliary, halts, values[:joints], values[joints:])
 
 
 class Remarks(msgspec.Struct, frozen=True, array_like=True):
@@ -153,9 +151,7 @@ class PlantDriver:
         self._writer = SlotWriter(directories.plant_orders_slot, PLANT_CAPACITY, PLANT_ORDERS_LAYOUT)
         joints = len(description.joints)
         first = clock.now_ns()  # so that no number is one that a servo process before this one has used
-        self._orders = Orders(
-            0, first, False, first, 0, 0, first, np.zeros(joints), np.full(len(self._names), np.nan)
-        )
+        self._orders = Orders(0, first, False, first, 0, 0, first, np.zeros(joints), np.full(len(self._names), np.nan))
         self._zeros = np.zeros(joints)
         self._state: PlantState | None = None
         self._failures = 0
@@ -287,9 +283,7 @@ class PlantDriver:
 
     def stop_auxiliary(self) -> None:
         """Order auxiliary joints to stand where they are. Never raises."""
-        self._send(
-            auxiliary_stops=self._orders.auxiliary_stops + 1, auxiliary=np.full(len(self._names), np.nan)
-        )
+        self._send(auxiliary_stops=self._orders.auxiliary_stops + 1, auxiliary=np.full(len(self._names), np.nan))
 
     # -- records --------------------------------------------------------------------------------------------
 

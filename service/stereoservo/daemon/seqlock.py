@@ -21,9 +21,7 @@ from typing import Self
 
 _MAGIC = 0x53_53_4C_4F_54_31  # "SSLOT1"
 _HEADER_BYTES = 64
-_MAGIC_WORD, _LAYOUT_WORD, _CAPACITY_WORD, _PID_WORD, _EPOCH_WORD, _SEQUENCE_WORD, _LENGTH_WORD, _CRC_WORD = (
-    range(8)
-)
+_MAGIC_WORD, _LAYOUT_WORD, _CAPACITY_WORD, _PID_WORD, _EPOCH_WORD, _SEQUENCE_WORD, _LENGTH_WORD, _CRC_WORD = range(8)
 
 _STATE = struct.Struct("@3Q")  # native: whole words, as the memory views write them
 """Sequence number, length and CRC of a record, which lie one behind the other from `_STATE_AT` on."""
@@ -148,9 +146,7 @@ class SlotWriter:
         except BlockingIOError as error:
             pid = self._mapping.words[_PID_WORD]
             self._mapping.close()
-            raise SlotError(
-                path, "busy", f"already written by process {pid}; a slot has one writer"
-            ) from error
+            raise SlotError(path, "busy", f"already written by process {pid}; a slot has one writer") from error
         words = self._mapping.words
         sequence = words[_SEQUENCE_WORD] + (words[_SEQUENCE_WORD] & 1)  # a crash may have left it odd
         self._sequence = sequence if sequence < _LARGEST_WORD // 2 else 0  # else damaged: it must still grow
@@ -161,9 +157,7 @@ class SlotWriter:
         """Replace the record. Raises SlotError where it is longer than the capacity."""
         length = len(record)
         if length > self._capacity:
-            raise SlotError(
-                self._path, "too_large", f"record of {length} bytes; the slot holds up to {self._capacity}"
-            )
+            raise SlotError(self._path, "too_large", f"record of {length} bytes; the slot holds up to {self._capacity}")
         self._sequence = sequence = self._sequence + 2
         self._words[_SEQUENCE_WORD] = sequence - 1
         self._bytes[_HEADER_BYTES : _HEADER_BYTES + length] = record

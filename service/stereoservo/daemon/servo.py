@@ -177,9 +177,7 @@ class ServoProcess:
         if self._auxiliary is None or self._dry_run:
             return
         for request in inputs.requests:
-            if (
-                not isinstance(request.command, OrderAuxiliary) or not self._active
-            ):  # a failed driver is stopped
+            if not isinstance(request.command, OrderAuxiliary) or not self._active:  # a failed driver is stopped
                 continue
             if any(event.request == request.request and event.accepted for event in outputs.events):
                 try:
@@ -347,9 +345,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
     """Run until terminated; the drives are stopped in any case."""
     directories = plan.directories
     clock = MonotonicClock()
-    hardware = hardware_lock_path(
-        directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options
-    )
+    hardware = hardware_lock_path(directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options)
     locks = [FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}")]
     if hardware is not None:
         locks.append(ChannelLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
@@ -364,9 +360,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
     else:
         warm_up_first()
     core = ServoCore(plan.settings())
-    driver = (
-        PlantDriver(plan.joints, directories, clock) if plan.joints.simulated else make_driver(plan, clock)
-    )
+    driver = PlantDriver(plan.joints, directories, clock) if plan.joints.simulated else make_driver(plan, clock)
     rate_hz = plan.cell.servo.rate_hz
     links = ProcessLinks(directories, tuple(camera.name for camera in plan.cell.camera))
     heartbeat = HeartbeatWriter(directories.heartbeat_slot("servo"))
@@ -405,9 +399,7 @@ def main() -> int:
     runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
     die_with_parent(parent, signal.SIGTERM)
     termination = Termination()
-    tell_progress(
-        runtime, "servo", parent
-    )  # of what no other process has compiled: where no cache can be written
+    tell_progress(runtime, "servo", parent)  # of what no other process has compiled: where no cache can be written
     try:
         run(load_plan(runtime), termination)
     except DriverError as error:

@@ -54,9 +54,7 @@ class ProcessLinks:
     def __init__(self, directories: CellDirectories, cameras: tuple[str, ...]) -> None:
         self._stop = StopSlot(directories.stop_slot)
         slots = [directories.observation_slot(name) for name in cameras]
-        self._observations = [
-            (SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name)) for slot in slots
-        ]
+        self._observations = [(SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name)) for slot in slots]
         self._gateway_boundary = RecordBoundary("messages of the gateway")
         self._priors = {
             name: SlotWriter(directories.prior_slot(name), PRIOR_CAPACITY, PRIOR_LAYOUT) for name in cameras

@@ -187,8 +187,7 @@ class Supervisor:
             for child in (*self.plant, self.servo, self.gateway):
                 if child.process is not None and (code := child.process.poll()) is not None:
                     raise StartError(
-                        f"the {child.name} process ended at its start (exit code {code}); its message "
-                        f"is above"
+                        f"the {child.name} process ended at its start (exit code {code}); its message is above"
                     )
             if wait.is_over(read_progress(self.plan.directories.runtime)):
                 raise StartError(
@@ -228,9 +227,7 @@ class Supervisor:
         child.process = None
         child.hung = ""
         child.restarts += 1
-        child.pause_s = (
-            FIRST_PAUSE_S if now - child.started > STEADY_S else min(2 * child.pause_s, LONGEST_PAUSE_S)
-        )
+        child.pause_s = FIRST_PAUSE_S if now - child.started > STEADY_S else min(2 * child.pause_s, LONGEST_PAUSE_S)
         child.due = now + child.pause_s
         self._reporter.report(kind, f"{child.name} {how}; starting again in {child.pause_s:g} s")
 
@@ -270,9 +267,7 @@ def _spawn(arguments: list[str]) -> subprocess.Popen[bytes]:
 
 
 def _end(children: list[Child], grace_s: float) -> None:
-    running = [
-        child.process for child in children if child.process is not None and child.process.poll() is None
-    ]
+    running = [child.process for child in children if child.process is not None and child.process.poll() is None]
     for process in running:
         process.terminate()
     until = time.monotonic() + grace_s

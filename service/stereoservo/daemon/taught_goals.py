@@ -153,9 +153,7 @@ def _pixels(event: Event) -> dict[str, dict[int, Pixel]]:
     }
 
 
-def _some(
-    pixels: dict[str, dict[int, Pixel]], body: tuple[int, ...], *, of_body: bool
-) -> dict[str, dict[int, Pixel]]:
+def _some(pixels: dict[str, dict[int, Pixel]], body: tuple[int, ...], *, of_body: bool) -> dict[str, dict[int, Pixel]]:
     """Pixels of the body's markers, or of the others; cameras without any are left out."""
     kept = {
         camera: {marker: pixel for marker, pixel in points.items() if (marker in body) == of_body}
@@ -182,10 +180,7 @@ def load_taught(path: Path, model_of: ModelOf = lambda _: None) -> dict[str, Tau
             _check_shapes(path, name, goal.model)
         verify_checksum(data)
         if found.schema == 1:
-            return {
-                name: migrated(goal, model_of(goal.target.model_epoch or 0))
-                for name, goal in found.goals.items()
-            }
+            return {name: migrated(goal, model_of(goal.target.model_epoch or 0)) for name, goal in found.goals.items()}
         return dict(found.goals)
 
 
@@ -213,9 +208,7 @@ def _check_shapes(path: Path, name: str, model: TaughtModel | None) -> None:
         sizes += [(f"{camera.name}.matrix", camera.matrix, 12), (f"{camera.name}.lens", camera.lens, lens)]
     for what, values, size in sizes:
         if len(values) != size:
-            raise TaughtFileError(
-                path, f"goals.{name}.model: {what} has {len(values)} numbers; {size} are needed"
-            )
+            raise TaughtFileError(path, f"goals.{name}.model: {what} has {len(values)} numbers; {size} are needed")
 
 
 def save_taught(path: Path, goals: dict[str, TaughtGoal]) -> None:

@@ -74,9 +74,7 @@ class VisionSlots:
     """`VisionLinks` of a vision process: slots in shared memory. Raises SlotError where another process writes."""
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
-        self._observations = SlotWriter(
-            directories.observation_slot(camera), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT
-        )
+        self._observations = SlotWriter(directories.observation_slot(camera), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
         self._priors = SlotReader(directories.prior_slot(camera), PRIOR_LAYOUT)
         self._boundary = RecordBoundary(directories.prior_slot(camera).name, partial(write_log, "vision"))
         self._prior: Prior | None = None
@@ -290,11 +288,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     section = next(section for section in plan.cell.camera if section.name == camera)
     description = next(description for description in plan.cameras if description.name == camera)
     path = hardware_lock_path(directories.runtime.parent, section.driver, section.options)
-    lock = (
-        ChannelLock(path, f"camera driver {section.driver!r} with these options")
-        if path is not None
-        else None
-    )
+    lock = ChannelLock(path, f"camera driver {section.driver!r} with these options") if path is not None else None
     driver, detector = make_camera(section, plan.driver_context(clock, section))
     reporter = Reporter(directories.reports_socket, f"vision-{camera}", clock)
     images: ImageRecorder | None = None
@@ -340,9 +334,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
 def main() -> int:
     """Entry of the process."""
     runtime, parent, camera = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
-    die_with_parent(
-        parent, signal.SIGKILL
-    )  # nothing to put in order here, and a hung driver must not survive
+    die_with_parent(parent, signal.SIGKILL)  # nothing to put in order here, and a hung driver must not survive
     termination = Termination()
     try:
         run(load_plan(runtime), camera, termination)

@@ -84,9 +84,7 @@ class CalibrationJobs:
             return
         (goal_id, what), self._handed = self._handed, None
         if epoch > what.epoch:
-            self._failed(
-                goal_id, f"model epoch {epoch} came before epoch {what.epoch} was used: calibrate again"
-            )
+            self._failed(goal_id, f"model epoch {epoch} came before epoch {what.epoch} was used: calibrate again")
             return
         self.notes = ()
         self._report_applied(goal_id, what)
@@ -186,9 +184,7 @@ class CalibrationJobs:
     def _decide(self, fit: FitJob) -> None:
         try:
             model, verdict, seconds = fit.model()
-            result = calibration_result(
-                model, fit.model_path, verdict, fit.report_path, fit.trials_path, seconds
-            )
+            result = calibration_result(model, fit.model_path, verdict, fit.report_path, fit.trials_path, seconds)
         except (FitFailedError, ModelFileError) as error:
             code = getattr(error, "code", "")
             kept = f"The trial data are kept in {fit.trials_path}, a report is in {fit.report_path}"
@@ -196,9 +192,7 @@ class CalibrationJobs:
             return
         self._send_to_core(model, self._fit_id, result, fit.model_path)
 
-    def _send_to_core(
-        self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path
-    ) -> None:
+    def _send_to_core(self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path) -> None:
         """Send a model to the core, which applies it once the arm is at rest; ``what`` is reported then."""
         if not self._link.send_model(model):
             self._failed(goal_id, f"the servo process does not take the model; it is saved as {path}")

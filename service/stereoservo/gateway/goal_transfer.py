@@ -88,9 +88,7 @@ def resolve(
     if requested.relative_to == "cameras" and not goal.tool:
         _require_same_mounting(goal, model, names, moved)
     elif not goal.tool and not same:
-        note += (
-            f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
-        )
+        note += f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
     return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")
 
 
@@ -173,32 +171,24 @@ def _common_change(
     require_still(observations, common, "the common markers")
     if requested.relative_to == "cameras" and same:
         away = np.sqrt(((now.pixels - before.pixels) ** 2).sum(axis=-1))
-        if np.nanmax(away, initial=0.0) > RESIDUAL_PX + DEVIATIONS * float(
-            np.nanmax(now.sigmas, initial=0.0)
-        ):
+        if np.nanmax(away, initial=0.0) > RESIDUAL_PX + DEVIATIONS * float(np.nanmax(now.sigmas, initial=0.0)):
             worst = common[int(np.nanargmax(np.where(np.isfinite(away), away, -1.0).max(axis=0)))]
             raise TransferError(
                 f"marker {worst} stands {np.nanmax(away):.1f} px from where it was taught, but the cameras' model is "
                 f"still that of epoch {model.epoch}: calibrate with the cameras as they are now, then send it again"
             )
     family = family_between(old, new, same)
-    return align_points(
-        family, old, new, *before.points(), now, common, f"relative to the {requested.relative_to}"
-    )
+    return align_points(family, old, new, *before.points(), now, common, f"relative to the {requested.relative_to}")
 
 
-def _common(
-    requested: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations
-) -> list[int]:
+def _common(requested: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations) -> list[int]:
     """Common markers by id: those requested, or all that were observed then and are observed now."""
     then = {marker for points in goal.others.values() for marker in points} - set(goal.tool)
     now = {marker for points in observations.values() for marker in points} - set(model.marker_ids)
     for marker in requested.common:
         for seen, when in ((then, "when it was taught"), (now, "now")):
             if marker not in seen:
-                raise TransferError(
-                    f"common marker {marker} is not seen {when}; seen: {listed(sorted(seen))}"
-                )
+                raise TransferError(f"common marker {marker} is not seen {when}; seen: {listed(sorted(seen))}")
     common = sorted(set(requested.common) or then & now)
     if len(common) < min(POINTS_NEEDED.values()):
         raise TransferError(

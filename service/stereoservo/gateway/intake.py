@@ -141,9 +141,7 @@ class Intake:
             operator, command = work(key, payload)
             number = self._link.send_command(command, operator)
             if number is None:
-                raise _Answered(
-                    self._refused("the servo process does not take requests; see `stereoservo status`")
-                )
+                raise _Answered(self._refused("the servo process does not take requests; see `stereoservo status`"))
         except _Answered as answered:
             self._answer(query, answered.reply, operator or key, streamed)
         else:
@@ -181,14 +179,10 @@ class Intake:
             resolved = self._teaching.resolve(goal.target)
             seen = self._teaching.seen_when_taught(goal.target, ids) if ids else {}
         except TransferError as error:
-            raise _Answered(
-                self._refused("the goal cannot be placed now", f"target: {error}", goal=goal.id)
-            ) from error
+            raise _Answered(self._refused("the goal cannot be placed now", f"target: {error}", goal=goal.id)) from error
         self._note = resolved.note
         goal = msgspec.structs.replace(goal, target=resolved.target, follow_seen=goal.follow_seen or seen)
-        self._require(
-            check_goal(goal, self._context()), "the taught goal does not fit the cell any more", goal.id
-        )
+        self._require(check_goal(goal, self._context()), "the taught goal does not fit the cell any more", goal.id)
         return goal
 
     def _require(self, problems: list[str], message: str, goal: str = "") -> None:
@@ -315,9 +309,7 @@ class StopThread:
         self._key = keys.stop
         self._stops = self._session.declare_queryable(keys.stop, RingChannel(16), complete=True)
         self._puts = self._session.declare_subscriber(keys.stop, RingChannel(16))
-        self._enables = self._session.declare_queryable(
-            keys.any_command("enable"), RingChannel(16), complete=True
-        )
+        self._enables = self._session.declare_queryable(keys.any_command("enable"), RingChannel(16), complete=True)
         self._replies = ReplyThread()
         self._boundary = Boundary(boot)
         self.enables: deque[Any] = deque(maxlen=16)
@@ -345,9 +337,7 @@ class StopThread:
                         self._raise_stop(sample)
                 while (query := self._stops.try_recv()) is not None:
                     if str(query.key_expr) == self._key:
-                        self._boundary.take(
-                            self._key, partial(self._stop, query), partial(self._reply, query)
-                        )
+                        self._boundary.take(self._key, partial(self._stop, query), partial(self._reply, query))
                     else:
                         query.drop()
                 while (query := self._enables.try_recv()) is not None:

@@ -75,9 +75,7 @@ class MarkerViews:
             if marker in self.ids:
                 pixels[:, k] = self.pixels[:, self.ids.index(marker)]
                 sigmas[:, k] = self.sigmas[:, self.ids.index(marker)]
-        return MarkerViews(
-            self.cameras, self.Ps, self.lenses, self.sizes, list(ids), pixels, sigmas, self.scene
-        )
+        return MarkerViews(self.cameras, self.Ps, self.lenses, self.sizes, list(ids), pixels, sigmas, self.scene)
 
     def points(self) -> tuple[FloatArray, FloatArray]:
         """Points (n, 4) at depth 1 in the first camera and their covariances (n, 4, 4); NaN where not seen twice."""
@@ -103,9 +101,7 @@ def observed_views(observations: MarkerObservations, model: CellModel, ids: Sequ
     """The current observations of markers ``ids``."""
     views = MarkerViews.empty(model, ids)
     for camera, seen in observations.items():
-        views.add(
-            camera, {marker: (observation.pixel, observation.sigma) for marker, observation in seen.items()}
-        )
+        views.add(camera, {marker: (observation.pixel, observation.sigma) for marker, observation in seen.items()})
     return views
 
 

@@ -117,9 +117,7 @@ class RelocalizationJobs:
             return
         try:
             epoch = self._models.next_epoch()
-            self._fit = RelocalizationJob(
-                self._job, self._models.path(model.epoch), self._models.path(epoch), epoch
-            )
+            self._fit = RelocalizationJob(self._job, self._models.path(model.epoch), self._models.path(epoch), epoch)
         except OSError as error:
             self._refuse(str(error))
 
@@ -235,9 +233,7 @@ class RefinementJobs:
         if not self._on:
             return None
         model, poses = self._calibration.model, len(self._poses.poses)
-        doing = (
-            "refining" if self._job is not None else "waiting" if self._found is not None else "collecting"
-        )
+        doing = "refining" if self._job is not None else "waiting" if self._found is not None else "collecting"
         return RefinementState(
             poses,
             self._due if self._due <= MOST_POSES else None,
@@ -343,9 +339,7 @@ class RefinementJobs:
             self._taught.put_back(goals)
             self._models.path(epoch).unlink(missing_ok=True)
         except OSError as error:
-            return (
-                f". Its file stays ({error.strerror}): the next start uses it, with the goals restated in it"
-            )
+            return f". Its file stays ({error.strerror}): the next start uses it, with the goals restated in it"
         return ""
 
     def complete_hand_over(self) -> None:
@@ -383,21 +377,15 @@ class RefinementJobs:
         if busy or not self._idle or self._running().goals:
             raise MessageError("the arm is at work: wait until no goal runs, or cancel it, then undo again")
         if self._handed is not None:
-            raise MessageError(
-                f"refined model epoch {used.epoch} is just being taken in: undo again in a moment"
-            )
+            raise MessageError(f"refined model epoch {used.epoch} is just being taken in: undo again in a moment")
         base = self._models.of_epoch(used.refined_from)
         if base is None:
-            raise MessageError(
-                f"the file of calibrated model epoch {used.refined_from} is gone: calibrate anew"
-            )
+            raise MessageError(f"the file of calibrated model epoch {used.refined_from} is gone: calibrate anew")
         self.cancel()
         self._poses.clear()
         text = f"the calibrated model epoch {base.epoch} is back, in place of refined epoch {used.epoch}"
         if not self._hand_over(used, base, text):
-            raise MessageError(
-                f"refined epoch {used.epoch} stays in use; event `refined` says why nothing was undone"
-            )
+            raise MessageError(f"refined epoch {used.epoch} stays in use; event `refined` says why nothing was undone")
         self._due, self._undone = MOST_POSES + 1, True
         return text
 

@@ -39,9 +39,7 @@ class ObservationCache:
 
     def __init__(self, systematic_px: Mapping[str, float]) -> None:
         self._systematic = dict(systematic_px)
-        self._frames: dict[str, deque[CameraObservation]] = {
-            camera: deque(maxlen=FRAMES) for camera in systematic_px
-        }
+        self._frames: dict[str, deque[CameraObservation]] = {camera: deque(maxlen=FRAMES) for camera in systematic_px}
 
     def add(self, observation: CameraObservation) -> None:
         """Add a frame."""
@@ -54,9 +52,7 @@ class ObservationCache:
             for camera, frames in self._frames.items()
         }
         moment_ns = min((frames[-1].t_shutter_ns for frames in fresh.values() if frames), default=0)
-        return {
-            camera: self._camera_observations(camera, frames, moment_ns) for camera, frames in fresh.items()
-        }
+        return {camera: self._camera_observations(camera, frames, moment_ns) for camera, frames in fresh.items()}
 
     def _camera_observations(
         self, camera: str, fresh: list[CameraObservation], moment_ns: int
@@ -69,13 +65,8 @@ class ObservationCache:
             for marker, pixel, covariance in zip(
                 observation.ids, observation.pixels, observation.covariances, strict=True
             ):
-                tracks.setdefault(int(marker), []).append(
-                    _Sight(since_s, pixel, 0.5 * float(np.trace(covariance)))
-                )
-        return {
-            int(marker): _average(tracks[int(marker)], self._systematic[camera] ** 2)
-            for marker in fresh[-1].ids
-        }
+                tracks.setdefault(int(marker), []).append(_Sight(since_s, pixel, 0.5 * float(np.trace(covariance))))
+        return {int(marker): _average(tracks[int(marker)], self._systematic[camera] ** 2) for marker in fresh[-1].ids}
 
 
 class _Sight(NamedTuple):

@@ -105,9 +105,7 @@ class ModelStore:
         return self._epochs(self._FILE)
 
     def _epochs(self, pattern: re.Pattern[str]) -> list[int]:
-        return sorted(
-            int(match[1]) for path in self._directory.iterdir() if (match := pattern.fullmatch(path.name))
-        )
+        return sorted(int(match[1]) for path in self._directory.iterdir() if (match := pattern.fullmatch(path.name)))
 
     def next_epoch(self) -> int:
         """The last epoch plus one; those of damaged files that were set aside count."""
@@ -120,9 +118,7 @@ class ModelStore:
         except ModelFileError:
             return None
 
-    def newest_fitting(
-        self, settings: CoreSettings, *, recover: bool = False
-    ) -> tuple[CellModel | None, list[str]]:
+    def newest_fitting(self, settings: CoreSettings, *, recover: bool = False) -> tuple[CellModel | None, list[str]]:
         """Newest model that fits the cell's joints and cameras, and why newer ones were skipped.
 
         ``recover``: set damaged files aside. Models of another schema are not damaged.

@@ -40,9 +40,7 @@ class TransferError(Exception):
 
 def require_still(observations: MarkerObservations, markers: list[int], what: str) -> None:
     """Raise TransferError naming those of ``markers`` that move."""
-    moving = sorted(
-        {m for points in observations.values() for m in markers if m in points and points[m].moves}
-    )
+    moving = sorted({m for points in observations.values() for m in markers if m in points and points[m].moves})
     if moving:
         raise TransferError(f"{what} {listed(moving)} move now; send the goal when they stand still")
 
@@ -67,9 +65,7 @@ def align_points(
         )  # fmt: skip
         return change, point_residuals(new.Ps, move_points(change.H, points[kept]), now.pixels[:, kept])
 
-    usable: BoolArray = np.asarray(
-        np.isfinite(points).all(axis=1) & np.isfinite(now.pixels).all(axis=2).any(axis=0)
-    )
+    usable: BoolArray = np.asarray(np.isfinite(points).all(axis=1) & np.isfinite(now.pixels).all(axis=2).any(axis=0))
     try:
         change, residuals = fit(usable)
     except GeometryError as error:
@@ -79,10 +75,7 @@ def align_points(
     ids = [common[k] for k in np.flatnonzero(usable)]
     if worst > limit:
         others = np.arange(usable.size)
-        fits = [
-            (f"marker {common[k]}", lambda k=k: fit(usable & (others != k))[1])
-            for k in np.flatnonzero(usable)
-        ]
+        fits = [(f"marker {common[k]}", lambda k=k: fit(usable & (others != k))[1]) for k in np.flatnonzero(usable)]
         raise TransferError(
             f"{what}: markers {listed(ids)} have not moved as one body: {worst:.1f} px is left at marker "
             f"{ids[int(np.nanargmax(residuals))]}, {limit:.1f} px is allowed"
@@ -98,9 +91,7 @@ def _allowed(now: MarkerViews) -> tuple[float, float]:
     return sigma, max(RESIDUAL_PX, DEVIATIONS * sigma)
 
 
-def _outlier(
-    fits: Iterable[tuple[str, Callable[[], FloatArray]]], sigma: float, limit: float, why: str
-) -> str:
+def _outlier(fits: Iterable[tuple[str, Callable[[], FloatArray]]], sigma: float, limit: float, why: str) -> str:
     """The single feature, by name, without which what its fit leaves [px] is below ``limit``, and ``why`` that may be;
     those that explain it as well as the best; empty where there is none, or too few are left.
     """
@@ -111,9 +102,7 @@ def _outlier(
         except GeometryError:
             continue  # too few are left, or they are coplanar: this one cannot be tested
     best = min(left.values(), default=limit)
-    alike = sorted(
-        (px, name) for name, px in left.items() if px < min(limit, max(ALIKE * best, ALIKE * sigma))
-    )
+    alike = sorted((px, name) for name, px in left.items() if px < min(limit, max(ALIKE * best, ALIKE * sigma)))
     if not alike:
         return ""
     if len(alike) == 1:
@@ -185,9 +174,7 @@ class CommonFeatures:
     @property
     def ids(self) -> list[int]:
         """All ids, sorted."""
-        return sorted(
-            {*self.points, *(m for line in self.lines for m in line), *(m for p in self.planes for m in p)}
-        )
+        return sorted({*self.points, *(m for line in self.lines for m in line), *(m for p in self.planes for m in p)})
 
     @property
     def names(self) -> list[str]:
@@ -248,9 +235,7 @@ def align_features(
         )
     note = f"{what} by {_counted(features)} as a {family} map, which agree within {worst:.2f} px"
     if left_out:
-        note += (
-            f"; left out, since they lie in a plane through two cameras' centres: edges {listed(left_out)}"
-        )
+        note += f"; left out, since they lie in a plane through two cameras' centres: edges {listed(left_out)}"
     return change, note
 
 

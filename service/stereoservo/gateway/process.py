@@ -150,16 +150,10 @@ class Gateway:
         self._relocalization = RelocalizationJobs(
             self._models, self._servo, self.log, lambda: self._calibration.model, self._use_model
         )
-        self._marker_cache = ObservationCache(
-            {camera.name: camera.systematic_px for camera in self.settings.cameras}
-        )
+        self._marker_cache = ObservationCache({camera.name: camera.systematic_px for camera in self.settings.cameras})
         taught = TaughtStore(directories.taught, self._models.of_epoch, self._notes.tell)
-        self._teaching = TaughtGoalRegistry(
-            taught, self._marker_cache, lambda: self._calibration.model, self.log
-        )
-        self._intake = Intake(
-            self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot
-        )
+        self._teaching = TaughtGoalRegistry(taught, self._marker_cache, lambda: self._calibration.model, self.log)
+        self._intake = Intake(self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot)
         self._refinement = RefinementJobs(
             self.settings, plan.cell.calibration is not None and plan.cell.calibration.refine, self._models,
             self._servo, self.log, self._calibration, self._relocalization, taught, self._intake.running,
@@ -167,15 +161,11 @@ class Gateway:
         self._reports = ReportIntake(directories.reports_socket)
         slots = [directories.observation_slot(name) for name in cameras]
         log = partial(write_log, "gateway")
-        self._observations = [
-            (SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name, log)) for slot in slots
-        ]
+        self._observations = [(SlotReader(slot, OBSERVATION_LAYOUT), RecordBoundary(slot.name, log)) for slot in slots]
         self._previews = Previews(self._publishers.previews, directories)
         self._preview_boundary = RecordBoundary("preview pictures", log)
         self._declare()
-        self._stop = StopThread(
-            stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot
-        )
+        self._stop = StopThread(stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot)
         self._state = CellState(plan, self.boot, self._servo)
         self._state_sent = self._steps_taken = 0.0
         self._recordings = Recordings(plan, self.log, self._notes.tell)
@@ -213,10 +203,7 @@ class Gateway:
             (self._goal_puts, self._intake.goal_sample),
             (self._goal_queries, self._intake.goal_query),
             *((queryable, self._intake.command_query) for queryable in self._command_queries),
-            *(
-                (queryable, partial(self._answer, work=self._gateway_command))
-                for queryable in self._gateway_queries
-            ),
+            *((queryable, partial(self._answer, work=self._gateway_command)) for queryable in self._gateway_queries),
             (self._event_queries, partial(self._answer, work=self._events_from, key=self.keys.event)),
             (self._state_queries, partial(self._answer, work=self._newest_state, key=self.keys.state)),
             (
@@ -473,9 +460,7 @@ class Gateway:
     def _take_report(self, report: Report) -> None:
         if report.images is not None:
             self._recordings.images.add_report(report.images)
-        self.log.add(
-            report.kind, t_ns=report.t_ns, message=report.message, name=report.origin, origin=report.origin
-        )
+        self.log.add(report.kind, t_ns=report.t_ns, message=report.message, name=report.origin, origin=report.origin)
 
     # -- life -----------------------------------------------------------------------------------------------
 

@@ -176,9 +176,7 @@ def features_message(observation: CameraObservation, shift_ns: int | None = None
     Raises MessageError for numbers that are not finite.
     """
     if not (np.isfinite(observation.pixels).all() and np.isfinite(observation.covariances).all()):
-        raise MessageError(
-            f"camera {observation.camera}: frame {observation.seq} holds numbers that are not finite"
-        )
+        raise MessageError(f"camera {observation.camera}: frame {observation.seq} holds numbers that are not finite")
     if shift_ns is None:
         shift_ns = time.time_ns() - time.monotonic_ns()
     sigmas = np.sqrt(0.5 * np.trace(observation.covariances, axis1=1, axis2=2))
@@ -285,9 +283,7 @@ def cell_info(
             for i, (name, kind) in enumerate(zip(settings.joint_names, settings.joint_kinds, strict=True))
         ),
         cameras=tuple(
-            CameraInfo(
-                camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids
-            )
+            CameraInfo(camera.name, camera.width, camera.height, camera.rate_hz, camera.mount, camera.marker_ids)
             for camera in settings.cameras
         ),
         laws=tuple(LAWS),

@@ -98,9 +98,7 @@ class TaughtGoalRegistry:
         """Set-points of a taught goal. Raises KeyError, TransferError."""
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
 
-    def seen_when_taught(
-        self, target: TaughtTarget, markers: tuple[MarkerId, ...]
-    ) -> dict[str, dict[int, Pixel]]:
+    def seen_when_taught(self, target: TaughtTarget, markers: tuple[MarkerId, ...]) -> dict[str, dict[int, Pixel]]:
         """Raw pixels of those of the ``markers`` that are not on the body, by camera, when it was taught. Raises
         KeyError.
         """
@@ -152,13 +150,10 @@ class TaughtGoalRegistry:
         return False
 
 
-def _where(
-    markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel]]
-) -> dict[str, dict[int, Pixel]]:
+def _where(markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel]]) -> dict[str, dict[int, Pixel]]:
     """Those of the ``markers`` that are ``shown``, by camera and marker; cameras that show none are not in it."""
     found = {
-        camera: {marker: pixels[marker] for marker in markers if marker in pixels}
-        for camera, pixels in shown.items()
+        camera: {marker: pixels[marker] for marker in markers if marker in pixels} for camera, pixels in shown.items()
     }
     return {camera: pixels for camera, pixels in found.items() if pixels}
 
@@ -173,9 +168,7 @@ def _scene_feature(feature: Feature, observations: MarkerObservations, may_move:
     text = ", ".join(str(marker) for marker in feature.markers)
     if len(pixels) < 2:
         cameras = ", ".join(pixels) or "no camera"
-        raise TransferError(
-            f"markers {text} of a fixed feature are all seen by {cameras} now; two cameras are needed"
-        )
+        raise TransferError(f"markers {text} of a fixed feature are all seen by {cameras} now; two cameras are needed")
     if not may_move and any(
         seen[marker].moves for seen in observations.values() for marker in feature.markers if marker in seen
     ):
@@ -210,9 +203,7 @@ def synthesise(
         drawn_points(np.zeros((1, 3)), pose)
     except GeometryError as error:
         raise TransferError(f"pose: {error}") from error
-    if (
-        model.mount == "eye_in_hand"
-    ):  # here the workpiece carries the model's body, the tool rides with the cameras
+    if model.mount == "eye_in_hand":  # here the workpiece carries the model's body, the tool rides with the cameras
         fixed, moving, pose = moving, fixed, np.linalg.inv(pose)
     shared = sorted(set(fixed) & set(model.marker_ids))
     if shared:
@@ -226,9 +217,7 @@ def synthesise(
     frame = model_frame(model)
     missing = [marker for marker in static_markers if marker not in seen]
     if len(static_markers) - len(missing) < MIN_MARKERS:
-        raise TransferError(
-            f"markers {listed(missing)} of the drawing are not seen now; 3 or more are needed"
-        )
+        raise TransferError(f"markers {listed(missing)} of the drawing are not seen now; 3 or more are needed")
     drawn = drawn_points(np.array([fixed[m] for m in static_markers]))
     change, description = align_points(
         family_between(DRAWING, frame, False),
@@ -260,9 +249,7 @@ def _drawn_goal(
 ) -> TaughtGoal:
     """Goal with the set-points of drawn markers as if they had been taught, and the markers that located them."""
     of_body = {c: {m: p for m, p in seen.items() if m in model.marker_ids} for c, seen in set_points.items()}
-    others = {
-        c: {m: p for m, p in seen.items() if m not in model.marker_ids} for c, seen in set_points.items()
-    }
+    others = {c: {m: p for m, p in seen.items() if m not in model.marker_ids} for c, seen in set_points.items()}
     for camera, seen in observations.items():
         for marker in static_markers:
             if marker in seen:

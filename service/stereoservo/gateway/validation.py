@@ -94,9 +94,7 @@ def _check_following(goal: Goal, settings: CoreSettings) -> list[str]:
         problems.append(
             f"follow_markers: carry the goal over by themselves; leave out relative_to {goal.target.relative_to!r}"
         )
-    problems += [
-        f"follow_markers: {marker} stands twice" for marker in sorted({i for i in ids if ids.count(i) > 1})
-    ]
+    problems += [f"follow_markers: {marker} stands twice" for marker in sorted({i for i in ids if ids.count(i) > 1})]
     names = [camera.name for camera in settings.cameras]
     for name, seen in goal.follow_seen.items():
         if name not in names:
@@ -133,9 +131,7 @@ def _check_law(goal: Goal, settings: CoreSettings) -> list[str]:
         value = getattr(goal, option)
         if value is not None and option not in law.options:
             given = f"{value!r} " if isinstance(value, str) else ""
-            problems.append(
-                f"{option}: {given}belongs to {_laws_named(LAWS.having(option))}; the goal's is {name!r}"
-            )
+            problems.append(f"{option}: {given}belongs to {_laws_named(LAWS.having(option))}; the goal's is {name!r}")
     if goal.cameras is not None and len(goal.cameras) == 1 and law.one_camera == "refused":
         single = [repr(other) for other, its in LAWS.items() if its.one_camera == "suffices"]
         problems.append(
@@ -152,9 +148,7 @@ def _check_cameras(goal: Goal, settings: CoreSettings) -> list[str]:
     if goal.cameras is None:
         return []
     names = [camera.name for camera in settings.cameras]
-    problems = [
-        f"cameras: no camera {name!r}; cameras: {listed(names)}" for name in goal.cameras if name not in names
-    ]
+    problems = [f"cameras: no camera {name!r}; cameras: {listed(names)}" for name in goal.cameras if name not in names]
     if not goal.cameras:
         problems.append(f"cameras: is empty; some of {listed(names)} are needed, or leave it out for all")
     problems += [
@@ -241,8 +235,7 @@ def _check_jog(command: Jog, settings: CoreSettings) -> list[str]:
         limit = float(settings.limits.velocity_max[settings.joint_names.index(name)])
         if abs(velocity) > limit:
             problems.append(
-                f"velocities.{name}: {velocity:g} is above the joint's limit; {-limit:g} to {limit:g} "
-                f"is valid"
+                f"velocities.{name}: {velocity:g} is above the joint's limit; {-limit:g} to {limit:g} is valid"
             )
     return problems
 
@@ -325,8 +318,7 @@ def check_features(target: FeatureTarget, context: GoalContext, where: str = "ta
     needed = fewest_markers(len(context.settings.joint_names))
     if not problems and len(markers) < needed:
         problems.append(
-            f"{where}.set_points: {len(markers)} marker(s) ({listed(sorted(markers))}); at least "
-            f"{needed} fix a pose"
+            f"{where}.set_points: {len(markers)} marker(s) ({listed(sorted(markers))}); at least {needed} fix a pose"
         )
     return problems
 
@@ -388,9 +380,7 @@ def _check_size(where: str, numbers: Sequence[float]) -> list[str]:
     largest = max(abs(number) for number in numbers)
     if 1.0 / MAX_SIZE <= largest <= MAX_SIZE:
         return []
-    return [
-        f"{where}: its largest number is {largest:g}; {1.0 / MAX_SIZE:g} to {MAX_SIZE:g} is valid, scale it"
-    ]
+    return [f"{where}: its largest number is {largest:g}; {1.0 / MAX_SIZE:g} to {MAX_SIZE:g} is valid, scale it"]
 
 
 def check_points(target: PointTarget, context: GoalContext) -> list[str]:
@@ -477,9 +467,7 @@ def check_joint_target(target: JointTarget, settings: CoreSettings, where: str =
         low = float(limits.position_min[i]) + limits.position_margin
         high = float(limits.position_max[i]) - limits.position_margin
         if not low <= position <= high:
-            problems.append(
-                f"{place}: {position:g} is outside the joint's limits; {low:.4g} to {high:.4g} is valid"
-            )
+            problems.append(f"{place}: {position:g} is outside the joint's limits; {low:.4g} to {high:.4g} is valid")
     return problems
 
 
@@ -498,16 +486,12 @@ def check_incidence(target: IncidenceTarget, context: GoalContext) -> list[str]:
     return problems
 
 
-def _check_feature(
-    where: str, feature: Feature, kind: str, has_epoch: bool, context: GoalContext
-) -> list[str]:
+def _check_feature(where: str, feature: Feature, kind: str, has_epoch: bool, context: GoalContext) -> list[str]:
     given = [way for way in ("markers", "points", "pixels", "segments") if getattr(feature, way)]
     if where.endswith("moving") and given != ["markers"]:
         return [f"{where}: given by {listed(given)}; what moves is given by markers of the body"]
     if len(given) != 1:
-        return [
-            f"{where}: given by {listed(given)}; exactly one of markers, points, pixels, segments is valid"
-        ]
+        return [f"{where}: given by {listed(given)}; exactly one of markers, points, pixels, segments is valid"]
     need = POINTS_OF[kind]
     if feature.segments:
         if kind != "line":
@@ -524,9 +508,7 @@ def _check_feature(
         problems += check_markers(f"{where}.markers", feature.markers, context, body=where.endswith("moving"))
         return problems
     if not has_epoch:
-        problems.append(
-            f"{where}.points: are in the frame of a model; target.model_epoch is needed with them"
-        )
+        problems.append(f"{where}.points: are in the frame of a model; target.model_epoch is needed with them")
     for i, point in enumerate(feature.points):
         problems += check_homogeneous(f"{where}.points[{i}]", point)
     M = np.array(feature.points)

@@ -13,9 +13,7 @@ from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CellFile, TlsSection
 from stereoservo.messages.directories import check_socket_path
 
-_NETWORK_ENDPOINT = re.compile(
-    r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}"
-)
+_NETWORK_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):[0-9]{1,5}")
 
 RECONNECT = {"period_init_ms": 100, "period_max_ms": 500}
 

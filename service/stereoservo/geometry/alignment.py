@@ -135,16 +135,12 @@ def align(
             points=called[both].tolist(),
         )
     own = None if M_covariance is None else np.asarray(M_covariance, dtype=np.float64)
-    covariance_px = triangulation_covariance(
-        new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both]
-    )
+    covariance_px = triangulation_covariance(new.Ps, M_new[both], np.where(weights > 0, sigma, np.inf)[:, both])
     _refuse_flat(family, M_new[both], covariance_px, called[both].tolist())
     up_old, up_new = upgrades(family, old, new)
     T = start_map(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
-    views = PointViews(
-        new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used]
-    )
+    views = PointViews(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
     # About the points' centroid, in units of their standard deviation: rotations and translations are then well
     # distinguished.
     local = local_frame(family, move_points(up_new, M_new[both])) @ up_new
@@ -188,9 +184,7 @@ class PointViews:
         moved = self.M @ T.T
         by_point = projection_jacobian_many(self.Ps, moved)
         by_map = np.einsum("cnij,knj->ncik", by_point, moved @ generators.transpose(0, 2, 1))
-        slopes: FloatArray = (whitening @ by_map.reshape(len(moved), -1, len(generators))).reshape(
-            -1, len(generators)
-        )
+        slopes: FloatArray = (whitening @ by_map.reshape(len(moved), -1, len(generators))).reshape(-1, len(generators))
         return slopes
 
 

@@ -77,9 +77,7 @@ def reprojection_residuals(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
     return residuals
 
 
-def check_views(
-    Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
+def check_views(Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """Pixels ``(c, n, 2)`` and weights ``(c, n)``, both with 0 for missing ones.
 
     Raises GeometryError on shapes that do not fit and on weights that are not finite or negative.
@@ -92,11 +90,7 @@ def check_views(
             pixels=pixels.shape,
         )
     seen: BoolArray = np.asarray(np.isfinite(pixels).all(axis=2))
-    w = (
-        np.ones(seen.shape)
-        if weights is None
-        else np.broadcast_to(np.asarray(weights, dtype=np.float64), seen.shape)
-    )
+    w = np.ones(seen.shape) if weights is None else np.broadcast_to(np.asarray(weights, dtype=np.float64), seen.shape)
     if not (np.isfinite(w[seen]).all() and (w[seen] >= 0).all()):
         raise GeometryError("not_finite", "weights must be finite and not negative where a pixel is given")
     return np.where(seen[..., None], pixels, 0.0), np.where(seen, w, 0.0)
@@ -113,11 +107,7 @@ def triangulate(
     of the reprojection error. ``sigmas`` (c, n) or a number [px]; default 1. NaN rows where fewer than two
     cameras see a point or its rays do not determine it. Raises GeometryError on shapes that do not fit.
     """
-    weights = (
-        None
-        if sigmas is None
-        else 1.0 / np.broadcast_to(np.asarray(sigmas, dtype=np.float64), pixels.shape[:2])
-    )
+    weights = None if sigmas is None else 1.0 / np.broadcast_to(np.asarray(sigmas, dtype=np.float64), pixels.shape[:2])
     values, w = check_views(Ps, pixels, weights)
     # The depth is fixed by eliminating one coordinate k through the first camera's third row.
     third = Ps[0, 2]
@@ -176,11 +166,7 @@ def triangulation_covariance(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) 
     """
     third = Ps[0, 2]
     free = np.linalg.svd(third[None])[2][1:].T
-    J = (
-        projection_jacobian_many(Ps, M)
-        @ free
-        / np.broadcast_to(sigmas, (Ps.shape[0], M.shape[0]))[..., None, None]
-    )
+    J = projection_jacobian_many(Ps, M) @ free / np.broadcast_to(sigmas, (Ps.shape[0], M.shape[0]))[..., None, None]
     information = np.einsum("cnij,cnik->njk", J, J)
     covariance: FloatArray = free @ np.linalg.inv(information) @ free.T
     return covariance
@@ -220,14 +206,10 @@ def canonical_pair(
     E = K @ np.linalg.inv(N_right).T @ F @ np.linalg.inv(N_left) @ K
     U, s, Vt = np.linalg.svd(E)
     if not (s[1] > 1e-6 * s[0] and s[2] < 1e-3 * s[1]):
-        raise GeometryError(
-            "degenerate", f"F has singular values {s.tolist()}; it must be of rank two", singular=s
-        )
+        raise GeometryError("degenerate", f"F has singular values {s.tolist()}; it must be of rank two", singular=s)
     scale = np.sqrt(s[0] * s[1])
     epipole, null = U[:, 2], Vt[2]
-    cross = np.array(
-        [[0, -epipole[2], epipole[1]], [epipole[2], 0, -epipole[0]], [-epipole[1], epipole[0], 0]]
-    )
+    cross = np.array([[0, -epipole[2], epipole[1]], [epipole[2], 0, -epipole[0]], [-epipole[1], epipole[0], 0]])
     turned = cross @ (U[:, :2] * (s[:2] / scale)) @ Vt[:2]
 
     rays_left, rays_right = _nominal_rays(F, N_left, N_right, K, left, right)
@@ -312,23 +294,17 @@ def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatAr
     seen = np.isfinite(pixels).all(axis=1) & np.isfinite(M).all(axis=1)
     M, pixels = M[seen], pixels[seen]
     if M.shape[0] < 6:
-        raise GeometryError(
-            "too_few", f"{M.shape[0]} points; a camera needs at least 6", points=int(M.shape[0])
-        )
+        raise GeometryError("too_few", f"{M.shape[0]} points; a camera needs at least 6", points=int(M.shape[0]))
     T = isotropic_normaliser(pixels)
     x = to_homogeneous(pixels) @ T.T
     root = whitener(M)
     X = M @ root.T
     X = X / np.linalg.norm(X, axis=1, keepdims=True)
     zero = np.zeros_like(X)
-    system = np.concatenate(
-        [np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:2] * X])], axis=0
-    )
+    system = np.concatenate([np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:2] * X])], axis=0)
     _, singular, v = np.linalg.svd(system, full_matrices=False)
     if not singular[10] > 1e-9 * singular[0]:
-        raise GeometryError(
-            "degenerate", "the points do not determine a camera (coplanar?)", singular=singular
-        )
+        raise GeometryError("degenerate", "the points do not determine a camera (coplanar?)", singular=singular)
     P: FloatArray = np.linalg.inv(T) @ v[-1].reshape(3, 4) @ root
     if refine:
         P = _refine_camera(P, M, pixels)
@@ -361,9 +337,7 @@ def _refine_camera(P: FloatArray, M: FloatArray, pixels: FloatArray) -> FloatArr
         product: FloatArray = J.reshape(-1, 12) @ chart
         return product
 
-    fit = least_squares(
-        residuals, np.zeros(11), jac=jacobian, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14
-    )
+    fit = least_squares(residuals, np.zeros(11), jac=jacobian, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     refined: FloatArray = np.linalg.inv(T) @ (start + chart @ fit.x).reshape(3, 4) @ root
     return refined
 
@@ -375,9 +349,7 @@ def isotropic_normaliser(pixels: FloatArray) -> FloatArray:
     centre = pixels.mean(axis=0)
     distance = float(np.linalg.norm(pixels - centre, axis=1).mean())
     if not distance > 1e-9 * (1.0 + float(np.abs(centre).max())):
-        raise GeometryError(
-            "degenerate", f"all pixels are one point, {centre.tolist()}", centre=centre.tolist()
-        )
+        raise GeometryError("degenerate", f"all pixels are one point, {centre.tolist()}", centre=centre.tolist())
     s = np.sqrt(2.0) / distance
     return np.array([[s, 0.0, -s * centre[0]], [0.0, s, -s * centre[1]], [0.0, 0.0, 1.0]])
 

@@ -137,9 +137,7 @@ def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> Flo
     for name, centred in (("first", x), ("second", y)):
         singular = np.linalg.svd(centred, compute_uv=False)
         if not singular[1] > STRAIGHT * singular[0]:
-            raise GeometryError(
-                "degenerate", f"the {name} points lie on one line: a turn about it stays open"
-            )
+            raise GeometryError("degenerate", f"the {name} points lie on one line: a turn about it stays open")
     U, singular, Vt = np.linalg.svd(y.T @ x)
     proper = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     T = np.eye(4)

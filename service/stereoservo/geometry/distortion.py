@@ -174,9 +174,7 @@ def distortion_jacobian(lens: FloatArray, pixels: FloatArray) -> FloatArray:
             axis=-2,
         )
     squared = (offset**2).sum(axis=-1)[..., None, None]
-    result: FloatArray = (1.0 + k * squared) * np.eye(2) + 2.0 * k * offset[..., :, None] * offset[
-        ..., None, :
-    ]
+    result: FloatArray = (1.0 + k * squared) * np.eye(2) + 2.0 * k * offset[..., :, None] * offset[..., None, :]
     return result
 
 
@@ -259,9 +257,7 @@ def lens_from_lines(lines: Sequence[FloatArray], sigma: float, width: int, heigh
         if near:
             break
     else:
-        raise GeometryError(
-            "no_convergence", f"the lens did not settle in {ITERATIONS} steps; cost {cost:.4g}"
-        )
+        raise GeometryError("no_convergence", f"the lens did not settle in {ITERATIONS} steps; cost {cost:.4g}")
     _, slope = errors_at(lens)
     freedom = len(pixels) - 2 * (len(starts) - 1) - 1
     covariance: FloatArray = np.asarray(np.linalg.inv(slope.T @ slope)) * max(1.0, cost / max(1, freedom))

@@ -69,9 +69,7 @@ def fundamental_robust(
     threshold = INLIER_SIGMAS * sigma_px
     found = _sampled(left, right, threshold, max_iterations)
     if found is None:
-        raise GeometryError(
-            "no_model", f"no fundamental matrix fits the {len(left)} matches", matches=len(left)
-        )
+        raise GeometryError("no_model", f"no fundamental matrix fits the {len(left)} matches", matches=len(left))
     F = _unit(found)
     inliers = np.abs(sampson_distances(F, left, right)) <= threshold
     for _ in range(10):
@@ -130,9 +128,7 @@ def fundamental_refine(
     start = np.linalg.inv(T_right).T @ np.asarray(F, dtype=np.float64) @ np.linalg.inv(T_left)
     U, s, Vt = np.linalg.svd(start)
     if not (np.isfinite(s).all() and s[1] > 1e-12 * s[0]):
-        raise GeometryError(
-            "degenerate", f"F has singular values {s.tolist()}; it must be of rank two", singular=s
-        )
+        raise GeometryError("degenerate", f"F has singular values {s.tolist()}; it must be of rank two", singular=s)
     x, y = to_homogeneous(from_pixels(T_left, left)), to_homogeneous(from_pixels(T_right, right))
     u, v = x @ Vt.T, y @ U  # F becomes diag(s₁, s₂, 0) in these coordinates
     lines = (T_left[:2, :2] @ Vt.T[:2], T_right[:2, :2] @ U[:2])  # rows of line normals, back to pixels
@@ -165,9 +161,7 @@ def fundamental_refine(
         d_value = _products(v, u) @ D.reshape(7, 9).T
         d_square = _products(on_right, u) @ (lines[1] @ D).reshape(7, 6).T
         d_square += _products(v, on_left) @ (D @ lines[0].T).reshape(7, 6).T
-        result: FloatArray = (d_value / length[:, None] - (value / length**3)[:, None] * d_square) * weights[
-            :, None
-        ]
+        result: FloatArray = (d_value / length[:, None] - (value / length**3)[:, None] * d_square) * weights[:, None]
         return result
 
     options: dict[str, Any] = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 200}
@@ -210,9 +204,7 @@ def epipolar_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> Fl
     x, y = to_homogeneous(left), to_homogeneous(right)
     on_right, on_left = x @ F.T, y @ F
     value = np.abs((y * on_right).sum(axis=1))
-    lengths = np.stack(
-        [np.linalg.norm(on_left[:, :2], axis=1), np.linalg.norm(on_right[:, :2], axis=1)], axis=1
-    )
+    lengths = np.stack([np.linalg.norm(on_left[:, :2], axis=1), np.linalg.norm(on_right[:, :2], axis=1)], axis=1)
     distances: FloatArray = value[:, None] / lengths
     return distances
 
@@ -266,18 +258,12 @@ def _refuse_plane(left: FloatArray, right: FloatArray, sigma_px: float) -> None:
 def _matches(left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
     left, right = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
     if left.ndim != 2 or left.shape[1:] != (2,) or left.shape != right.shape:
-        raise GeometryError(
-            "shape", f"matches have shapes {left.shape} and {right.shape}; both must be (n, 2)"
-        )
+        raise GeometryError("shape", f"matches have shapes {left.shape} and {right.shape}; both must be (n, 2)")
     if not (np.isfinite(left).all() and np.isfinite(right).all()):
         bad = np.flatnonzero(~(np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1))).tolist()
-        raise GeometryError(
-            "not_finite", f"match(es) {bad} are not finite; leave missing ones out", matches=bad
-        )
+        raise GeometryError("not_finite", f"match(es) {bad} are not finite; leave missing ones out", matches=bad)
     if len(left) < MIN_MATCHES:
-        raise GeometryError(
-            "too_few", f"{len(left)} matches; at least {MIN_MATCHES} are needed", matches=len(left)
-        )
+        raise GeometryError("too_few", f"{len(left)} matches; at least {MIN_MATCHES} are needed", matches=len(left))
     return left, right
 
 

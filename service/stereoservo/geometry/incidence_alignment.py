@@ -97,9 +97,7 @@ class _Lines:
         """Distances (c, m, 2) [px] of the moved points from the lines; NaN where missing."""
         moved, _ = self._moved(T)
         pixels = project_many(self.Ps, moved.reshape(-1, 4)).reshape(len(self.Ps), -1, 2, 2)
-        away: FloatArray = (
-            np.einsum("cmi,cmki->cmk", self.lines[..., :2], pixels) + self.lines[..., 2][..., None]
-        )
+        away: FloatArray = np.einsum("cmi,cmki->cmk", self.lines[..., :2], pixels) + self.lines[..., 2][..., None]
         return away
 
     def whitening(self, T: FloatArray) -> FloatArray:
@@ -123,9 +121,7 @@ class _Lines:
                     M[2 * row + end, 4 * end : 4 * end + 4] = by_A[k, m, end]
                 block = slice(2 * row, 2 * row + 2)
                 own[block, block] = self.sigmas[k, m] ** 2 * shares[k, m] @ shares[k, m].T
-            root = np.linalg.cholesky(
-                own + M @ self.covariance[m] @ M.T + 1e-12 * np.trace(own) * np.eye(len(own))
-            )
+            root = np.linalg.cholesky(own + M @ self.covariance[m] @ M.T + 1e-12 * np.trace(own) * np.eye(len(own)))
             whitening[m][np.ix_(rows, rows)] = np.linalg.inv(root)
         return whitening
 
@@ -199,14 +195,10 @@ class _Mixed:
         return np.concatenate([part.residuals(T, w) for part, w in zip(self.parts, whitening, strict=True)])
 
     def slopes(self, T: FloatArray, generators: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
-        return np.concatenate(
-            [part.slopes(T, generators, w) for part, w in zip(self.parts, whitening, strict=True)]
-        )
+        return np.concatenate([part.slopes(T, generators, w) for part, w in zip(self.parts, whitening, strict=True)])
 
 
-def line_end_points(
-    Ps: FloatArray, segments: FloatArray, sigmas: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two points (m, 2, 4), at depth 1, of each line of segments ``(c, m, 2, 2)`` [px], NaN where missing, and their
     covariance (m, 8, 8) for ends known to ``sigmas`` (c, m) [px].
 
@@ -298,9 +290,7 @@ def align_incidences(
     found.sort(key=lambda pair: pair[0])
     squares, T = found[0]
     for other_squares, other in found[1:]:
-        if other_squares < squares + AMBIGUOUS and float(np.abs(other - T).max()) > APART * float(
-            np.abs(T).max()
-        ):
+        if other_squares < squares + AMBIGUOUS and float(np.abs(other - T).max()) > APART * float(np.abs(T).max()):
             raise GeometryError(
                 "degenerate",
                 "two maps bring the features onto their images alike; add a line or a point that tells them apart",

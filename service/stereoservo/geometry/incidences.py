@@ -219,9 +219,7 @@ def homography_from_incidences(incidences: Sequence[Incidence], tolerance: float
     of the family left where they do not determine H (singular values below ``tolerance``).
     """
     equations = sum(incidence.equations for incidence in incidences)
-    kinds = (
-        ", ".join(f"{count} x {kind}" for kind, count in Counter(map(str, incidences)).items()) or "nothing"
-    )
+    kinds = ", ".join(f"{count} x {kind}" for kind, count in Counter(map(str, incidences)).items()) or "nothing"
     if equations < 15:
         raise GeometryError(
             "too_few",
@@ -258,9 +256,7 @@ def homography_from_incidences(incidences: Sequence[Incidence], tolerance: float
         )
     H = unit_determinant(np.linalg.solve(W_B, H) @ W_A, "the homography")
     pairs = [(i.first[0], i.second[0]) for i in incidences if len(i.second) == 1]
-    agreement = (
-        sum(float(np.sign(second @ H @ first)) for first, second in pairs) or H.flat[np.abs(H).argmax()]
-    )
+    agreement = sum(float(np.sign(second @ H @ first)) for first, second in pairs) or H.flat[np.abs(H).argmax()]
     return -H if agreement < 0 else H
 
 
@@ -372,9 +368,7 @@ class _PixelTargets:
                     images=len(images),
                 )
             at, values, targets = (
-                (pixel_at, pixels, images)
-                if len(incidence.second) == 1
-                else (line_at, lines, image_lines(images))
+                (pixel_at, pixels, images) if len(incidence.second) == 1 else (line_at, lines, image_lines(images))
             )
             for c in np.flatnonzero(np.isfinite(targets).all(axis=1)).tolist():
                 for k in own:
@@ -403,9 +397,7 @@ class _PixelTargets:
         for size, at in self.plane_at.items():
             X = moved[at] / (moved[at] @ Ps[0, 2])[:, None]
             B = self.planes[size]
-            covariance_px = (
-                B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
-            )
+            covariance_px = B @ triangulation_covariance(Ps, X, np.full((len(Ps), 1), sigma)) @ B.transpose(0, 2, 1)
             offset = np.einsum("nij,nj->ni", B, X)
             parts.append(np.linalg.solve(np.linalg.cholesky(covariance_px), offset[..., None]).ravel())
         return np.concatenate(parts)

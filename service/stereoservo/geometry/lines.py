@@ -72,9 +72,7 @@ def line_planes(L: FloatArray) -> FloatArray:
     return _two_rows(meet_matrix(checked_lines(L)), L, line_in_planes)
 
 
-def _two_rows(
-    matrix: FloatArray, L: FloatArray, line_of: Callable[[FloatArray, FloatArray], FloatArray]
-) -> FloatArray:
+def _two_rows(matrix: FloatArray, L: FloatArray, line_of: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
     rows: FloatArray = np.linalg.svd(matrix)[2][..., :2, :]
     agrees = (line_of(rows[..., 0, :], rows[..., 1, :]) * L).sum(axis=-1) >= 0
     return np.where(agrees[..., None, None], rows, rows[..., ::-1, :])
@@ -114,9 +112,7 @@ def nearest_line(L: FloatArray) -> FloatArray:
     plus, minus = L[..., :3] + L[..., 3:], L[..., :3] - L[..., 3:]
     lengths = np.linalg.norm(plus, axis=-1), np.linalg.norm(minus, axis=-1)
     if not (np.minimum(*lengths) > RANK_TOLERANCE * np.maximum(*lengths)).all():
-        raise GeometryError(
-            "degenerate", f"d and m are parallel and equal in {L.tolist()}; no line is nearest"
-        )
+        raise GeometryError("degenerate", f"d and m are parallel and equal in {L.tolist()}; no line is nearest")
     mean_length = 0.5 * (lengths[0] + lengths[1])
     plus = plus * (mean_length / lengths[0])[..., None]
     minus = minus * (mean_length / lengths[1])[..., None]
@@ -191,9 +187,7 @@ def crossing_angles(Ps: FloatArray, segments: FloatArray) -> FloatArray:
     return angles
 
 
-def triangulate_lines(
-    Ps: FloatArray, segments: FloatArray, sigma: float = 1.0, iterations: int = 10
-) -> FloatArray:
+def triangulate_lines(Ps: FloatArray, segments: FloatArray, sigma: float = 1.0, iterations: int = 10) -> FloatArray:
     """Lines ``(n, 6)``, unit norm, from segments ``(c, n, 2, 2)`` [px], NaN where missing, seen by c >= 2 cameras.
 
     The meet of the interpretation planes (2.72), then of least squared distance [px] between the segments' ends
@@ -293,9 +287,7 @@ def _distances(
     )
 
 
-def _refined(
-    Ps: FloatArray, points: FloatArray, segments: FloatArray, seen: BoolArray
-) -> tuple[FloatArray, float]:
+def _refined(Ps: FloatArray, points: FloatArray, segments: FloatArray, seen: BoolArray) -> tuple[FloatArray, float]:
     """One Gauss-Newton step for all lines; the new orthonormal points and the largest step."""
     residual, J = _distances(Ps, points, segments, seen)
     step = -(np.linalg.pinv(J) @ residual[..., None])[..., 0]

@@ -98,9 +98,7 @@ class FrameChange:
     degrees_of_freedom: int
 
 
-def carried_point_covariance(
-    change: FrameChange, M: FloatArray, M_covariance: FloatArray | None = None
-) -> FloatArray:
+def carried_point_covariance(change: FrameChange, M: FloatArray, M_covariance: FloatArray | None = None) -> FloatArray:
     """First-order covariance ``(m, 4, 4)`` of transformed points ``H M`` from that of H and, if given, of the
     points.
 
@@ -150,9 +148,7 @@ def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -
     deviation = deviation - np.outer(P.ravel(), P.ravel() @ deviation)
     residuals = reprojection_residuals(P[None], M, pixels[None]).ravel() / sigma
     freedom = residuals.size - 11
-    return ResectedCamera(
-        P, deviation @ deviation.T, float(np.sqrt(residuals @ residuals / freedom)), freedom
-    )
+    return ResectedCamera(P, deviation @ deviation.T, float(np.sqrt(residuals @ residuals / freedom)), freedom)
 
 
 def _refuse_flat_view(P: FloatArray, deviation: FloatArray) -> None:

@@ -83,9 +83,7 @@ def point_charts(M: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(M[:, None, :])[2][:, 1:].transpose(0, 2, 1), dtype=np.float64)
 
 
-def linearise(
-    images: Images, H: FloatArray, slopes: FloatArray, M: FloatArray, charts: FloatArray
-) -> Linearisation:
+def linearise(images: Images, H: FloatArray, slopes: FloatArray, M: FloatArray, charts: FloatArray) -> Linearisation:
     """Residuals and derivatives at displacements ``H`` (s, 4, 4) and points ``M`` (m, 4) or (s, m, 4)."""
     M = np.broadcast_to(M, (len(H), *M.shape[-2:]))
     moved = M @ H.transpose(0, 2, 1)

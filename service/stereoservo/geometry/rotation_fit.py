@@ -68,11 +68,7 @@ def bundle_rotation(
     """
     images = read_images(Ps, pixels, sigma)
     theta = np.asarray(angles, dtype=np.float64)
-    if (
-        theta.shape != pixels.shape[:1]
-        or points.shape != (pixels.shape[2], 4)
-        or not np.isfinite(theta).all()
-    ):
+    if theta.shape != pixels.shape[:1] or points.shape != (pixels.shape[2], 4) or not np.isfinite(theta).all():
         raise GeometryError(
             "shape",
             f"points {points.shape} and angles {theta.shape} do not fit pixels {pixels.shape}; finite "
@@ -178,9 +174,7 @@ def check_rotation_generator(G: FloatArray) -> FloatArray:
     """``G`` (4, 4) as an array, once ``Ĥ³ = −Ĥ`` holds and it is not zero. Raises GeometryError."""
     G = np.asarray(G, dtype=np.float64)
     if G.shape != (4, 4) or not np.isfinite(G).all():
-        raise GeometryError(
-            "shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape
-        )
+        raise GeometryError("shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape)
     size = float(np.linalg.norm(G))
     defect = float(np.linalg.norm(G @ G @ G + G))
     if not (size > 0 and defect <= ROTATION_TOLERANCE * max(size, size**3)):

@@ -145,9 +145,7 @@ def estimate_translations(
     first order: where `height_deviation` is above about 1 % it is too small (at 2 % by half, at 6 % sixfold).
     """
     if len(pixels) < 2:
-        raise GeometryError(
-            "too_few", "no motion is given; the stop at rest and one more are needed", motions=0
-        )
+        raise GeometryError("too_few", "no motion is given; the stop at rest and one more are needed", motions=0)
     scene = _scene(Ps, pixels, sigma)
     n = len(pixels) - 1
     if not reject:
@@ -270,9 +268,7 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
     if best.cost > chi2_distribution.isf(TAIL, max(1, freedom)):
         return _Single(None, None, MotionJudgement("points", conditioning, least, nan))
     try:
-        plane, directions = (
-            scene.start(np.array([stop])) if scene.flat else (svd.plane, svd.generator @ svd.plane)
-        )
+        plane, directions = scene.start(np.array([stop])) if scene.flat else (svd.plane, svd.generator @ svd.plane)
         fit = bundle_translations(
             images.cameras,
             scene.pixels[pair][:, :, both],
@@ -297,9 +293,7 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
     return _Single(z, variance, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
 
 
-def _second_singular_noise(
-    left: FloatArray, H: FloatArray, slopes: FloatArray, covariance: FloatArray
-) -> float:
+def _second_singular_noise(left: FloatArray, H: FloatArray, slopes: FloatArray, covariance: FloatArray) -> float:
     """Value that ``σ₂`` of the generator of a true translation exceeds with probability `TAIL`, from the
     homography's covariance (15, 15), G weighted by ``left``: by Weyl at most the norm of the error, whose square
     is nearly a scaled chi-square.

@@ -178,9 +178,7 @@ def bundle_translations(
     """
     images = read_images(Ps, pixels, sigma)
     if points.shape != (pixels.shape[2], 4):
-        raise GeometryError(
-            "shape", f"points {points.shape}; {(pixels.shape[2], 4)} are needed", points=points.shape
-        )
+        raise GeometryError("shape", f"points {points.shape}; {(pixels.shape[2], 4)} are needed", points=points.shape)
     _check_start(plane, directions, len(pixels) - 1)
     known = np.isfinite(points).all(axis=1) & ((images.weights > 0).sum(axis=(0, 1)) >= 2)
     images = _only(images, known)
@@ -217,9 +215,7 @@ def _check_start(plane: FloatArray, directions: FloatArray, n: int) -> None:
 
 def _only(images: Images, known: BoolArray) -> Images:
     if int(known.sum()) < 4:
-        raise GeometryError(
-            "too_few", f"{int(known.sum())} points are known; 4 are needed", points=int(known.sum())
-        )
+        raise GeometryError("too_few", f"{int(known.sum())} points are known; 4 are needed", points=int(known.sum()))
     return Images(images.cameras, images.pixels[:, :, known], images.weights[:, :, known])
 
 
@@ -262,9 +258,7 @@ def planar_map(Ps: FloatArray, m: FloatArray, depth: FloatArray, pixels: FloatAr
     """
     values, w = check_views(Ps, pixels, None)
     if 2 * int((w > 0).sum()) < 11:
-        raise GeometryError(
-            "too_few", f"{2 * int((w > 0).sum())} pixel coordinates; 11 unknowns need as many"
-        )
+        raise GeometryError("too_few", f"{2 * int((w > 0).sum())} pixel coordinates; 11 unknowns need as many")
     rows = (Ps[:, None, :2, :] - values[..., None] * Ps[:, None, 2:, :]) * (w / depth)[..., None, None]
     system = (rows[..., :, None] * m[None, :, None, None, :]).reshape(-1, 12)
     size = np.linalg.norm(system, axis=0)

@@ -27,9 +27,7 @@ def raw_generator(H: FloatArray) -> FloatArray:
     """
     H = np.asarray(H, dtype=np.float64)
     if H.shape != (4, 4) or not np.isfinite(H).all():
-        raise GeometryError(
-            "shape", f"a homography is a finite (4, 4) matrix, got {H.tolist()}", shape=H.shape
-        )
+        raise GeometryError("shape", f"a homography is a finite (4, 4) matrix, got {H.tolist()}", shape=H.shape)
     gamma = float(np.trace(H)) / 4.0
     if not abs(gamma) > 1e-9 * float(np.linalg.norm(H)):
         raise GeometryError(

@@ -98,9 +98,7 @@ def axis_angle(u: FloatArray, v: FloatArray) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v))
 
 
-def common_normal(
-    c1: FloatArray, u1: FloatArray, c2: FloatArray, u2: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def common_normal(c1: FloatArray, u1: FloatArray, c2: FloatArray, u2: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Feet (3,), (3,) of the common normal on two lines that are not parallel."""
     normal = np.cross(u1, u2)
     square = float(normal @ normal)

@@ -56,9 +56,7 @@ class ProjectiveChain:
             )
         for j, kind in enumerate(self.kinds):
             if kind not in KIND_CODES:
-                raise ChainError(
-                    f"joint {j} is of kind {kind!r}; known: {', '.join(KIND_CODES)}", joint=j, kind=kind
-                )
+                raise ChainError(f"joint {j} is of kind {kind!r}; known: {', '.join(KIND_CODES)}", joint=j, kind=kind)
         if not (np.isfinite(generators).all() and np.isfinite(zero).all()):
             raise ChainError("generators and zero must be finite")
         object.__setattr__(self, "kinds", tuple(self.kinds))

@@ -57,9 +57,7 @@ def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
         camera.matrix + np.tensordot(own(basis), basis, axes=1)
         for camera, basis in zip(model.cameras, given.cameras, strict=True)
     ]
-    lenses = [
-        camera.lens + own(basis) @ basis for camera, basis in zip(model.cameras, given.lenses, strict=True)
-    ]
+    lenses = [camera.lens + own(basis) @ basis for camera, basis in zip(model.cameras, given.lenses, strict=True)]
     points = np.array(
         [point + own(basis) @ basis for point, basis in zip(model.marker_points, given.markers, strict=True)]
     )
@@ -76,9 +74,7 @@ def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
     )
 
 
-def propagated(
-    model: CellModel, function: Callable[[CellModel], FloatArray]
-) -> tuple[FloatArray, FloatArray]:
+def propagated(model: CellModel, function: Callable[[CellModel], FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Values (r,) of ``function`` at the model and their covariance (r, r), to first order.
 
     ``function`` must not depend on the frame, nor, in the metric stratum, on the one open length. Raises

@@ -230,9 +230,7 @@ def chosen_columns(axes: Axes, links: tuple[Convention, ...]) -> tuple[tuple[str
     return tuple(rows)
 
 
-def dh_values(
-    parts: FramedModel, links: tuple[Convention, ...], known: KnownLength, names: CellModel
-) -> FloatArray:
+def dh_values(parts: FramedModel, links: tuple[Convention, ...], known: KnownLength, names: CellModel) -> FloatArray:
     """``a, α, β, d, θ`` and the prismatic scale (n, 6) in metres; ``names``: a model with the names of ``known``."""
     axes = axes_at_origin(parts)
     table = dh_table(axes, links)
@@ -279,11 +277,7 @@ def _check_known(model: CellModel, known: KnownLength) -> None:
     else:
         of_kind = {"prismatic": ("prismatic",)}.get(known.what, ("revolute", "prismatic"))
         valid, count = (
-            tuple(
-                name
-                for name, kind in zip(model.joint_names, model.joint_kinds, strict=True)
-                if kind in of_kind
-            ),
+            tuple(name for name, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind in of_kind),
             1,
         )
     if len(known.of) != count or len(set(known.of)) != count or not set(known.of) <= set(valid):
@@ -433,9 +427,7 @@ def base_origin(axes: Axes) -> FloatArray:
     anchor = axes.points[first]
     if last < len(axes.kinds):
         other = next(j for j in range(last + 1, len(axes.kinds)) if axes.kinds[j] == "revolute")
-        foot, _ = common_normal(
-            axes.points[last], axes.directions[last], axes.points[other], axes.directions[other]
-        )
+        foot, _ = common_normal(axes.points[last], axes.directions[last], axes.points[other], axes.directions[other])
         z = axes.directions[first]
         anchor = anchor + z * ((foot - anchor) @ z)
     return np.asarray(anchor, dtype=np.float64)

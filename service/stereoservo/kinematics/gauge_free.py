@@ -64,9 +64,7 @@ def gauge_free_quantities(model: CellModel) -> list[Quantity]:
 
 def not_identified(model: CellModel) -> list[tuple[str, str]]:
     """Quantities that the model leaves undetermined, with the reason: ``(name, reason)``."""
-    turning = [
-        name for name, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "revolute"
-    ]
+    turning = [name for name, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "revolute"]
     if model.stratum == "metric":
         return [
             ("scale of lengths", "images and joint angles fix ratios only; one known length gives the scale"),
@@ -190,15 +188,11 @@ def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
                 sense = np.sign(along @ (np.cos(angle), np.sin(angle))) / np.linalg.norm(along)
                 u, v = sense * along
                 # About the present angle, so that none jumps by half a turn.
-                turn = np.arctan2(
-                    np.cos(angle) * v - np.sin(angle) * u, np.cos(angle) * u + np.sin(angle) * v
-                )
+                turn = np.arctan2(np.cos(angle) * v - np.sin(angle) * u, np.cos(angle) * u + np.sin(angle) * v)
                 return np.array([np.degrees(angle + turn), sense * (line @ middle)])
 
             label = f"axis {joint} in {camera.name}"
-            groups.append(
-                Group(((f"{label}: angle", "°"), (f"{label}: distance from the middle", "px")), values)
-            )
+            groups.append(Group(((f"{label}: angle", "°"), (f"{label}: distance from the middle", "px")), values))
     return groups
 
 
@@ -397,10 +391,7 @@ def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]
     """Quantities: angles of successive axes; of nearly parallel revolute ones the two small signed angles of
     Hayati.
     """
-    two = [
-        link.link == "parallel" and kind == "revolute"
-        for link, kind in zip(links, model.joint_kinds, strict=True)
-    ]
+    two = [link.link == "parallel" and kind == "revolute" for link, kind in zip(links, model.joint_kinds, strict=True)]
     names: list[tuple[str, str]] = []
     for (a, b), signed in zip(pairwise(model.joint_names), two, strict=False):
         label = f"angle of axes {a} {b}"
@@ -424,9 +415,7 @@ def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
     """
     named = _named_lengths(model, parts, links)
     measured = _measured_lengths(parts, links)
-    usable = [
-        k for k, (_, arm) in enumerate(named) if arm and abs(measured[k]) > LEAST * np.abs(measured).max()
-    ]
+    usable = [k for k, (_, arm) in enumerate(named) if arm and abs(measured[k]) > LEAST * np.abs(measured).max()]
     if not usable:  # axes that all meet: the first baseline, or the first distance of markers
         usable = [next(k for k, (name, arm) in enumerate(named) if name.startswith(("baseline", "distance")))]
     largest = max(usable, key=lambda k: abs(measured[k]))
@@ -440,18 +429,13 @@ def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
     return Group(tuple((f"{named[k][0]} over {unit}", "") for k in kept), values)
 
 
-def _named_lengths(
-    model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
-) -> list[tuple[str, bool]]:
+def _named_lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]) -> list[tuple[str, bool]]:
     """Name of each measured length and whether it is the arm's; an empty name where a convention sets it."""
     chosen_of = chosen_columns(axes_at_origin(parts), links)
     names: list[tuple[str, bool]] = []
     for j, joint in enumerate(model.joint_names):
         chosen = chosen_of[j]
-        names += [
-            ("" if column in chosen else f"{column} of {joint}", column not in chosen)
-            for column in ("a", "d")
-        ]
+        names += [("" if column in chosen else f"{column} of {joint}", column not in chosen) for column in ("a", "d")]
         names.append((f"unit of {joint}", True) if parts.kinds[j] == "prismatic" else ("", False))
     left = model.cameras[0].name
     names += [(f"baseline {left} {camera.name}", False) for camera in model.cameras[1:]]

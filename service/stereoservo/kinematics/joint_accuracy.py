@@ -28,9 +28,7 @@ class JointAccuracy(msgspec.Struct, frozen=True, eq=False):
 
     def in_order(self, order: IntArray) -> JointAccuracy:
         """The same of joints in another order (n,)."""
-        return JointAccuracy(
-            self.random[order], self.repeatable[order], self.stated[order], self.posture[order]
-        )
+        return JointAccuracy(self.random[order], self.repeatable[order], self.stated[order], self.posture[order])
 
     def deviations(self, offsets: FloatArray) -> FloatArray:
         """Deviations (s, n) of the readings at positions ``offsets`` (s, n) from the model's zero."""

@@ -292,9 +292,7 @@ def joint_zeros(
         offsets=np.atleast_2d(encoders),
         point_covariance=point_covariance,
     )
-    found = measured_joints(
-        problem, limits=default if limits is None else limits, largest_deviation=largest_deviation
-    )
+    found = measured_joints(problem, limits=default if limits is None else limits, largest_deviation=largest_deviation)
     # The images tell these from each other by chance alone.
     nearest, *others = sorted(found, key=lambda angles: float(np.linalg.norm(angles.q)))
     return JointZeros(
@@ -349,9 +347,7 @@ def telling_motion(
     return max(found, key=lambda motion: (motion.told, motion.pixels), default=None)
 
 
-def sensitivity(
-    problem: JointProblem, changed: JointProblem, opposite: JointProblem, q: FloatArray
-) -> FloatArray:
+def sensitivity(problem: JointProblem, changed: JointProblem, opposite: JointProblem, q: FloatArray) -> FloatArray:
     """Change (n,) of the measured joints, at ``q`` (n,), by half the difference of two calibrations.
 
     First order: ``-(JᵀJ)⁻¹ Jᵀ (r₊ - r₋)/2``; with the calibration's covariance as columns of a root, the sum of
@@ -374,9 +370,7 @@ def _bounds(seen: SeenChain, limits: FloatArray | None, *, local: bool) -> Float
                 limits=bounds.tolist(),
             )
         return bounds
-    free = [
-        name for name, kind in zip(seen.joint_names, seen.chain.kinds, strict=True) if kind == "prismatic"
-    ]
+    free = [name for name, kind in zip(seen.joint_names, seen.chain.kinds, strict=True) if kind == "prismatic"]
     if free and not local:
         raise JointAnglesError(
             "limits", f"prismatic joints {free} need limits for a search without a start", joints=free

@@ -167,9 +167,7 @@ class JointProblem:
         """
         images, changes, _, front = self.moved(q)
         blocks = np.linalg.inv(self.seen.cameras[:, :, :3])[:, None]
-        target = (
-            blocks @ np.concatenate([self.pixels, np.ones((*self.pixels.shape[:-1], 1))], axis=-1)[..., None]
-        )
+        target = blocks @ np.concatenate([self.pixels, np.ones((*self.pixels.shape[:-1], 1))], axis=-1)[..., None]
         target = target[..., 0] / np.linalg.norm(target[..., 0], axis=-1, keepdims=True)
         rays, turning = (blocks @ images[..., None])[..., 0], blocks @ changes
         length = np.linalg.norm(rays, axis=-1)

@@ -234,11 +234,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         if count < 1:
             raise ModelFileError(path, key, f"is empty; a model has at least one {what}")
         if count > most:
-            beside = (
-                f" beside {len(model.scene_ids)} static ones"
-                if key == "marker_ids" and model.scene_ids
-                else ""
-            )
+            beside = f" beside {len(model.scene_ids)} static ones" if key == "marker_ids" and model.scene_ids else ""
             raise ModelFileError(path, key, f"has {count} entries; a cell has at most {most} {what}s{beside}")
     if len(model.joint_kinds) != n:
         raise ModelFileError(
@@ -260,10 +256,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
         ("marker_points", model.marker_points, (m, 4)),
         ("plane_at_infinity", model.plane_at_infinity, (4,)),
         *((f"cameras[{i}].matrix", camera.matrix, (3, 4)) for i, camera in enumerate(model.cameras)),
-        *(
-            (f"cameras[{i}].lens", camera.lens, (lens_size(model.cameras),))
-            for i, camera in enumerate(model.cameras)
-        ),
+        *((f"cameras[{i}].lens", camera.lens, (lens_size(model.cameras),)) for i, camera in enumerate(model.cameras)),
     ]
     if model.projective_to_euclidean is not None:
         arrays.append(("projective_to_euclidean", model.projective_to_euclidean, (4, 4)))
@@ -398,9 +391,7 @@ def _check_scene(model: CellModel, path: Path | str) -> None:
         if ids.count(marker) > 1:
             raise ModelFileError(path, "scene_ids", f"{marker} stands twice; entries must differ")
         if marker in model.marker_ids:
-            raise ModelFileError(
-                path, "scene_ids", f"{marker} is in marker_ids, too; a static id is not of the arm"
-            )
+            raise ModelFileError(path, "scene_ids", f"{marker} is in marker_ids, too; a static id is not of the arm")
     if ids and model.mount == "eye_in_hand":
         raise ModelFileError(
             path, "scene_ids", "holds ids although the cameras ride on the arm; from there nothing is static"
@@ -444,9 +435,7 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
     p = 0
     for key, bases, count, shape in expected:
         if len(bases) != count:
-            raise ModelFileError(
-                path, f"covariance.{key}", f"has {len(bases)} entries; the model has {count} of them"
-            )
+            raise ModelFileError(path, f"covariance.{key}", f"has {len(bases)} entries; the model has {count} of them")
         for i, basis in enumerate(bases):
             where = f"covariance.{key}[{i}]"
             if basis.shape[1:] != shape:
@@ -457,26 +446,20 @@ def _check_covariance(model: CellModel, given: ModelCovariance, path: Path | str
             p += len(basis)
     matrix, key = given.covariance, "covariance.covariance"
     if matrix.shape != (p, p):
-        raise ModelFileError(
-            path, key, f"has shape {matrix.shape}; the directions are {p}, ({p}, {p}) is needed"
-        )
+        raise ModelFileError(path, key, f"has shape {matrix.shape}; the directions are {p}, ({p}, {p}) is needed")
     if not np.isfinite(matrix).all():
         raise ModelFileError(path, key, "has entries that are not finite")
     variances = np.diag(matrix)
     if not (variances > 0.0).all():
         worst = int(variances.argmin())
-        raise ModelFileError(
-            path, key, f"variance {worst} is {variances[worst]:.3g}; positive ones are needed"
-        )
+        raise ModelFileError(path, key, f"variance {worst} is {variances[worst]:.3g}; positive ones are needed")
     deviations = np.sqrt(variances)
     correlation = matrix / deviations[:, None] / deviations[None, :]
     if not np.abs(correlation - correlation.T).max() <= SYMMETRY_TOLERANCE:
         raise ModelFileError(path, key, "is not symmetric")
     least = float(np.linalg.eigvalsh(correlation)[0])
     if least < -SYMMETRY_TOLERANCE:
-        raise ModelFileError(
-            path, key, f"has an eigenvalue of {least:.3g} as a correlation; none may be negative"
-        )
+        raise ModelFileError(path, key, f"has an eigenvalue of {least:.3g} as a correlation; none may be negative")
 
 
 def _check_algebra(model: CellModel, path: Path | str) -> None:
@@ -562,9 +545,7 @@ def _converted(tree: Any, path: Path | str) -> CellModel:
         shaped = _shaped(model.covariance, lens_size(model.cameras))
         model = msgspec.structs.replace(model, covariance=shaped)
     if not model.scene_ids:
-        model = msgspec.structs.replace(
-            model, scene_points=np.zeros((0, 4)), scene_covariances=np.zeros((0, 4, 4))
-        )
+        model = msgspec.structs.replace(model, scene_points=np.zeros((0, 4)), scene_covariances=np.zeros((0, 4, 4)))
     return model
 
 

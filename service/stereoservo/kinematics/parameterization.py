@@ -95,9 +95,7 @@ def exponentials(generators: FloatArray, kinds: tuple[Kind, ...], q: FloatArray)
     return np.stack(steps, axis=1)
 
 
-def camera_basis(
-    matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum
-) -> FloatArray:
+def camera_basis(matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum) -> FloatArray:
     """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) without gauge freedoms.
 
     ``other``: all but the matrix's own scale (11). ``right``: in addition without what a change of frame that

@@ -55,9 +55,7 @@ def metric_arm(model: CellModel, known: KnownLength) -> MetricArm:
     origin, R = base_origin(axes), _root_axes(axes)
     to_root = np.eye(4)
     to_root[:3, :3], to_root[:3, 3] = metres * R.T, -metres * R.T @ origin
-    at_zero = ProjectiveChain(parts.kinds, parts.generators, parts.zero).displacement(
-        np.zeros(len(parts.kinds))
-    )
+    at_zero = ProjectiveChain(parts.kinds, parts.generators, parts.zero).displacement(np.zeros(len(parts.kinds)))
     carries_cameras = model.mount == "eye_in_hand"
     move_markers, move_cameras = (np.eye(4), at_zero) if carries_cameras else (at_zero, np.eye(4))
     cameras = np.tile(np.eye(4), (len(parts.cameras), 1, 1))
@@ -92,16 +90,12 @@ def _root_axes(axes: Axes) -> FloatArray:
         if np.linalg.det(nearest) > 0 and np.abs(D[:3].T - nearest).max() < SQUARE:
             return nearest
     z = D[0]
-    across = [
-        w - z * (w @ z) for w in (*D[1:], *np.eye(3)) if np.linalg.norm(np.cross(w, z)) > np.sin(SQUARE)
-    ]
+    across = [w - z * (w @ z) for w in (*D[1:], *np.eye(3)) if np.linalg.norm(np.cross(w, z)) > np.sin(SQUARE)]
     x = unit(across[0])
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def urdf_text(
-    model: CellModel, arm: MetricArm, name: str, limits: Mapping[str, tuple[float, float, float]]
-) -> str:
+def urdf_text(model: CellModel, arm: MetricArm, name: str, limits: Mapping[str, tuple[float, float, float]]) -> str:
     """URDF: links ``base``, ``link_1`` … ``link_n``, ``marker_ID``, ``camera_NAME`` (optical frames).
 
     ``limits`` by joint: lowest, highest position, velocity [rad or m, s] in the model's units; revolute joints without

@@ -76,9 +76,7 @@ class Address(str):
         if problem:
             raise AddressError(f"not a URL: {problem}")
         if not self._given.isprintable():
-            raise AddressError(
-                "not a URL: it has characters that are not printed; those are written %0A and the like"
-            )
+            raise AddressError("not a URL: it has characters that are not printed; those are written %0A and the like")
         authority, tail = _split(rest)
         match = _HOST.fullmatch(authority)
         if match is None or int(match["port"] or 0) > 65535:
@@ -117,8 +115,7 @@ def without_secrets(value: Any) -> Any:
         return str(Address(value))
     if isinstance(value, Mapping):
         return {
-            key: HIDDEN if _SECRET_OPTION.search(str(key)) else without_secrets(item)
-            for key, item in value.items()
+            key: HIDDEN if _SECRET_OPTION.search(str(key)) else without_secrets(item) for key, item in value.items()
         }
     if isinstance(value, list | tuple):
         return [without_secrets(item) for item in value]
@@ -144,9 +141,7 @@ def _read(text: str) -> _Reading:
         return _Reading(scheme, before if at else None, behind, "")
     found = _HOST.fullmatch(authority)
     if found is not None and not tail.startswith("#"):
-        certain = (
-            ":" not in rest.rpartition("@")[0] or _NO_USER.fullmatch(found["host"]) or "." in found["host"]
-        )
+        certain = ":" not in rest.rpartition("@")[0] or _NO_USER.fullmatch(found["host"]) or "." in found["host"]
         return _Reading(scheme, None, rest, "" if certain else _BEHIND)
     within = tail.rpartition("@")[0]
     if tail.startswith("#"):

@@ -478,11 +478,7 @@ def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:
     info = msgspec.inspect.type_info(section)
     assert isinstance(info, msgspec.inspect.StructType)
     field_type = next((field.type for field in info.fields if field.encode_name == name), None)
-    return (
-        [str(word) for word in field_type.values]
-        if isinstance(field_type, msgspec.inspect.LiteralType)
-        else []
-    )
+    return [str(word) for word in field_type.values] if isinstance(field_type, msgspec.inspect.LiteralType) else []
 
 
 _SECTIONS: dict[str, type[msgspec.Struct]] = {

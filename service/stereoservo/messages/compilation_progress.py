@@ -31,11 +31,7 @@ class CompilationProgress(msgspec.Struct, frozen=True):
     @property
     def words(self) -> str:
         """As text."""
-        return (
-            f"{self.done} of about {max(self.total, self.done)} kernels"
-            if self.total
-            else f"{self.done} kernels"
-        )
+        return f"{self.done} of about {max(self.total, self.done)} kernels" if self.total else f"{self.done} kernels"
 
 
 def progress_path(runtime: Path, part: str) -> Path:

@@ -200,9 +200,7 @@ def create_directories(directories: CellDirectories) -> None:
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
-            raise DirectoryError(
-                f"{path}: {error.strerror}; set {STATE_VARIABLE} to a directory you own"
-            ) from error
+            raise DirectoryError(f"{path}: {error.strerror}; set {STATE_VARIABLE} to a directory you own") from error
     for path in (
         directories.control_socket,
         directories.reports_socket,
@@ -222,8 +220,7 @@ def _private(path: Path, variable: str) -> None:
         raise DirectoryError(f"{path}: is not a directory of user {os.getuid()}; {advice}")
     if found.st_mode & 0o022:
         raise DirectoryError(
-            f"{path}: others may write to it (mode {stat.S_IMODE(found.st_mode):o}); chmod 700 it, or "
-            f"{advice}"
+            f"{path}: others may write to it (mode {stat.S_IMODE(found.st_mode):o}); chmod 700 it, or {advice}"
         )
 
 

@@ -76,13 +76,9 @@ def check_writable(path: Path) -> None:
     if path.is_dir():
         raise OSError(errno.EISDIR, f"{os.strerror(errno.EISDIR)}: the name of a file is needed", str(path))
     if path.exists() and not path.is_file():
-        raise OSError(
-            errno.EINVAL, "Not a regular file: the name of a file, new or old, is needed", str(path)
-        )
+        raise OSError(errno.EINVAL, "Not a regular file: the name of a file, new or old, is needed", str(path))
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise OSError(
-            errno.EACCES, f"{os.strerror(errno.EACCES)}: a folder to write to is needed", str(path.parent)
-        )
+        raise OSError(errno.EACCES, f"{os.strerror(errno.EACCES)}: a folder to write to is needed", str(path.parent))
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -36,9 +36,7 @@ Homogeneous = tuple[float, float, float, float]
 Pixel = tuple[float, float]
 
 
-class FeatureTarget(
-    msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True
-):
+class FeatureTarget(msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True):
     """Set-points: for each camera, marker id -> (u, v), raw pixels. ``model_epoch``: the goal is refused with another
     model; None: any model.
     """
@@ -57,9 +55,7 @@ class PointTarget(msgspec.Struct, frozen=True, tag="points", tag_field="kind", f
     model_epoch: Epoch
 
 
-class DisplacementTarget(
-    msgspec.Struct, frozen=True, tag="displacement", tag_field="kind", forbid_unknown_fields=True
-):
+class DisplacementTarget(msgspec.Struct, frozen=True, tag="displacement", tag_field="kind", forbid_unknown_fields=True):
     """A displacement of the marker body from its current pose: 4x4, row-major, projective, current -> goal.
 
     Either in the frame of the model of ``model_epoch``, or in the projective basis of five markers ``basis`` of the
@@ -131,9 +127,7 @@ class IncidenceSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fixed: Feature
 
 
-class IncidenceTarget(
-    msgspec.Struct, frozen=True, tag="incidence", tag_field="kind", forbid_unknown_fields=True
-):
+class IncidenceTarget(msgspec.Struct, frozen=True, tag="incidence", tag_field="kind", forbid_unknown_fields=True):
     """Incidence constraints; the remaining degrees of freedom are free, or serve ``secondary`` in their null space.
 
     ``secondary``: joint positions, or set-points, approached as far as the incidences allow.
@@ -276,9 +270,7 @@ class UpdateGoal(msgspec.Struct, frozen=True, tag="update", tag_field="command",
     stamp_s: float | None = None
 
 
-class AcknowledgeGoal(
-    msgspec.Struct, frozen=True, tag="acknowledge", tag_field="command", forbid_unknown_fields=True
-):
+class AcknowledgeGoal(msgspec.Struct, frozen=True, tag="acknowledge", tag_field="command", forbid_unknown_fields=True):
     """Release a reached goal with ``acknowledge_s``, so that the queue continues."""
 
     id: GoalId
@@ -338,9 +330,7 @@ class AuxiliarySpec(msgspec.Struct, frozen=True):
     velocity: float = 0.0
 
 
-class OrderAuxiliary(
-    msgspec.Struct, frozen=True, tag="auxiliary", tag_field="command", forbid_unknown_fields=True
-):
+class OrderAuxiliary(msgspec.Struct, frozen=True, tag="auxiliary", tag_field="command", forbid_unknown_fields=True):
     """Command positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name."""
 
     values: dict[str, float]
@@ -354,9 +344,7 @@ class Home(msgspec.Struct, frozen=True, tag="home", tag_field="command", forbid_
     lease_s: Lease | None = None
 
 
-class Calibrate(
-    msgspec.Struct, frozen=True, tag="calibrate", tag_field="command", forbid_unknown_fields=True
-):
+class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="command", forbid_unknown_fields=True):
     """Run the trial motions of the cell file and fit a model.
 
     ``check``: run the short check motion instead, and report whether the model is still valid.
@@ -397,9 +385,7 @@ class ReanchorRefused(
     unit: str = ""
 
 
-class ExtendLeases(
-    msgspec.Struct, frozen=True, tag="extend_leases", tag_field="command", forbid_unknown_fields=True
-):
+class ExtendLeases(msgspec.Struct, frozen=True, tag="extend_leases", tag_field="command", forbid_unknown_fields=True):
     """Extend all leases and acknowledgement times by ``seconds``, during which clients could not be heard.
 
     Sent by the servo process; no client may send it, and it is not answered.

@@ -9,8 +9,7 @@ import msgspec
 
 What = Literal["a", "d", "prismatic", "markers", "baseline"]
 FORMS = (
-    "markers:10,11=0.05 (two ids), baseline:left,right=0.2 (two cameras), prismatic:j1=1, a:j2=0.4, d:j3=0.1 (a "
-    "joint)"
+    "markers:10,11=0.05 (two ids), baseline:left,right=0.2 (two cameras), prismatic:j1=1, a:j2=0.4, d:j3=0.1 (a joint)"
 )
 
 

@@ -159,9 +159,7 @@ def state_message(
         error_px=_number(status.error_px) if fresh else None,
         task_error=tuple(float(x) for x in status.task_error if math.isfinite(x)),
         innovation_px={
-            name: value
-            for name, value in status.innovation_px.items()
-            if name in fresh and math.isfinite(value)
+            name: value for name, value in status.innovation_px.items() if name in fresh and math.isfinite(value)
         },
         visible={name: count for name, count in status.visible.items() if name in fresh},
         loop=LoopInfo(
@@ -188,9 +186,7 @@ def state_message(
         effort_limits=_finite(names, status.effort_limits),
         following_limits=_finite(names, status.following_limits),
         health=_health(status.health, fresh),
-        auxiliary={
-            name: value for name, value in state.auxiliary.items() if measured and math.isfinite(value)
-        },
+        auxiliary={name: value for name, value in state.auxiliary.items() if measured and math.isfinite(value)},
         joints_age_s=joints_age_s,
         camera_age_s=cameras,
         halt=halt,

@@ -79,9 +79,7 @@ class Record(msgspec.Struct, frozen=True, tag="record", tag_field="command", for
     images: bool = False
 
 
-class Synthesise(
-    msgspec.Struct, frozen=True, tag="synthesise", tag_field="command", forbid_unknown_fields=True
-):
+class Synthesise(msgspec.Struct, frozen=True, tag="synthesise", tag_field="command", forbid_unknown_fields=True):
     """Make the goal ``name`` from CAD drawings. Handled by the gateway, not forwarded to the core.
 
     ``workpiece``, ``tool``: marker -> (x, y, z) in the coordinates of the respective drawing, with one unit of length
@@ -478,9 +476,7 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
         known = _keys(_type_at(kind, value, parts), _value_at(value, parts), text.split("`")[1])
         return at + text + (f"; {known}" if known else "")
     given = _value_at(value, parts)
-    said = (
-        "" if given is None or isinstance(given, dict | list) or repr(given) in text else f", got {given!r}"
-    )
+    said = "" if given is None or isinstance(given, dict | list) or repr(given) in text else f", got {given!r}"
     words = _words(_type_at(kind, value, parts), parts[-1]) if text.startswith("Invalid ") and parts else ()
     return at + text + said + (f"; valid: {', '.join(words)}" if words else "")
 
@@ -527,10 +523,7 @@ def _type_at(kind: Any, value: Any, parts: Sequence[str]) -> Any:
     found: Any = _described(kind)
     for k, part in enumerate(parts):
         if part.startswith("["):
-            inner = [
-                getattr(member, "item_type", getattr(member, "value_type", None))
-                for member in _members(found)
-            ]
+            inner = [getattr(member, "item_type", getattr(member, "value_type", None)) for member in _members(found)]
             found = next(filter(None, inner), None)
         elif any(struct.tag_field == part for struct in _structs(found)):
             return found

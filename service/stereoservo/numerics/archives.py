@@ -31,9 +31,7 @@ def read_archive(data: bytes, limit: int) -> dict[str, npt.NDArray[Any]]:
             stored = len(data) if item.compress_type == zipfile.ZIP_STORED else len(data) * MOST_EXPANSION
             if item.file_size > stored:
                 raise ValueError(f"{item.filename} is said to have {item.file_size} bytes")
-        return {
-            item.filename.removesuffix(".npy"): _array(item.filename, archive.read(item)) for item in items
-        }
+        return {item.filename.removesuffix(".npy"): _array(item.filename, archive.read(item)) for item in items}
 
 
 def _array(name: str, data: bytes) -> npt.NDArray[Any]:
@@ -41,9 +39,7 @@ def _array(name: str, data: bytes) -> npt.NDArray[Any]:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"{name} has npy version {version}; 1.0 and 2.0 are read")
-    read_header = (
-        np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    )
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read_header(file)
     if dtype.hasobject or dtype.itemsize == 0:
         raise ValueError(f"{name} is an array of {dtype}; numbers are read")

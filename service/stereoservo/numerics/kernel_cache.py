@@ -34,9 +34,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, py_func: Any) -> None:
         super().__init__(py_func)
-        file_hash(
-            inspect.getfile(py_func)
-        )  # as imported: an upgrade may change the file before this is compiled
+        file_hash(inspect.getfile(py_func))  # as imported: an upgrade may change the file before this is compiled
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return (*super()._index_key(sig, codegen), dependencies(self._py_func))

@@ -101,9 +101,7 @@ def add_equation(row: FloatArray, error: float, weight: float, N: FloatArray, b:
 
 
 @kernel
-def add_pixel_equations(
-    rows: FloatArray, u: float, v: float, weight: float, N: FloatArray, b: FloatArray
-) -> None:
+def add_pixel_equations(rows: FloatArray, u: float, v: float, weight: float, N: FloatArray, b: FloatArray) -> None:
     """Add the two equations of a pixel: `add_equation` for ``rows`` (2, n) and errors ``u``, ``v``."""
     for i in range(b.shape[0]):
         weighted_u, weighted_v = weight * rows[0, i], weight * rows[1, i]
@@ -124,9 +122,7 @@ def damped_solve(N: FloatArray, b: FloatArray, damping: float, x: FloatArray) ->
 
 
 @kernel
-def damped_least_squares(
-    J: FloatArray, e: FloatArray, weights: FloatArray, damping: float
-) -> tuple[FloatArray, float]:
+def damped_least_squares(J: FloatArray, e: FloatArray, weights: FloatArray, damping: float) -> tuple[FloatArray, float]:
     """``x`` (n,) of least ``Σ w²(Jx − e)² + damping·d·|x|²``, ``d`` the largest diagonal of ``JᵀW²J``.
 
     ``J`` (r, n), ``e`` (r,), ``weights`` (r,) = 1/sigma, 0 where missing (the row is then not read). Returns
@@ -172,9 +168,7 @@ def right_singular(A: FloatArray) -> tuple[FloatArray, FloatArray]:
                     beta += U[r, q] * U[r, q]
                     gamma += U[r, p] * U[r, q]
                 size = abs(gamma)
-                if not (
-                    size > floor * math.sqrt(max(alpha, beta)) and size > ORTHOGONAL * math.sqrt(alpha * beta)
-                ):
+                if not (size > floor * math.sqrt(max(alpha, beta)) and size > ORTHOGONAL * math.sqrt(alpha * beta)):
                     continue
                 rotated = True
                 zeta = (beta - alpha) / (2.0 * gamma)

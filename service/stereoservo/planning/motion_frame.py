@@ -174,9 +174,7 @@ def _invariant_form(blocks: FloatArray, start: FloatArray) -> FloatArray:
             shifted[i, i] += SHIFT * trace
         if cholesky_solve(shifted, q, x) == 0.0:
             break
-        size = math.sqrt(
-            x[0] * x[0] + x[3] * x[3] + x[5] * x[5] + 2.0 * (x[1] * x[1] + x[2] * x[2] + x[4] * x[4])
-        )
+        size = math.sqrt(x[0] * x[0] + x[3] * x[3] + x[5] * x[5] + 2.0 * (x[1] * x[1] + x[2] * x[2] + x[4] * x[4]))
         for i in range(6):
             q[i] = x[i] / size
     Q = np.empty((3, 3))
@@ -204,9 +202,7 @@ def _root(Q: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
-def motion_frame(
-    operators: FloatArray, plane: FloatArray, centre: FloatArray, eyes: FloatArray
-) -> FloatArray:
+def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, eyes: FloatArray) -> FloatArray:
     """``W`` (4, 4): ``W (x, y, z, 1)`` is a point of height 1, ``W (0, 0, 0, 1)`` the ``centre`` (4,).
 
     In its coordinates the ``operators`` (n, 4, 4) are Euclidean twists, and the mean distance of ``eyes`` (c, 4) from

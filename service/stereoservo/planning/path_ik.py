@@ -184,9 +184,7 @@ def move_arm(arm: Arm, step: FloatArray) -> None:
 
 
 @kernel
-def reach(
-    required: FloatArray, constraints: Constraints, arm: Arm, redundant: bool, iterations: int
-) -> float:
+def reach(required: FloatArray, constraints: Constraints, arm: Arm, redundant: bool, iterations: int) -> float:
     """Largest distance left after at most ``iterations`` steps of the arm that bring its body to ``required`` (m, 3).
 
     The arm moves in place, as near as it comes. ``redundant``: it has self-motion, which keeps its joints away from
@@ -272,9 +270,7 @@ def pixel_distance(
 
 
 @kernel
-def _points_on_path(
-    path: FloatArray, path_parameter: float, body: FloatArray, residual: FloatArray
-) -> FloatArray:
+def _points_on_path(path: FloatArray, path_parameter: float, body: FloatArray, residual: FloatArray) -> FloatArray:
     """Required points (m, 3) of the body on the path, with its share of the ``residual`` (m, 3) at the end."""
     points = moved(pose_on_path(path, path_parameter), body)
     for p in range(points.shape[0]):
@@ -311,9 +307,7 @@ def _deviation_between(
 
 
 @kernel
-def _record_sample(
-    k: int, path_parameter: float, constraints: Constraints, arm: Arm, record: PathRecord
-) -> int:
+def _record_sample(k: int, path_parameter: float, constraints: Constraints, arm: Arm, record: PathRecord) -> int:
     """Record sample ``k`` of the arm and check it: kind of limit broken or −1."""
     for j in range(arm.joints.shape[0]):
         record.joints[k, j] = arm.joints[j]
@@ -322,9 +316,7 @@ def _record_sample(
             record.displacements[k, i, r] = arm.displacement[i, r]
     broken = check_joints(arm.joints, path_parameter, constraints, record.table)
     if broken < 0:
-        broken = check_view(
-            moved(arm.displacement, constraints.body), path_parameter, constraints, record.table, True
-        )
+        broken = check_view(moved(arm.displacement, constraints.body), path_parameter, constraints, record.table, True)
     return broken
 
 
@@ -401,9 +393,7 @@ def follow_path(
                 )
             if distance <= limit:
                 limit = STRIDE_PX
-                distance, marker = _deviation_between(
-                    arm, record.joints[k - 1], record.displacements[k - 1], s
-                )
+                distance, marker = _deviation_between(arm, record.joints[k - 1], record.displacements[k - 1], s)
             if not distance <= limit:
                 table = record.table
                 table[5, 0], table[5, 1] = limit - distance, limit - distance

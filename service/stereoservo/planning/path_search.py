@@ -393,9 +393,7 @@ def _end(p: Planning) -> None:
 
 
 @kernel
-def _distance_from_goal(
-    displacement: FloatArray, constraints: Constraints, goal: FloatArray
-) -> tuple[float, int]:
+def _distance_from_goal(displacement: FloatArray, constraints: Constraints, goal: FloatArray) -> tuple[float, int]:
     """`pixel_distance` of the body after its ``displacement`` (4, 4) from the ``goal`` (m, 3)."""
     s = constraints
     return pixel_distance(s.cameras, s.must_stay_visible, moved(displacement, s.body), goal)
@@ -722,9 +720,7 @@ class JointPace(NamedTuple):
 
 
 @kernel
-def sample_times(
-    joints: FloatArray, velocity_max: FloatArray, acceleration_max: FloatArray, even: bool
-) -> FloatArray:
+def sample_times(joints: FloatArray, velocity_max: FloatArray, acceleration_max: FloatArray, even: bool) -> FloatArray:
     """Times (K,) [s] from 0 of the samples ``joints`` (K, n), with limits (n,), infinite where there is none.
 
     ``even``: the samples follow each other at one pace, as far as accelerations let them.

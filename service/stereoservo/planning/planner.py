@@ -97,17 +97,13 @@ def start_planning(request: PlanRequest) -> Planning:
         )
     body, goal, camera_centres = local[:m].copy(), local[m : 2 * m].copy(), local[2 * m : -2].copy()
     if not _spans_a_plane(body):
-        raise PlanRequestError(
-            f"{len(body)} markers on one line fix no pose: three that span a plane are needed"
-        )
+        raise PlanRequestError(f"{len(body)} markers on one line fix no pose: three that span a plane are needed")
     faces = np.array(r.faces, dtype=np.int64, order="C", copy=True).reshape(-1, 3)
     lying = int(_face_on_a_line(body, faces))
     if lying >= 0:
         raise PlanRequestError(f"the markers {faces[lying].tolist()} of a face are on one line")
     centre_translation = local[-1].copy()
-    rotation, residual, own, rank = _whole_displacement(
-        body, goal, centre_translation, frame, inverse, operators
-    )
+    rotation, residual, own, rank = _whole_displacement(body, goal, centre_translation, frame, inverse, operators)
     constraints, refusal = read_constraints(r, frame, camera_centres, body, goal)
     kinds = np.stack(turnings(rotation, face_normal(body, constraints.faces)))
     planning = Planning(
@@ -163,9 +159,7 @@ def _check(request: PlanRequest) -> None:
         raise PlanRequestError("a plan needs a joint and a camera at least")
     faces = np.asarray(request.faces)
     if faces.size and not (int(faces.min()) >= 0 and int(faces.max()) < len(request.points)):
-        raise PlanRequestError(
-            f"faces name markers from 0 to {len(request.points) - 1}, got {faces.tolist()}"
-        )
+        raise PlanRequestError(f"faces name markers from 0 to {len(request.points) - 1}, got {faces.tolist()}")
     _check_limits(request.limits)
 
 
@@ -184,17 +178,13 @@ def _check_limits(limits: PlanLimits) -> None:
 
 
 @kernel
-def _into_frame(
-    operators: FloatArray, points: FloatArray, first: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _into_frame(operators: FloatArray, points: FloatArray, first: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Motion frame and its inverse (4, 4), and ``points`` (k, 4) of height 1 as (k, 3) in it.
 
     Of the points, the camera centres begin at ``first``; the last but one is the centre, the last the centre's target.
     """
     k = points.shape[0]
-    frame = motion_frame(
-        operators, plane_at_infinity(operators, points), points[k - 2], points[first : k - 2]
-    )
+    frame = motion_frame(operators, plane_at_infinity(operators, points), points[k - 2], points[first : k - 2])
     inverse = invert4(frame)
     return frame, inverse, in_frame(inverse, points)
 

@@ -171,9 +171,7 @@ def _kernel(operators: FloatArray, system: FloatArray, freedoms: Freedoms | None
     # An arm of one freedom has no second value; unit planes, points and operators give about 1.
     second = float(values[rank - 2]) if rank > 1 else 1.0
     if second <= DEGENERATE_RATIO * largest:
-        raise DegenerateStepError(
-            f"{freedom}: more than one motion fits (second singular value {second:.3g})"
-        )
+        raise DegenerateStepError(f"{freedom}: more than one motion fits (second singular value {second:.3g})")
     threshold = NOISE_RATIO if rank == RIGID_FREEDOMS else REACH_RATIO
     if smallest > threshold * second:
         raise NotReachableError(freedom, smallest / second, threshold)

@@ -151,9 +151,7 @@ def _face(A: FloatArray) -> FloatArray:
     plane = plane_of_points(A[0], A[1], A[2])
     edges = float(np.linalg.norm(A[1] - A[0]) * np.linalg.norm(A[2] - A[0])) * float(np.linalg.norm(A[0]))
     if not float(np.linalg.norm(plane)) > FLAT_FACE * edges:
-        raise DegenerateFaceError(
-            f"the three points {A.tolist()} are collinear; three that span a face are needed"
-        )
+        raise DegenerateFaceError(f"the three points {A.tolist()} are collinear; three that span a face are needed")
     return plane
 
 
@@ -176,9 +174,7 @@ def _positive(primitive: Primitive, theta: float) -> tuple[Primitive, float]:
     """The sense of the axis is free: the one that makes the angle a distance."""
     if theta >= 0.0:
         return primitive, theta
-    flipped = Primitive(
-        -primitive.screw, -primitive.operator, primitive.smallest, primitive.second, primitive.largest
-    )
+    flipped = Primitive(-primitive.screw, -primitive.operator, primitive.smallest, primitive.second, primitive.largest)
     return flipped, -theta
 
 

@@ -64,9 +64,7 @@ def _rate(pace: float, values: FloatArray, k: int, i: int) -> float:
 
 
 @kernel
-def interpolate_into(
-    times: FloatArray, values: FloatArray, t_s: float, out: FloatArray, rates: FloatArray
-) -> None:
+def interpolate_into(times: FloatArray, values: FloatArray, t_s: float, out: FloatArray, rates: FloatArray) -> None:
     """Values (w,) and rates (w,) at ``t_s`` of samples (K, w): cubic, with continuous rates; at rest outside."""
     K, width = values.shape
     if K == 1 or not t_s > times[0]:
@@ -106,9 +104,7 @@ def sample_plan(plan: Plan, t_s: float) -> PlanSample:
     return PlanSample(H.reshape(4, 4), H_rate.reshape(4, 4), joints, joint_rates)
 
 
-def planned_joints(
-    plan: Plan, begin_s: float, end_s: float, dt_s: float, joints: FloatArray
-) -> PlannedJoints:
+def planned_joints(plan: Plan, begin_s: float, end_s: float, dt_s: float, joints: FloatArray) -> PlannedJoints:
     """For an arm at ``joints`` (n,) and a step of ``dt_s`` in which the plan's time goes from ``begin_s`` to ``end_s``.
 
     Empty, with weight 0, when the plan is at its end.

@@ -149,9 +149,7 @@ def elevation(points: FloatArray, faces: IntArray, f: int, side: float, camera_c
     wx = camera_centre[0] - (points[i0, 0] + points[i1, 0] + points[i2, 0]) / 3.0
     wy = camera_centre[1] - (points[i0, 1] + points[i1, 1] + points[i2, 1]) / 3.0
     wz = camera_centre[2] - (points[i0, 2] + points[i1, 2] + points[i2, 2]) / 3.0
-    sine = (nx * wx + ny * wy + nz * wz) / math.sqrt(
-        (nx * nx + ny * ny + nz * nz) * (wx * wx + wy * wy + wz * wz)
-    )
+    sine = (nx * wx + ny * wy + nz * wz) / math.sqrt((nx * nx + ny * ny + nz * nz) * (wx * wx + wy * wy + wz * wz))
     return side * math.asin(min(1.0, max(-1.0, sine)))
 
 
@@ -203,9 +201,7 @@ def check_view(
 
 
 @kernel
-def check_joints(
-    joints: FloatArray, path_parameter: float, constraints: Constraints, table: FloatArray
-) -> int:
+def check_joints(joints: FloatArray, path_parameter: float, constraints: Constraints, table: FloatArray) -> int:
     """The first kind of limit that ``joints`` (n,) break, or −1; their clearance is entered into the table (6, 7)."""
     s = constraints
     n = joints.shape[0]

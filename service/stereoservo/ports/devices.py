@@ -63,9 +63,7 @@ class JointSpec(msgspec.Struct, frozen=True):
         for name in ("position_min", "position_max", "velocity_max", "acceleration_max", "resolution"):
             msgspec.structs.force_setattr(self, name, float(getattr(self, name)))
         if not 0.0 <= self.resolution < math.inf:
-            raise ValueError(
-                f"joint {self.name!r}: encoder resolution {self.resolution:g}; at least 0 is needed"
-            )
+            raise ValueError(f"joint {self.name!r}: encoder resolution {self.resolution:g}; at least 0 is needed")
 
 
 class JointDriverDescription(msgspec.Struct, frozen=True):

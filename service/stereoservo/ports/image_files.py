@@ -164,17 +164,13 @@ class ImageWriter:
         sidecar = sidecar_of(video)
         for path in (video, sidecar):
             if path.exists():
-                raise ImageFileError(
-                    path, "exists", "is there already; a recording never writes over another"
-                )
+                raise ImageFileError(path, "exists", "is there already; a recording never writes over another")
         self._check_room(0)
         header = ImageHeader(SCHEMA, camera, *size, rate_hz, driver, boot=boot_id())
         self._sidecar = _open_sidecar(sidecar)
         self._put(header)
         padded = self._width + self._width % 2, self._height + self._height % 2
-        self._padded: ImageArray | None = (
-            None if padded == size else np.zeros((padded[1], padded[0]), np.uint8)
-        )
+        self._padded: ImageArray | None = None if padded == size else np.zeros((padded[1], padded[0]), np.uint8)
         self._video = cv2.VideoWriter(
             str(video),
             cv2.CAP_FFMPEG,
@@ -221,9 +217,7 @@ class ImageWriter:
             )  # fmt: skip
         self._check_room(image.nbytes)
         self._video.write(self._even(image))
-        line = ImageLine(
-            self.frames, frame.seq, frame.t_shutter_ns, frame.t_received_ns, crc_of(image), left_out
-        )
+        line = ImageLine(self.frames, frame.seq, frame.t_shutter_ns, frame.t_received_ns, crc_of(image), left_out)
         self._put(line)
         self._last_ns = frame.t_shutter_ns
         self.frames += 1
@@ -346,9 +340,7 @@ class ImageReader:
     def _open(self, camera: str) -> cv2.VideoCapture:
         header = self.header
         if camera and header.camera != camera:
-            raise ImageFileError(
-                self.path, "camera", f"is a recording of camera {header.camera!r}, not of {camera!r}"
-            )
+            raise ImageFileError(self.path, "camera", f"is a recording of camera {header.camera!r}, not of {camera!r}")
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, SLOWEST_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, SLOWEST_MS]
         capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG, limits)
         if not capture.isOpened():
@@ -427,16 +419,12 @@ class ImageReader:
         if isinstance(line, ImageEnd):
             self.end = line
             if line.frames != self.frame:
-                raise self._damaged(
-                    f"it ends after {self.frame} frames and says {line.frames}: lines are missing"
-                )
+                raise self._damaged(f"it ends after {self.frame} frames and says {line.frames}: lines are missing")
             return None
         if not isinstance(line, ImageLine) or line.frame != self.frame:
             raise self._damaged("its line is another frame's: lines are missing, or out of order")
         if line.t_shutter_ns <= self._last_ns:
-            raise self._damaged(
-                f"stamp {line.t_shutter_ns} ns is not after the one before, {self._last_ns} ns"
-            )
+            raise self._damaged(f"stamp {line.t_shutter_ns} ns is not after the one before, {self._last_ns} ns")
         self._last_ns = line.t_shutter_ns
         return line
 
@@ -509,9 +497,7 @@ def _open_header(path: Path, video: Path) -> tuple[IO[bytes], ImageHeader]:
     if not isinstance(header, ImageHeader):
         cause = f"its first line is no header of a recorded camera ({data[:60]!r})"
     elif header.schema != SCHEMA or header.codec != CODEC:
-        cause = (
-            f"is {header.schema!r} with codec {header.codec!r}; this version reads {SCHEMA!r} with {CODEC!r}"
-        )
+        cause = f"is {header.schema!r} with codec {header.codec!r}; this version reads {SCHEMA!r} with {CODEC!r}"
     elif header.width < 1 or header.height < 1:
         cause = f"its pictures are {header.width}x{header.height} px"
     if cause or not isinstance(header, ImageHeader):

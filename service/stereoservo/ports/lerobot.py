@@ -127,9 +127,7 @@ def read_info(folder: Path) -> Info:
             f"format {info.codebase_version!r}; {', '.join(VERSIONS)} are read: lerobot has converters",
         )
     if not (math.isfinite(info.fps) and info.fps > 0.0 and info.chunks_size > 0):
-        raise _wrong(
-            folder, f"fps = {info.fps}, chunks_size = {info.chunks_size}; positive numbers are needed"
-        )
+        raise _wrong(folder, f"fps = {info.fps}, chunks_size = {info.chunks_size}; positive numbers are needed")
     return info
 
 
@@ -141,9 +139,7 @@ def state_names(info: Info, folder: Path) -> list[str]:
     if feature is None or len(feature.shape) != 1:
         raise _wrong(folder, f"no feature {STATE!r} of one row a frame; it has {', '.join(info.features)}")
     if not 1 <= feature.shape[0] <= MOST_STATES:
-        raise _wrong(
-            folder, f"{STATE!r} has {feature.shape[0]} parts in info.json; 1 to {MOST_STATES} are valid"
-        )
+        raise _wrong(folder, f"{STATE!r} has {feature.shape[0]} parts in info.json; 1 to {MOST_STATES} are valid")
     stated = _flat(feature.names)
     if len(stated) != feature.shape[0]:
         stated = [""] * feature.shape[0]
@@ -214,13 +210,9 @@ def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = Non
     ``observation.images.``; others, and two of which that is the same, by the whole features. Raises DataSetError.
     """
     keys = [
-        key
-        for key, feature in info.features.items()
-        if feature.dtype in ("video", "image") and not _of_depth(feature)
+        key for key, feature in info.features.items() if feature.dtype in ("video", "image") and not _of_depth(feature)
     ]
-    short = [
-        "image" if key == IMAGES[0] else key.removeprefix(IMAGES[1]).removeprefix(IMAGES[2]) for key in keys
-    ]
+    short = ["image" if key == IMAGES[0] else key.removeprefix(IMAGES[1]).removeprefix(IMAGES[2]) for key in keys]
     count = Counter([*short, *keys])
     found = {name if count[name] == 1 else key: key for name, key in zip(short, keys, strict=True)}
     if wanted is None:
@@ -242,9 +234,7 @@ def _of_depth(feature: Feature) -> bool:
 # -- tables ---------------------------------------------------------------------------------------------------
 
 
-def _tables(
-    folder: Path, part: str, columns: list[str], episode: int | None = None
-) -> dict[Path, Mapping[str, Any]]:
+def _tables(folder: Path, part: str, columns: list[str], episode: int | None = None) -> dict[Path, Mapping[str, Any]]:
     """Columns of all parquet files of a part of a data set, or of the rows of one ``episode``, as lists by name.
     Raises DataSetError.
     """
@@ -306,9 +296,7 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
         raise _wrong(folder, f"states that are not finite, or stamps beyond {LARGEST_STAMP_S:g} s")
     counts = np.concatenate([frame, episode])
     if not ((counts >= 0.0) & (counts <= MOST_COUNTED) & (counts == np.floor(counts))).all():
-        raise _wrong(
-            folder, f"frame_index and episode_index are to be whole numbers from 0 to {MOST_COUNTED}"
-        )
+        raise _wrong(folder, f"frame_index and episode_index are to be whole numbers from 0 to {MOST_COUNTED}")
     order = np.lexsort((frame, episode))
     episode, frame, stamp = episode[order].astype(np.int64), frame[order].astype(np.int64), stamp[order]
     together = np.diff(episode) == 0
@@ -353,9 +341,7 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
 
     def file_of(**numbers: int) -> Path:
         names = ", ".join(("video_key", *numbers))
-        with _reading(
-            f"LeRobot data set {folder}: video_path = {template[:200]!r}; its parts may be {names}"
-        ):
+        with _reading(f"LeRobot data set {folder}: video_path = {template[:200]!r}; its parts may be {names}"):
             return folder / template.format(video_key=key, **numbers)
 
     if info.codebase_version != VERSIONS[-1]:
@@ -367,12 +353,8 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
     needed = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
     places = {}
     for table in _tables(folder, "meta/episodes", ["episode_index", *needed]).values():
-        for episode, chunk, file, begin in zip(
-            *(table[name] for name in ("episode_index", *needed)), strict=True
-        ):
-            with _reading(
-                f"LeRobot data set {folder}: meta/episodes, episode {episode}, {', '.join(needed)}"
-            ):
+        for episode, chunk, file, begin in zip(*(table[name] for name in ("episode_index", *needed)), strict=True):
+            with _reading(f"LeRobot data set {folder}: meta/episodes, episode {episode}, {', '.join(needed)}"):
                 places[int(episode)] = file_of(chunk_index=int(chunk), file_index=int(file)), float(begin)
             if not 0.0 <= float(begin) <= LARGEST_STAMP_S:
                 raise _wrong(

@@ -120,9 +120,7 @@ class StepBlocks:
         numbers = numbers << kinds[stored, None].astype(np.int64)
         difference = np.zeros((width, count), np.int64)
         used = kinds != ZERO
-        difference[used] = numbers[
-            (np.cumsum(stored) - 1)[used]
-        ]  # a repeated one equals the newest stored one
+        difference[used] = numbers[(np.cumsum(stored) - 1)[used]]  # a repeated one equals the newest stored one
         before = self._last.get(form, np.zeros(width, np.int64))
         rows: IntArray = np.cumsum(np.vstack([before[None], difference.T]), axis=0)[1:]
         self._last[form] = rows[-1]

@@ -87,9 +87,7 @@ class FlightRecorder:
     Raises OSError if the file cannot be created.
     """
 
-    def __init__(
-        self, path: Path, settings: CoreSettings, fingerprint: Fingerprint, *, durable: bool = True
-    ) -> None:
+    def __init__(self, path: Path, settings: CoreSettings, fingerprint: Fingerprint, *, durable: bool = True) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.steps = 0
@@ -118,9 +116,7 @@ class FlightRecorder:
             for topic, encoding in TOPICS.items()
         }
         self._sequence = 0
-        header = msgspec.msgpack.encode(
-            {"fingerprint": msgspec.to_builtins(fingerprint), "settings": encoded}
-        )
+        header = msgspec.msgpack.encode({"fingerprint": msgspec.to_builtins(fingerprint), "settings": encoded})
         self._add("header", header, 0)
 
     @property

@@ -148,9 +148,7 @@ def joints(
         return None if array is None else float(array[j])
 
     states = [
-        JointState(
-            name=name, position=value(positions, j), velocity=value(velocities, j), effort=value(efforts, j)
-        )
+        JointState(name=name, position=value(positions, j), velocity=value(velocities, j), effort=value(efforts, j))
         for j, name in enumerate(names)
     ]
     return Published(topic, t_ns, JointStates(timestamp=stamp(t_ns), joints=states))
@@ -192,9 +190,7 @@ def markers_seen(
                 thickness=size,
             )
         )  # fmt: skip
-    return Published(
-        f"/camera/{camera}/annotations", t_ns, ImageAnnotations(timestamp=stamp(t_ns), points=drawn)
-    )
+    return Published(f"/camera/{camera}/annotations", t_ns, ImageAnnotations(timestamp=stamp(t_ns), points=drawn))
 
 
 # -- in space -----------------------------------------------------------------------------------------------
@@ -297,9 +293,7 @@ def _sphere(v: FloatArray, size: float) -> SpherePrimitive:
 
 def _camera(centre: FloatArray, rotation: FloatArray) -> LinePrimitive:
     """A pyramid from a camera's centre in its viewing direction."""
-    corners = [
-        centre + 0.1 * np.array([x, y, 1.5]) @ rotation for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    ]
+    corners = [centre + 0.1 * np.array([x, y, 1.5]) @ rotation for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
     strip = [corners[0]]
     for corner, following in zip(corners, [*corners[1:], corners[0]], strict=True):
         strip += [corner, centre, corner, following]

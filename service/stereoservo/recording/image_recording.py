@@ -79,9 +79,7 @@ class ImageRecorder:
     def take(self, delivered: list[Frame] | list[CameraObservation]) -> None:
         """Queue a copy of the frames that the camera delivered; never waits for the thread."""
         recording = self._recording
-        if (
-            recording is None or recording.ending
-        ):  # later frames would prevent a slow disk or computer from finishing
+        if recording is None or recording.ending:  # later frames would prevent a slow disk or computer from finishing
             return
         for frame in delivered:
             if not isinstance(frame, Frame):
@@ -191,9 +189,7 @@ class ImageRecorder:
         """Create the files with the size of the first picture. Raises ImageFileError, OSError."""
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         height, width = first.image.shape
-        return ImageWriter(
-            file, self._camera, (width, height), self._rate_hz, driver=self._driver, limits=self._limits
-        )
+        return ImageWriter(file, self._camera, (width, height), self._rate_hz, driver=self._driver, limits=self._limits)
 
 
 def _finish(recording: _Recording, writer: ImageWriter | None, missing: int) -> None:

@@ -67,9 +67,7 @@ def read_motion(path: Path) -> RecordedMotion:
         try:
             if topic == "header":
                 header = msgspec.msgpack.decode(data)
-                settings = msgspec.msgpack.decode(
-                    header["settings"], type=CoreSettings, dec_hook=decode_array
-                )
+                settings = msgspec.msgpack.decode(header["settings"], type=CoreSettings, dec_hook=decode_array)
             elif topic == "step":
                 record = decode_step(data)
                 inputs = record.inputs
@@ -81,9 +79,7 @@ def read_motion(path: Path) -> RecordedMotion:
                 if _calibrates(record):
                     calibration_ns = inputs.now_ns
         except Exception as error:  # a decoder may raise anything
-            raise RecordingError(
-                path, len(steps), f"{topic} record is damaged ({cause_of(error)})"
-            ) from error
+            raise RecordingError(path, len(steps), f"{topic} record is damaged ({cause_of(error)})") from error
     if settings is None:
         raise RecordingError(path, len(steps), "holds no header; is it a flight recording?")
     if len(joint_ns) < 2:
@@ -101,8 +97,7 @@ def read_motion(path: Path) -> RecordedMotion:
 
 def _calibrates(record: StepRecord) -> bool:
     return any(
-        isinstance(request.command, Calibrate) and not request.command.check
-        for request in record.inputs.requests
+        isinstance(request.command, Calibrate) and not request.command.check for request in record.inputs.requests
     )
 
 
@@ -136,9 +131,7 @@ def rest_intervals(motion: RecordedMotion, settle_s: float) -> list[RestInterval
 
 def _moving(motion: RecordedMotion) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Whether some joint is faster than ``AT_REST`` at each step (s,)."""
-    newest = np.clip(
-        np.searchsorted(motion.joint_ns, motion.now_ns, side="right") - 1, 0, len(motion.joint_ns) - 1
-    )
+    newest = np.clip(np.searchsorted(motion.joint_ns, motion.now_ns, side="right") - 1, 0, len(motion.joint_ns) - 1)
     before = np.searchsorted(motion.joint_ns, motion.joint_ns[newest] - SPEED_OVER_NS, side="left")
     span_s = np.maximum(motion.joint_ns[newest] - motion.joint_ns[before], 1) * 1e-9
     speed = np.abs(motion.positions[newest] - motion.positions[before]).max(axis=1) / span_s

@@ -107,9 +107,7 @@ class _Replay:
         self.recorded = msgspec.convert(first["fingerprint"], Fingerprint)
         self.settings = msgspec.msgpack.decode(first["settings"], type=CoreSettings, dec_hook=decode_array)
 
-    def _take_step(
-        self, record: StepRecord, core: ServoCore, default_law: str
-    ) -> tuple[StepInputs, StepOutputs]:
+    def _take_step(self, record: StepRecord, core: ServoCore, default_law: str) -> tuple[StepInputs, StepOutputs]:
         laws = _laws_of_goals(record.inputs, default_law)
         if self.recorded is not None:
             _require_installed(laws & set(self.recorded.laws))
@@ -177,11 +175,7 @@ def replay(
 def _cause(error: Exception, topic: str, recorded: Fingerprint | None) -> str:
     """Why a message of this ``topic`` cannot be replayed."""
     if isinstance(error, UnknownLawError):
-        made = (
-            ""
-            if recorded is None
-            else f" (recorded with {recorded.laws.get(error.name, 'an unknown version')})"
-        )
+        made = "" if recorded is None else f" (recorded with {recorded.laws.get(error.name, 'an unknown version')})"
         return f"needs a law that is not installed here{made}: {error}"
     if isinstance(error, StateVersionError):
         return _of_another_version(str(error), recorded)

@@ -63,9 +63,7 @@ def comparable(recorded: Fingerprint, present: Fingerprint, used: Container[str]
 def _processor() -> str:
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as file:
-            found = [
-                line.split(":", 1)[1].strip() for line in file if line.startswith(("model name", "flags"))
-            ]
+            found = [line.split(":", 1)[1].strip() for line in file if line.startswith(("model name", "flags"))]
     except OSError:
         return platform.processor()
     flags = f"{zlib.crc32(found[1].encode()):08x}" if len(found) > 1 else ""

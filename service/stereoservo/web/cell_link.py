@@ -323,9 +323,7 @@ def why(event: EventMessage) -> str:
         limit = "" if reason.threshold is None else f", limit {reason.threshold:.4g}"
         subject = f" {reason.subject}" if reason.subject else ""
         hint = "" if reason.hint in found else f": {reason.hint}"
-        found.append(
-            f"{reason.code}{subject}{f' ({value.strip()}{limit} {reason.unit})' if value else ''}{hint}"
-        )
+        found.append(f"{reason.code}{subject}{f' ({value.strip()}{limit} {reason.unit})' if value else ''}{hint}")
     return "; ".join(found) or "the daemon gave no reason, which is a fault of it"
 
 

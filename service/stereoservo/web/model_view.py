@@ -144,17 +144,13 @@ class DragModel:
         c = self._index(camera)
         wanted = project_many(self._Ps, self._wanted(c, self._points(start), np.array(shift), turn, nearer))
         if not np.isfinite(wanted).all():
-            raise GeometryError(
-                "outside", f"the body is dragged into the focal plane of {camera}", camera=camera
-            )
+            raise GeometryError("outside", f"the body is dragged into the focal plane of {camera}", camera=camera)
         joints = self._fitted(start, wanted)
         reached = self._ideal(joints)
         left = float(np.sqrt(((reached[c] - wanted[c]) ** 2).sum(axis=-1).mean()))
         return DraggedGoal(joints, self._raw(reached), left)
 
-    def _wanted(
-        self, c: int, points: FloatArray, shift: FloatArray, turn: float, nearer: float
-    ) -> FloatArray:
+    def _wanted(self, c: int, points: FloatArray, shift: FloatArray, turn: float, nearer: float) -> FloatArray:
         """Markers (m, 4) as `dragged` asks for them; they may be no displacement that the arm can make."""
         lens, P = self.model.cameras[c].lens, self._Ps[c, None]
         middle = points.mean(axis=0)
@@ -196,9 +192,7 @@ class DragModel:
 
     def _index(self, camera: str) -> int:
         if camera not in self.cameras:
-            raise GeometryError(
-                "camera", f"no camera {camera!r} in the model; it has {', '.join(self.cameras)}"
-            )
+            raise GeometryError("camera", f"no camera {camera!r} in the model; it has {', '.join(self.cameras)}")
         return self.cameras.index(camera)
 
     def _points(self, joints: FloatArray) -> FloatArray:
@@ -290,9 +284,7 @@ class Scene:
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         cameras = [
             {"name": camera.name, "centre": centre.tolist(), "axis": axis.tolist()}
-            for camera, centre, axis in zip(
-                model.cameras, euclidean_centres(parts.cameras), directions, strict=True
-            )
+            for camera, centre, axis in zip(model.cameras, euclidean_centres(parts.cameras), directions, strict=True)
         ]
         return cls(ProjectiveChain(parts.kinds, parts.generators, parts.zero), parts.points, cameras)
 

@@ -36,9 +36,7 @@ def allowed_hosts(address: str, port: int, names: Sequence[str] = ()) -> frozens
     else:
         computer = socket.gethostname().lower()
         own = {address, computer, f"{computer.partition('.')[0]}.local"}
-    return frozenset(
-        value for name in own | {name.lower() for name in names} for value in _values(name, port)
-    )
+    return frozenset(value for name in own | {name.lower() for name in names} for value in _values(name, port))
 
 
 def _values(name: str, port: int) -> tuple[str, ...]:
@@ -95,15 +93,11 @@ class ArmHolder:
         """Let ``page`` hold the arm. Raises RightsError: read-only, a wrong or used token, or another page holds it."""
         with self._lock:
             if self.operator is None:
-                raise RightsError(
-                    "this page is read-only; `stereoservo web CELL --operate NAME` lets one command"
-                )
+                raise RightsError("this page is read-only; `stereoservo web CELL --operate NAME` lets one command")
             if self._holder is page:
                 return
             if self._holder is not None:
-                raise RightsError(
-                    f"another page holds the arm as {self.operator}; close it, or release it there"
-                )
+                raise RightsError(f"another page holds the arm as {self.operator}; close it, or release it there")
             if not hmac.compare_digest(self._token.encode(), token.encode()):
                 raise RightsError(
                     "this token is wrong, or was used before; the newest stands in the terminal of `stereoservo web`"
@@ -210,9 +204,7 @@ class Leases:
 
     def take_event(self, event: EventMessage) -> None:
         """Renew no longer what ``event`` ends, or what the daemon does not know any more (its end went unheard)."""
-        unknown = event.kind == "goal_refused" and any(
-            reason.code == "NO_SUCH_GOAL" for reason in event.reasons
-        )
+        unknown = event.kind == "goal_refused" and any(reason.code == "NO_SUCH_GOAL" for reason in event.reasons)
         if event.kind in ENDS or (unknown and event.id in self.renewed):
             self._drop(event.id)
 

@@ -168,9 +168,7 @@ class PageServer:
         self._secure = False
         self.link = make_link(self._publish)
 
-    async def start(
-        self, address: str, port: int, tls: ssl.SSLContext | None = None, names: Sequence[str] = ()
-    ) -> int:
+    async def start(self, address: str, port: int, tls: ssl.SSLContext | None = None, names: Sequence[str] = ()) -> int:
         """Listen; returns the port (given as 0: a free one). ``names``: more names of this server. Raises OSError."""
         self._loop = asyncio.get_running_loop()
         self._secure = tls is not None
@@ -379,9 +377,7 @@ class PageServer:
                 link.update(UpdateGoal(request.id, request.target, request.stamp_s))
                 return {"message": "moved"}
             case Play() | Seek():
-                raise RightsError(
-                    "a live cell is shown, which has no past: `stereoservo web --flight FILE` plays one"
-                )
+                raise RightsError("a live cell is shown, which has no past: `stereoservo web --flight FILE` plays one")
 
     @property
     def _cell_link(self) -> CellLink:

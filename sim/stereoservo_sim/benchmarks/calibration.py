@@ -74,9 +74,7 @@ def run_calibration(repetitions: int, seed: int, progress: ProgressCall) -> dict
     times = [row["fit_ms_an_image"] for row in result["per_image"]]
     result["fit_ms_an_image_last_over_first"] = times[-1] / times[0]
     plants = [row for row in result["per_marker"] if row["cameras"] == 2]
-    slope = np.polyfit(
-        np.log([row["markers"] for row in plants]), np.log([row["fit_cpu_s"] for row in plants]), 1
-    )
+    slope = np.polyfit(np.log([row["markers"] for row in plants]), np.log([row["fit_cpu_s"] for row in plants]), 1)
     result["fit_cpu_exponent_over_markers"] = float(slope[0])
     return result
 

@@ -275,9 +275,7 @@ class _CpuMeter:
 
     def figures(self) -> dict[str, Any]:
         whole = _per_cycle_ms(self._first, self._read())
-        process, bus_thread = (
-            statistics.median(values) for values in zip(*self._segments or [whole], strict=True)
-        )
+        process, bus_thread = (statistics.median(values) for values in zip(*self._segments or [whole], strict=True))
         return {
             "bus_thread": round(bus_thread, 4),
             "process": round(process, 4),

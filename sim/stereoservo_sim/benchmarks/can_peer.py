@@ -30,9 +30,7 @@ AXES = 6
 SYNC = CanFrame(0x80)
 COMMANDS = [CanFrame(0x200 + node, bytes(6)) for node in range(1, AXES + 1)]
 ANSWERS = [
-    CanFrame(base + node, bytes(length))
-    for base, length in ((0x180, 6), (0x280, 4))
-    for node in range(1, AXES + 1)
+    CanFrame(base + node, bytes(length)) for base, length in ((0x180, 6), (0x280, 4)) for node in range(1, AXES + 1)
 ]
 """To a SYNC: status word and position, then velocity."""
 ENDING_S = 10.0
@@ -57,9 +55,7 @@ def peer(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         assert process.stdout is not None
         line = process.stdout.readline().strip()
         if not line:
-            raise RuntimeError(
-                f"the process {' '.join(words)!r} of the bench ended at once; its message is above"
-            )
+            raise RuntimeError(f"the process {' '.join(words)!r} of the bench ended at once; its message is above")
         yield process, line
     finally:
         if process.stdin is not None and not process.stdin.closed:

@@ -97,9 +97,7 @@ class CoreLoop:
         seen = self.cell.pixels((self.cell.home + share * self.cell.ranges)[None])[:, 0]
         return FeatureTarget(
             {
-                f"cam{c}": {
-                    i: (float(u), float(v)) for i, (u, v) in zip(self.cell.marker_ids, pixels, strict=True)
-                }
+                f"cam{c}": {i: (float(u), float(v)) for i, (u, v) in zip(self.cell.marker_ids, pixels, strict=True)}
                 for c, pixels in enumerate(seen)
             }
         )

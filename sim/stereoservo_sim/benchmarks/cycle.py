@@ -61,9 +61,7 @@ def stereo_problem() -> dict[str, Any]:
     K = np.array([(800.0, 0, 320), (0, 800, 240), (0, 0, 1)])
     left = K @ np.eye(3, 4)
     right = left + np.column_stack([np.zeros((3, 3)), K @ (-0.2, 0.0, 0.0)])
-    markers = np.array(
-        [(-0.05, -0.05, 1.2, 1), (0.05, -0.05, 1.2, 1), (0.05, 0.05, 1.22, 1), (-0.05, 0.05, 1.2, 1)]
-    )
+    markers = np.array([(-0.05, -0.05, 1.2, 1), (0.05, -0.05, 1.2, 1), (0.05, 0.05, 1.22, 1), (-0.05, 0.05, 1.2, 1)])
     Ps = np.array([left, right])
     set_points = project_many(Ps, markers) + rng.uniform(-20, 20, (2, 4, 2))
     return {
@@ -121,9 +119,7 @@ def with_reference(p: dict[str, Any]) -> FloatArray:
     chain = ProjectiveChain(("revolute",) * 6, p["generators"], np.zeros(6))
     points = p["markers"] @ chain.displacement(p["q"]).T
     jacobian = chain.image_jacobian(p["Ps"], p["q"], points)
-    return stereo_law(
-        jacobian, project_many(p["Ps"], points), p["set_points"], np.ones((2, 4)), GAIN, DAMPING
-    ).velocity
+    return stereo_law(jacobian, project_many(p["Ps"], points), p["set_points"], np.ones((2, 4)), GAIN, DAMPING).velocity
 
 
 def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:

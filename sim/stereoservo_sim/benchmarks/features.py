@@ -67,9 +67,7 @@ class Conditions:
         if not self.drawn:
             return self
         blur, noise, gradient = rng.uniform(0.0, 1.0, 3) * (self.blur, self.noise, self.gradient)
-        return replace(
-            self, blur=blur, noise=noise, gradient=gradient, clutter=int(rng.integers(self.clutter + 1))
-        )
+        return replace(self, blur=blur, noise=noise, gradient=gradient, clutter=int(rng.integers(self.clutter + 1)))
 
 
 def look(tilt: float, azimuth: float, roll: float, distance: float, at: FloatArray) -> FloatArray:
@@ -157,9 +155,7 @@ def add_ellipse(coverage: npt.NDArray[np.float32], conic: FloatArray, blur: floa
         coverage[c:d, a:b] += patch[c - v0 : d - v0, a - u0 : b - u0]
 
 
-def _cover(
-    image: npt.NDArray[np.float32], conic: FloatArray, conditions: Conditions, rng: np.random.Generator
-) -> None:
+def _cover(image: npt.NDArray[np.float32], conic: FloatArray, conditions: Conditions, rng: np.random.Generator) -> None:
     """Cover an ellipse from one side, to the depth of the cut, by something dark with an edge as blurred as the
     dots'.
     """
@@ -203,9 +199,7 @@ def _moved(image: npt.NDArray[np.float32], length: float, angle: float) -> npt.N
     """The image with motion blur along a line, about its centre."""
     u, v = np.meshgrid(np.fft.rfftfreq(WIDTH), np.fft.fftfreq(HEIGHT))
     smear = np.sinc(length * (u * np.cos(angle) + v * np.sin(angle)))
-    moved: npt.NDArray[np.float32] = np.fft.irfft2(np.fft.rfft2(image) * smear, image.shape).astype(
-        np.float32
-    )
+    moved: npt.NDArray[np.float32] = np.fft.irfft2(np.fft.rfft2(image) * smear, image.shape).astype(np.float32)
     return moved
 
 
@@ -217,9 +211,7 @@ TESTED: dict[str, Conditions] = {
     "detection: up to all of it": Conditions(
         tilt=70.0, distance=NEAR, blur=1.5, noise=10.0, gradient=0.5, clutter=9, drawn=True
     ),
-    "detection: all at once": Conditions(
-        tilt=70.0, distance=NEAR, blur=1.5, noise=10.0, gradient=0.5, clutter=9
-    ),
+    "detection: all at once": Conditions(tilt=70.0, distance=NEAR, blur=1.5, noise=10.0, gradient=0.5, clutter=9),
     "detection: all at once, 10 px": Conditions(tilt=70.0, blur=1.5, noise=10.0, gradient=0.5, clutter=9),
     "detection: tilt 70, clutter": Conditions(tilt=70.0, distance=NEAR, clutter=9),
     "n0": Conditions(noise=0.0),
@@ -373,15 +365,11 @@ def tag_scene(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     to_fine = np.array([[FINE, 0, (FINE - 1) / 2], [0, FINE, (FINE - 1) / 2], [0, 0, 1.0]])
     corners = []
     for k in range(TAG_COLUMNS * TAG_ROWS):
-        at = np.array([90.0 + 153 * (k % TAG_COLUMNS), 85.0 + 155 * (k // TAG_COLUMNS)]) + rng.uniform(
-            -8, 8, 2
-        )
+        at = np.array([90.0 + 153 * (k % TAG_COLUMNS), 85.0 + 155 * (k // TAG_COLUMNS)]) + rng.uniform(-8, 8, 2)
         H = _tag_view(rng, at)
         cells = np.pad(1.0 - tag_cells(DICTIONARY, k), 1, constant_values=1.0)
         n, scale = len(cells) - 2, 16
-        printed = np.kron(TAG_BLACK + (TAG_WHITE - TAG_BLACK) * cells, np.ones((scale, scale))).astype(
-            np.float32
-        )
+        printed = np.kron(TAG_BLACK + (TAG_WHITE - TAG_BLACK) * cells, np.ones((scale, scale))).astype(np.float32)
         from_print = np.array([[1, 0, 0.5 - scale], [0, 1, 0.5 - scale], [0, 0, n * scale]]) / (n * scale)
         cv2.warpPerspective(
             printed,
@@ -402,9 +390,7 @@ def tags(repetitions: int, seed: int) -> dict[str, Any]:
     """CPU ms an image with a prior, without, and of OpenCV's detector; corners' rms error [px]; share found."""
     rng = np.random.default_rng(seed)
     ids = np.arange(4 * TAG_COLUMNS * TAG_ROWS)
-    detector = TagDetector(
-        {"tags": list(range(TAG_COLUMNS * TAG_ROWS)), "dictionary": DICTIONARY}, context_of("left")
-    )
+    detector = TagDetector({"tags": list(range(TAG_COLUMNS * TAG_ROWS)), "dictionary": DICTIONARY}, context_of("left"))
     peer = cv2.aruco.ArucoDetector(dictionary(DICTIONARY))
     frames, priors, errors = [], [], []
     for k in range(TAG_IMAGES):

@@ -99,9 +99,7 @@ def run_loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
     return {"segment_s": SEGMENT_S, "segments": repetitions, "rows": rows}
 
 
-def _of_daemon(
-    folder: Path, rate_hz: int, priority: int, repetitions: int, seed: int
-) -> list[dict[str, Any]]:
+def _of_daemon(folder: Path, rate_hz: int, priority: int, repetitions: int, seed: int) -> list[dict[str, Any]]:
     """The rows of one daemon: all loads."""
     with moving_cell(folder, rate_hz, priority, seed) as cell:
         rows = []
@@ -261,8 +259,7 @@ def _moving() -> Iterator[_Motion]:
 def _running(names: tuple[str, ...]) -> Iterator[None]:
     """Other work, in processes of its own."""
     started = [
-        subprocess.Popen([sys.executable, "-c", BESIDE[name], "demo"], stdout=subprocess.DEVNULL)
-        for name in names
+        subprocess.Popen([sys.executable, "-c", BESIDE[name], "demo"], stdout=subprocess.DEVNULL) for name in names
     ]
     if started:
         time.sleep(5.0)  # until they work

@@ -70,9 +70,7 @@ def photographs(root: Path | None = None) -> Photographs:
     doc = next((place for place in (root / "opencv-doc", DEBIAN) if place.is_dir()), DEBIAN)
     samples = sorted((doc / "examples" / "data").glob("*.[jp][pn]g"))
     boards = [path for path in samples if path.match(BOARDS)]
-    others = [
-        path for path in samples if path not in boards and path.name != "chessboard.png" and _large(path)
-    ]
+    others = [path for path in samples if path not in boards and path.name != "chessboard.png" and _large(path)]
     found = {
         "franka": sorted((root / "fairo_franka" / "set_a").glob("pose*_cam*.jpg")),
         "boards": boards,
@@ -128,9 +126,7 @@ def look(detector: Detector, image: ImageArray) -> CameraObservation:
     return detector.detect(Frame("photograph", 0, 1_000_000_000, 1_000_000_000, image), None)
 
 
-def over(
-    images: Sequence[ImageArray], call: Callable[[ImageArray], T], repetitions: int
-) -> tuple[list[T], float]:
+def over(images: Sequence[ImageArray], call: Callable[[ImageArray], T], repetitions: int) -> tuple[list[T], float]:
     """``call`` of each image, and the median of its processor time [ms] over ``repetitions`` of each."""
     found, times = [], []
     call(images[0])
@@ -223,9 +219,7 @@ def calibrated_rms(boards: Sequence[tuple[str, Board]], shape: tuple[int, ...]) 
     squares, count = 0.0, 0
     for camera in sorted({name for name, _ in boards}):
         pixels = [
-            corners.astype(np.float32)[:, None]
-            for name, corners in boards
-            if name == camera and corners is not None
+            corners.astype(np.float32)[:, None] for name, corners in boards if name == camera and corners is not None
         ]
         rms = cv2.calibrateCamera(
             [layout] * len(pixels), pixels, (shape[1], shape[0]), None, None, flags=cv2.CALIB_FIX_K3
@@ -240,9 +234,7 @@ def boardless_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
     rows = []
     for name, find in METHODS.items():
         found, ms = over(images, find, repetitions)
-        rows.append(
-            Row("no chessboard", len(images), name, 0, 0, sum(one is not None for one in found), None, "", ms)
-        )
+        rows.append(Row("no chessboard", len(images), name, 0, 0, sum(one is not None for one in found), None, "", ms))
     return rows
 
 
@@ -257,9 +249,7 @@ def corner_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
         places = cv2.goodFeaturesToTrack(median, CORNERS, 0.02, APART_PX)[:, 0].astype(np.float64)
         inside = ((places > 2 * PATCH) & (places < np.array(median.shape[::-1]) - 2 * PATCH)).all(axis=1)
         places = places[inside]
-        answers = [
-            over(images, call, repetitions) for call in (_patches(median, places), _flow(median, places))
-        ]
+        answers = [over(images, call, repetitions) for call in (_patches(median, places), _flow(median, places))]
         near = []
         for name, (each, ms) in zip(seen, answers, strict=True):
             times[name].append(ms)
@@ -338,9 +328,7 @@ def _grid() -> FloatArray:
     return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 
 
-def drawn(
-    photograph: ImageArray, dots: FloatArray, rng: np.random.Generator
-) -> tuple[ImageArray, FloatArray]:
+def drawn(photograph: ImageArray, dots: FloatArray, rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
     """A photograph with a plate of ``dots`` (n, 2) [m] in it, and their centres (n, 2) [px]."""
     image = cv2.resize(photograph, SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
     light = cv2.GaussianBlur(image, (0, 0), LIGHT_PX)
@@ -381,9 +369,7 @@ def dot_rows(paths: Sequence[Path], repetitions: int, seed: int) -> list[Row]:
     def grid(image: ImageArray) -> FloatArray:
         flags = cv2.CALIB_CB_SYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
         found, centres = cv2.findCirclesGrid(image, (GRID, GRID), flags=flags, blobDetector=finder)
-        return (
-            np.asarray(centres, dtype=np.float64).reshape(-1, 2) if found else np.full((GRID**2, 2), np.nan)
-        )
+        return np.asarray(centres, dtype=np.float64).reshape(-1, 2) if found else np.full((GRID**2, 2), np.nan)
 
     rows = []
     for name, find, dots in (
@@ -582,9 +568,7 @@ def franka_rows(paths: Sequence[Path], repetitions: int) -> tuple[list[Row], lis
     return rows, why
 
 
-def _standing(
-    finds: dict[str, list[list[Find]]], cameras: Sequence[int], camera: int
-) -> dict[int, FloatArray]:
+def _standing(finds: dict[str, list[list[Find]]], cameras: Sequence[int], camera: int) -> dict[int, FloatArray]:
     """Median corners of each of the table's tags in a camera, of all detectors and pictures."""
     seen: dict[int, list[FloatArray]] = {}
     for each in finds.values():
@@ -606,9 +590,7 @@ def _transfer(one: dict[int, FloatArray], other: dict[int, FloatArray]) -> tuple
     return float(((carried - b) ** 2).sum()), 2 * len(a) - 8
 
 
-def sheet_rows(
-    paths: Sequence[Path], name: DictionaryName, on: str, repetitions: int
-) -> tuple[list[Row], list[str]]:
+def sheet_rows(paths: Sequence[Path], name: DictionaryName, on: str, repetitions: int) -> tuple[list[Row], list[str]]:
     """Tags on a sheet (of which it is known which) or, where ``name`` is 36h11, those of Webots; accuracy of the latter
     is not known."""
     images = [read(path) for path in paths]
@@ -662,9 +644,7 @@ def run_detectors(repetitions: int, seed: int, progress: ProgressCall) -> dict[s
     """
     shown = photographs()
     if not (shown.franka or shown.boards or shown.others or shown.sheet or shown.webots):
-        raise ExperimentError(
-            "data_missing", "no photographs: " + "; ".join(shown.missing), missing=shown.missing
-        )
+        raise ExperimentError("data_missing", "no photographs: " + "; ".join(shown.missing), missing=shown.missing)
     progress("tags", 0, 3)
     rows, left_out = tag_rows(shown, repetitions)
     progress("chessboards and corners", 1, 3)

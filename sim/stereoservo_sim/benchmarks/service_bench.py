@@ -154,9 +154,7 @@ class ServiceBench:
 
     def __enter__(self) -> Self:
         # What compiles beside the loop would be in its times.
-        subprocess.run(
-            [sys.executable, "-m", "stereoservo.cli.main", "warmup"], stdout=sys.stderr, check=True
-        )
+        subprocess.run([sys.executable, "-m", "stereoservo.cli.main", "warmup"], stdout=sys.stderr, check=True)
         text = shipped_cell_path(CELL).read_text(encoding="utf-8")
         text += "\n[recording]\nreserve_mib = 0\n"  # small disks are filled to the last byte
         front, rest = text[: text.index("[[camera]]")], text[text.index("[servo]") :]
@@ -469,9 +467,7 @@ def refused_puts(bench: ServiceBench) -> int:
     return t0_ns
 
 
-def during(
-    first: Callable[[ServiceBench], int], then: Callable[[ServiceBench], int]
-) -> Callable[[ServiceBench], int]:
+def during(first: Callable[[ServiceBench], int], then: Callable[[ServiceBench], int]) -> Callable[[ServiceBench], int]:
     """An act while another lasts; the time is that of the second."""
 
     def act(bench: ServiceBench) -> int:

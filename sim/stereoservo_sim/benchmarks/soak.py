@@ -297,9 +297,7 @@ class _Soak:
             if fastest <= CREEP:
                 return
             self.cell.run_for(0.5)
-        raise ExperimentError(
-            "moves", f"encoder stuck: the arm moves at {fastest:.3g} rad/s for ever, law {law}"
-        )
+        raise ExperimentError("moves", f"encoder stuck: the arm moves at {fastest:.3g} rad/s for ever, law {law}")
 
     def _operated(self, name: str) -> None:
         assert self.cell.status is not None
@@ -313,9 +311,7 @@ class _Soak:
             self.cell.submit(Resume())
         if self.cell.status.lifecycle != Lifecycle.ACTIVE:
             reasons = msgspec.to_builtins(self.cell.status.reasons)
-            raise ExperimentError(
-                "not_active", f"after {name} the cell is {self.cell.status.lifecycle}: {reasons}"
-            )
+            raise ExperimentError("not_active", f"after {name} the cell is {self.cell.status.lifecycle}: {reasons}")
         self._seen_again(name)
 
     def _seen_again(self, name: str) -> None:
@@ -456,9 +452,7 @@ def _recorded(bench: ServiceBench, trial: Trial) -> tuple[int, int]:
     begin_wall = time.time() - (time.monotonic_ns() - trial.begin_ns) * 1e-9
     for path, written in _files(bench):
         if written >= begin_wall:
-            with suppress(
-                RecordingError
-            ):  # a file that is being written, or was cut; others are told by the replay
+            with suppress(RecordingError):  # a file that is being written, or was cut; others are told by the replay
                 for topic, data in recorded_messages(path):
                     if topic == "step":
                         record = decode_step(data)
@@ -533,9 +527,7 @@ class _LiveSoak:
 
     def _goal(self, lease_s: float | None) -> str:
         end = float(self.rng.uniform(-END, END))
-        return self.client.goal(
-            {"j1": end}, speed_scale=SPEED_SCALE, lease_s=lease_s, time_limit_s=LIMIT_S
-        ).id
+        return self.client.goal({"j1": end}, speed_scale=SPEED_SCALE, lease_s=lease_s, time_limit_s=LIMIT_S).id
 
     def _vision(self, how: signal.Signals) -> None:
         if (pid := self.bench.processes().get("vision-left")) is not None:

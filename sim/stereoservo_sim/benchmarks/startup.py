@@ -112,9 +112,7 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
     except (ClientError, DaemonError) as error:
         raise ExperimentError("startup", f"the {name} start: {error}; {text.read_text()[-2000:]}") from error
     if code != 0:
-        raise ExperimentError(
-            "startup", f"the daemon ended with exit code {code}: {text.read_text()[-2000:]}"
-        )
+        raise ExperimentError("startup", f"the daemon ended with exit code {code}: {text.read_text()[-2000:]}")
     cpu = {line["process"]: line["cpu_s"] for line in _lines(log) if "cpu_s" in line}
     spent = {
         "preparation_cpu_s": cpu["cell_preparation"],
@@ -190,8 +188,6 @@ def show_startup(figures: dict[str, Any], console: Console) -> dict[str, Any]:
     """The table of what compiles; the rest of the figures."""
     table = Table("kernel", "signatures", "seconds", "processes", box=None)
     for row in figures["kernels"]:
-        table.add_row(
-            row["kernel"], str(row["signatures"]), f"{row['seconds']:.2f}", " ".join(row["processes"])
-        )
+        table.add_row(row["kernel"], str(row["signatures"]), f"{row['seconds']:.2f}", " ".join(row["processes"]))
     console.print(table)
     return {key: value for key, value in figures.items() if key != "kernels"}

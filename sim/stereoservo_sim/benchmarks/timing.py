@@ -17,9 +17,7 @@ STOLEN = 7
 """Place of the stolen time among the numbers of /proc/stat's first line, in ticks."""
 
 
-def timed(
-    call: Callable[[int], object], repetitions: int, warm_up: int = 1
-) -> tuple[list[float], list[float]]:
+def timed(call: Callable[[int], object], repetitions: int, warm_up: int = 1) -> tuple[list[float], list[float]]:
     """Wall and CPU seconds of ``call(k)`` for k = 0, 1, …, after ``warm_up`` calls that do not count."""
     for k in range(warm_up):
         call(k)

@@ -21,8 +21,7 @@ from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.progress import ProgressCall
 
 LIMITS = "\n".join(
-    f'[[safety.limit]]\njoint = "j{k}"\nmin = -1.7\nmax = 1.7\nvelocity = 0.8\nacceleration = 3.0'
-    for k in range(1, 7)
+    f'[[safety.limit]]\njoint = "j{k}"\nmin = -1.7\nmax = 1.7\nvelocity = 0.8\nacceleration = 3.0' for k in range(1, 7)
 )
 CELL = f"""
 schema = 1
@@ -107,9 +106,7 @@ def run_wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
 
 @contextmanager
 def _echo(endpoint: str) -> Iterator[None]:
-    process = subprocess.Popen(
-        [sys.executable, "-c", ECHO, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    process = subprocess.Popen([sys.executable, "-c", ECHO, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         assert process.stdout is not None
         process.stdout.readline()

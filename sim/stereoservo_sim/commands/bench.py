@@ -102,9 +102,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
 
 def _flat(value: Any, name: str) -> list[tuple[str, Any]]:
     if isinstance(value, dict):
-        return [
-            line for key, inner in value.items() for line in _flat(inner, f"{name}.{key}" if name else key)
-        ]
+        return [line for key, inner in value.items() for line in _flat(inner, f"{name}.{key}" if name else key)]
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return [line for k, inner in enumerate(value) for line in _flat(inner, f"{name}[{k}]")]
     return [(name, value)]

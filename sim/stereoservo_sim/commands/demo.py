@@ -39,17 +39,13 @@ def demo(
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="One process on a virtual clock: deterministic given the seed.")
     ] = False,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the simulated noise.")
-    ] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of the simulated noise.")] = 0,
     out: Annotated[
         Path, typer.Option("--out", help="Directory for report, recording and model (made where missing).")
     ] = Path("stereoservo-demo"),
     cell: Annotated[
         str,
-        typer.Option(
-            "--cell", metavar="NAME|PATH", help=f"{', '.join(CELLS)}, or a .toml file of a simulated cell."
-        ),
+        typer.Option("--cell", metavar="NAME|PATH", help=f"{', '.join(CELLS)}, or a .toml file of a simulated cell."),
     ] = CELLS[0],
     law: Annotated[
         str | None,
@@ -154,9 +150,7 @@ def _telling() -> Iterator[DemonstrationProgress]:
 
 def _line(console: Console) -> Callable[[str], None]:
     start = time.monotonic()
-    return lambda text: console.print(
-        f"{time.monotonic() - start:6.1f} s  {text}", highlight=False, soft_wrap=True
-    )
+    return lambda text: console.print(f"{time.monotonic() - start:6.1f} s  {text}", highlight=False, soft_wrap=True)
 
 
 def _print(result: dict[str, Any]) -> None:
@@ -167,9 +161,7 @@ def _print(result: dict[str, Any]) -> None:
         f"{calibration['chi2']:.0f} for {calibration['degrees_of_freedom']} degrees of freedom",
         highlight=False,
     )
-    table = Table(
-        "goal", "law", "turn °", "way mm", "error px", "error mm", "off line mm", "s", "outcome", box=None
-    )
+    table = Table("goal", "law", "turn °", "way mm", "error px", "error mm", "off line mm", "s", "outcome", box=None)
     for goal in result["goals"]:
         table.add_row(
             goal["name"], goal["law"], f"{goal['rotation_deg']:.0f}", f"{goal['distance_mm']:.0f}",

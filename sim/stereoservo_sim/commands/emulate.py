@@ -25,9 +25,7 @@ GRACE_S = 5.0
 
 def emulate(
     what: Annotated[str, typer.Argument(help="What to stand in for: drives, cameras, conveyor.")],
-    cell: Annotated[
-        str, typer.Argument(metavar="CELL", help="A cell file (*.toml), or the name of a shipped cell.")
-    ],
+    cell: Annotated[str, typer.Argument(metavar="CELL", help="A cell file (*.toml), or the name of a shipped cell.")],
     channel: Annotated[
         str | None,
         typer.Option(
@@ -57,9 +55,7 @@ def emulate(
     run the belt of a simulated cell, until Ctrl-C.
     """
     if what not in KINDS:
-        raise typer.BadParameter(
-            f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT"
-        )
+        raise typer.BadParameter(f"{what!r} cannot be emulated; there is: {', '.join(KINDS)}", param_hint="WHAT")
     if parent:
         die_with_parent(parent, signal.SIGTERM)
     termination = Termination(grace_s=GRACE_S)
@@ -115,9 +111,7 @@ def _named(path: Path, key: str) -> Iterator[None]:
         raise DriverError(error.code, f"{path}: {key}: {error}", **error.data) from error
 
 
-def _serve(
-    path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination
-) -> None:
+def _serve(path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination) -> None:
     from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint, served_channel
     from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_bus_emulator
     from stereoservo_sim.emulators.console import Console, Printer

@@ -29,9 +29,7 @@ COMMON = {
 """Options that every experiment takes: default and type."""
 
 
-def reproduce(
-    experiment: str, seed: int, plot: Path | None, html: Path | None, as_json: bool, **given: Any
-) -> None:
+def reproduce(experiment: str, seed: int, plot: Path | None, html: Path | None, as_json: bool, **given: Any) -> None:
     """Run an experiment again and print our figures beside those to compare with."""
     # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -40,9 +38,7 @@ def reproduce(
             _all(seed, plot, html, as_json, given)
             return
         if html is not None:
-            raise ExperimentError(
-                "option", f"--html writes the page of `reproduce {ALL}`; {experiment}: --plot DIR"
-            )
+            raise ExperimentError("option", f"--html writes the page of `reproduce {ALL}`; {experiment}: --plot DIR")
         chosen = find_experiment(experiment)
         if plot is not None:
             _make_folder(plot)
@@ -70,9 +66,7 @@ def _all(seed: int, plot: Path | None, html: Path | None, as_json: bool, given: 
     from stereoservo_sim.experiments.thesis_page import Reproduction, answer_of_all, page, reproduce_all
 
     if plot is not None:
-        raise ExperimentError(
-            "option", f"`reproduce {ALL}` takes --html FILE, which holds the figures, not --plot"
-        )
+        raise ExperimentError("option", f"`reproduce {ALL}` takes --html FILE, which holds the figures, not --plot")
     seeds = given.pop("seeds", None)
     if asked := [name for name, value in given.items() if value is not None]:
         raise ExperimentError("option", f"{ALL} does not take --{asked[0].replace('_', '-')}")

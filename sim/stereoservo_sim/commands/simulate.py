@@ -111,15 +111,11 @@ def simulate(
     ] = None,
     mechanics: Annotated[
         MechanicsChoice | None,
-        typer.Option(
-            help="Of the arm rx90: gears and encoders as such joints have them; docs/simulation.md."
-        ),
+        typer.Option(help="Of the arm rx90: gears and encoders as such joints have them; docs/simulation.md."),
     ] = None,
     law_only: Annotated[
         bool,
-        typer.Option(
-            help="The law alone, without goal, monitors and safety stage; the arm free has no others."
-        ),
+        typer.Option(help="The law alone, without goal, monitors and safety stage; the arm free has no others."),
     ] = False,
     draw: Draw = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
@@ -235,9 +231,7 @@ def _drop(text: str | None) -> tuple[float, float] | None:
     return found
 
 
-def _chosen(
-    tasks: tuple[AlignmentTask, ...], limit: int | None, ids: str | None
-) -> tuple[AlignmentTask, ...]:
+def _chosen(tasks: tuple[AlignmentTask, ...], limit: int | None, ids: str | None) -> tuple[AlignmentTask, ...]:
     if ids is not None:
         by_id = {task.id: task for task in tasks}
         try:
@@ -254,9 +248,7 @@ def _chosen(
 def _show(answer: dict[str, Any], console: Console) -> None:
     failed = [task for task in answer["tasks"] if task["success"] is False]
     if failed:
-        table = Table(
-            "id", "reason", "steps", "error px", "back face", "out of view", "off line mm", box=None
-        )
+        table = Table("id", "reason", "steps", "error px", "back face", "out of view", "off line mm", box=None)
         for task in failed:
             table.add_row(
                 str(task["id"]), task["refused"] or task["stopped"] or task["reason"], str(task["iterations"]),
@@ -273,9 +265,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
     )
     for key, (name, unit) in SHOWN.items():
         if answer[key] is not None:
-            console.print(
-                f"{name}: median {answer[key]['median']:.3g}{unit}, max {answer[key]['max']:.3g}{unit}"
-            )
+            console.print(f"{name}: median {answer[key]['median']:.3g}{unit}, max {answer[key]['max']:.3g}{unit}")
     console.print(f"{answer['seconds']:.1f} s")
 
 

@@ -61,9 +61,7 @@ def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Pa
     emulated = "drives" in tree.get("emulate", {})
     driver = tree["joints"]["driver"]
     if not emulated and driver not in ("fake", "pybullet", "twist"):
-        raise ValueError(
-            f"{cell_path}: joints.driver is {driver!r}; only simulated arms have a choice of mechanics"
-        )
+        raise ValueError(f"{cell_path}: joints.driver is {driver!r}; only simulated arms have a choice of mechanics")
     section = "emulate.drives" if emulated else "joints.options"
     line = f'mechanics = "{preset}"'
     heading = re.search(rf"^\[{re.escape(section)}\][^\n]*\n", text, re.MULTILINE)

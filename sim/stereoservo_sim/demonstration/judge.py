@@ -140,9 +140,7 @@ def judge_goal(
     places = _Places(cell, belt)
     seen = [
         (places.at(t), q)
-        for t, q in zip(
-            *(values[way][:: max(1, int(way.sum()) // 400)] for values in (truth_t, truth_q)), strict=True
-        )
+        for t, q in zip(*(values[way][:: max(1, int(way.sum()) // 400)] for values in (truth_t, truth_q)), strict=True)
     ]
     path = np.array([here.marker_positions_rig(q).mean(axis=0) for here, q in seen])
     at_end = places.at(end.t_ns)
@@ -202,8 +200,7 @@ def _steady(
     cell = places.cell
     goal_points = np.mean([cell.marker_positions_rig(q) for q in shown], axis=0)
     goal_pixels = {
-        camera.name: np.mean([cell.truth_pixels(q)[camera.name] for q in shown], axis=0)
-        for camera in cell.rig.cameras
+        camera.name: np.mean([cell.truth_pixels(q)[camera.name] for q in shown], axis=0) for camera in cell.rig.cameras
     }
     apart_px, apart_mm = [], 0.0
     for t, q in zip(times[judged][::5], positions[judged][::5], strict=True):

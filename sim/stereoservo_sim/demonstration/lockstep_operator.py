@@ -121,9 +121,7 @@ class LockstepOperator:
     def _send_model(self, model: CellModel) -> None:
         since = self._last_event
         self.cell.update_model(ModelUpdate(model))
-        self.cell.wait_for(
-            lambda e: e.kind == "model" and self.cell.status.model_epoch == model.epoch, 5.0, since
-        )
+        self.cell.wait_for(lambda e: e.kind == "model" and self.cell.status.model_epoch == model.epoch, 5.0, since)
         self._body = model.marker_ids
 
     @property

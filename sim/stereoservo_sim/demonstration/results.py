@@ -123,11 +123,7 @@ def false_verdicts(verdicts: Sequence[str]) -> list[str]:
 def _row(goal: Judgement) -> dict[str, Any]:
     plain = ("name", "law", "outcome", "final_error_px", "final_error_mm", "max_line_deviation_mm", "rotation_deg",
              "distance_mm", "steps", "seconds")  # fmt: skip
-    steady = (
-        None
-        if goal.steady is None
-        else {k: v if np.isfinite(v) else None for k, v in asdict(goal.steady).items()}
-    )
+    steady = None if goal.steady is None else {k: v if np.isfinite(v) else None for k, v in asdict(goal.steady).items()}
     return {**{name: getattr(goal, name) for name in plain}, **({} if steady is None else {"steady": steady})}
 
 
@@ -211,9 +207,7 @@ def write_pages(
     }
     if demonstration.loop is not None:
         lateness = demonstration.loop.lateness_us
-        facts["lateness"] = (
-            f"p50 {lateness['p50']:.0f} µs, p99 {lateness['p99']:.0f} µs, max {lateness['max']:.0f} µs"
-        )
+        facts["lateness"] = f"p50 {lateness['p50']:.0f} µs, p99 {lateness['p99']:.0f} µs, max {lateness['max']:.0f} µs"
         facts["overruns"] = f"{demonstration.loop.overruns} of {demonstration.loop.cycles} cycles"
     data = ReportData(
         title="stereoservo demonstration",
@@ -262,10 +256,7 @@ def residuals(model: CellModel, trials: TrialData) -> FloatArray:
     matrices = np.array([camera.matrix for camera in model.cameras])
     rows = [model.marker_ids.index(marker) for marker in trials.marker_ids]
     predicted = np.array(
-        [
-            project_many(matrices, model.marker_points[rows] @ chain.displacement(q).T)
-            for q in trials.positions
-        ]
+        [project_many(matrices, model.marker_points[rows] @ chain.displacement(q).T) for q in trials.positions]
     )
     raw = [
         distort(camera.lens, ideal)
@@ -324,21 +315,15 @@ def render_report(data: ReportData) -> str:
     if data.goals:
         parts += ["<h2>Goals</h2>", goals_table(data.goals)]
         parts += [
-            _picture(
-                draw_errors(data.goals, data.tolerance_px), "Largest pixel error of each goal over time"
-            ),
+            _picture(draw_errors(data.goals, data.tolerance_px), "Largest pixel error of each goal over time"),
             _picture(
                 draw_velocities(data.goals, data.joints, data.velocity_limits),
                 "Commanded joint velocities of each goal",
             ),
-            _picture(
-                draw_paths(data.goals), "Path of the centre, its straight line, and the distance between them"
-            ),
+            _picture(draw_paths(data.goals), "Path of the centre, its straight line, and the distance between them"),
         ]
         if any(goal.tracks for goal in data.goals):
-            parts.append(
-                _picture(draw_goal_tracks(data.goals), "Marker tracks in the images, from start to goal")
-            )
+            parts.append(_picture(draw_goal_tracks(data.goals), "Marker tracks in the images, from start to goal"))
     if data.calibration is not None:
         parts += ["<h2>Self-calibration</h2>", calibration_table(data.calibration)]
         parts += [
@@ -389,9 +374,7 @@ def calibration_table(c: CalibrationPlots) -> str:
     for j, joint in enumerate(c.joints):
         moved = c.residuals[:, c.joint == j]
         rows.append((joint, *(_rms(part) for part in moved), str(int((c.joint == j).sum()))))
-    by_joint = _table(
-        ("moving joint", *(f"{name}: rms [px]" for name in c.cameras), "stops"), rows, text_columns=1
-    )
+    by_joint = _table(("moving joint", *(f"{name}: rms [px]" for name in c.cameras), "stops"), rows, text_columns=1)
     figures = {
         "residual rms": f"{c.rms_px:.4f} px",
         "expected noise": "not stated" if c.sigma_px is None else f"{c.sigma_px:.4f} px",
@@ -419,8 +402,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int
 
     def cells(tag: str, row: Sequence[str]) -> str:
         return "".join(
-            f"<{tag}{'' if i < text_columns else ' class=n'}>{html.escape(cell)}</{tag}>"
-            for i, cell in enumerate(row)
+            f"<{tag}{'' if i < text_columns else ' class=n'}>{html.escape(cell)}</{tag}>" for i, cell in enumerate(row)
         )
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
@@ -470,9 +452,7 @@ def draw_calibration_tracks(c: CalibrationPlots) -> Figure:
         if np.isfinite(rest).any():
             axis.plot(*rest.T, "+", color="0.4", markersize=4, label="none")
         _image_axis(axis, name, size)
-    axes[-1].legend(
-        title="moving joint", fontsize=7, title_fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5)
-    )
+    axes[-1].legend(title="moving joint", fontsize=7, title_fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
 
 
@@ -500,9 +480,7 @@ def draw_residuals(c: CalibrationPlots) -> Figure:
             axis.tick_params(labelsize=7)
             _plain(axis)
     for axis in axes[-1]:
-        axis.set_xlabel(
-            "residual coordinate [px]" + (", line: expected noise" if c.sigma_px else ""), fontsize=8
-        )
+        axis.set_xlabel("residual coordinate [px]" + (", line: expected noise" if c.sigma_px else ""), fontsize=8)
     return figure
 
 

@@ -195,9 +195,7 @@ def conduct_live(
     return _kept(demonstration)
 
 
-def _emulate_drives(
-    ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress
-) -> Path:
+def _emulate_drives(ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress) -> Path:
     """Start the cell's emulated drives on a free port, until ``ends``; returns a cell file that uses them."""
     drives = EmulatorProcess(cell_path, options=("--channel", ANY_PORT), log=out / "drives.log")
     channel = ends.enter_context(drives).wait_ready()
@@ -205,15 +203,11 @@ def _emulate_drives(
     return move_to_channel(cell_path, scratch, channel)
 
 
-def _emulate_cameras(
-    ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress
-) -> Path:
+def _emulate_cameras(ends: ExitStack, cell_path: Path, scratch: Path, out: Path, stage: DemonstrationProgress) -> Path:
     """Start the cell's emulated cameras, which read the arm's history in the runtime directory; otherwise as
     `_emulate_drives`.
     """
-    cameras = EmulatorProcess(
-        cell_path, what="cameras", options=("--channel", ANY_SERVER), log=out / "cameras.log"
-    )
+    cameras = EmulatorProcess(cell_path, what="cameras", options=("--channel", ANY_SERVER), log=out / "cameras.log")
     channel = ends.enter_context(cameras).wait_ready()
     stage.tell(f"emulated cameras at {channel}")
     folder = scratch / "streams"
@@ -311,9 +305,7 @@ class LiveDemonstrator:
 
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
         """Execute a goal to its end, under a lease."""
-        result = self._drive(
-            lambda: self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow)
-        ).wait()
+        result = self._drive(lambda: self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow)).wait()
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
     def _look(self) -> None:
@@ -431,11 +423,7 @@ class LockstepDemonstrator:
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
         """Execute a goal to its end."""
         event = self._operator.goal(target, law=law, follow_markers=follow)
-        return (
-            "reached"
-            if event.kind == "goal_reached"
-            else f"{event.kind.removeprefix('goal_')}: {event.message}"
-        )
+        return "reached" if event.kind == "goal_reached" else f"{event.kind.removeprefix('goal_')}: {event.message}"
 
     def rest(self, seconds: float) -> None:
         """Let virtual time pass."""

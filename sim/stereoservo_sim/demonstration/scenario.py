@@ -196,9 +196,7 @@ def perform(
     return calibrated, outcomes
 
 
-def _met_on_belt(
-    operator: Operator, goal: ShownGoal, model: CellModel, belt: Belt, tell: Callable[[str], None]
-) -> str:
+def _met_on_belt(operator: Operator, goal: ShownGoal, model: CellModel, belt: Belt, tell: Callable[[str], None]) -> str:
     """Go with a part from when the belt sets off until it stands; the outcome."""
     belt.put()
     operator.rest(REST_S)

@@ -72,9 +72,7 @@ class EmulatorProcess:
             code = self.process.poll()
             if code is not None:
                 self._reader.join(1.0)
-                raise EmulatorError(
-                    f"the {self._what} ended (exit code {code}): {self.output()}", code, self.output()
-                )
+                raise EmulatorError(f"the {self._what} ended (exit code {code}): {self.output()}", code, self.output())
             if time.monotonic() > until:
                 raise EmulatorError(f"no {self._what} within {timeout_s:g} s", None, self.output())
         return self.channel

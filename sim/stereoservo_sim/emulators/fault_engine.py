@@ -112,9 +112,7 @@ class FaultLanguage(Generic[Command]):
     appear in the help.
     """
 
-    def __init__(
-        self, command: type[Command], verbs: Mapping[str, Verb], *, example: str, note: str = ""
-    ) -> None:
+    def __init__(self, command: type[Command], verbs: Mapping[str, Verb], *, example: str, note: str = "") -> None:
         self._command = command
         self.verbs = dict(verbs)
         self._example = example
@@ -133,9 +131,7 @@ class FaultLanguage(Generic[Command]):
             raise FaultCommandError(f"an empty order; orders: {', '.join(self.verbs)}")
         name = words[0].lower()
         if name not in self.verbs:
-            raise FaultCommandError(
-                f"no order {words[0]!r}; orders: {', '.join(self.verbs)} (`help` explains them)"
-            )
+            raise FaultCommandError(f"no order {words[0]!r}; orders: {', '.join(self.verbs)} (`help` explains them)")
         verb = self.verbs[name]
         try:
             at_ns = duration_ns(when.strip()) if at else None

@@ -31,9 +31,7 @@ CAMERAS_ASSUMED = (
     f"focal length {FOCAL_PX:.0f} px and image {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]} px: not said in chapter 3, taken from "
     "table 5.2; both cameras look at the middle of the object"
 )
-EPIPOLAR_ASSUMED = (
-    "the epipolar geometry is known (rigid stereo, chapter 2), except in rows that say otherwise"
-)
+EPIPOLAR_ASSUMED = "the epipolar geometry is known (rigid stereo, chapter 2), except in rows that say otherwise"
 
 
 def converging_rig(distance: float, baseline: float = 0.2) -> StereoRig:

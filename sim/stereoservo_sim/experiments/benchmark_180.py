@@ -131,8 +131,7 @@ def _paths_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison]
         free = {
             row["gain"]: row["line_deviation_mm"]
             for row in rows
-            if (row["law"], row["arm"], row["step"], row["joint_speed_deg_s"])
-            == (law, "rx90", "first order", None)
+            if (row["law"], row["arm"], row["step"], row["joint_speed_deg_s"]) == (law, "rx90", "first order", None)
         }
         slow = [row for row in rows if row["law"] == law and row["joint_speed_deg_s"] is not None]
         if not free or not slow:
@@ -162,9 +161,7 @@ def _errors_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison
                          min(known) > 0.95 and max(known) < 1.05)
         )  # fmt: skip
     start = _of(rows, scene="aside", law="cartesian2", gain=0.5, step="corrected")[0]["theta_start_deg"][0]
-    found.append(
-        of_statement("fig. 8.19", "theta_s at the start", "180°", f"{start:.1f}°", abs(start - 180.0) < 0.5)
-    )
+    found.append(of_statement("fig. 8.19", "theta_s at the start", "180°", f"{start:.1f}°", abs(start - 180.0) < 0.5))
     (overlap,) = [item for item in summary if "overlap" in item]
     largest = max(overlap["theta_r_apart_deg"], overlap["theta_p_apart_deg"])
     found.append(
@@ -228,9 +225,7 @@ def _control_errors(curves: list[Curve]) -> Figure:
             t = np.linspace(curve["seconds"][0], curve["seconds"][-1], len(errors))
             for i, name in enumerate(names):
                 values = 100.0 * errors[:, 0] / errors[0, 0] if i == 0 else np.degrees(errors[:, i])
-                axis.plot(
-                    t, values, "--" if limited else "-", color=COLOURS[i], label=None if limited else name
-                )
+                axis.plot(t, values, "--" if limited else "-", color=COLOURS[i], label=None if limited else name)
         labelled(axis, title, "[s]", "still to be made")
         if axis.lines:
             axis.legend(fontsize=7)
@@ -443,11 +438,7 @@ def asked() -> list[BenchmarkRun]:
     """
     arms: tuple[ArmName, ...] = ("free", "rx90")
     return [
-        *(
-            BenchmarkRun(scene, "free", law, model)
-            for scene in ASIDE_M
-            for law, (model, _) in CLASSICAL.items()
-        ),
+        *(BenchmarkRun(scene, "free", law, model) for scene in ASIDE_M for law, (model, _) in CLASSICAL.items()),
         *(BenchmarkRun(scene, arm, law) for scene in ASIDE_M for arm in arms for law in CARTESIAN),
         *(
             BenchmarkRun("aside", "rx90", law, gain=gain, step=step)
@@ -457,18 +448,14 @@ def asked() -> list[BenchmarkRun]:
             if (gain, step) != (GAIN, "corrected")
         ),
         *(
-            BenchmarkRun(
-                "aside", "rx90", law, gain=1.0, step="first order", joint_speed_deg_s=JOINT_SPEED_DEG_S
-            )
+            BenchmarkRun("aside", "rx90", law, gain=1.0, step="first order", joint_speed_deg_s=JOINT_SPEED_DEG_S)
             for law in CARTESIAN[:2]
         ),
         COMPARED[1],
     ]
 
 
-def run_benchmark_180(
-    *, seed: int, progress: ProgressCall, runs: list[BenchmarkRun] | None = None
-) -> dict[str, Any]:
+def run_benchmark_180(*, seed: int, progress: ProgressCall, runs: list[BenchmarkRun] | None = None) -> dict[str, Any]:
     """Run all laws and planned paths. Raises CalibrationError."""
     runs = asked() if runs is None else runs
     tasks = {scene: benchmark_task(scene) for scene in ASIDE_M}
@@ -484,9 +471,7 @@ def run_benchmark_180(
         rows.append(_row(run, task, result, trace))
         curves.append(_curve(run, task, trace))
     progress("benchmark-180", len(runs), len(runs))
-    ways = [
-        _planned(scene, tasks[scene], known["", "free", "projective"], profile) for scene, profile in PLANNED
-    ]
+    ways = [_planned(scene, tasks[scene], known["", "free", "projective"], profile) for scene, profile in PLANNED]
     return {
         "title": TITLE,
         "noise_px": NOISE_PX,
@@ -510,9 +495,7 @@ def _calibrations(
     }
     for scene in dict.fromkeys(run.scene for run in runs if run.arm == "rx90"):
         cell = placed_rx90(tasks[scene], seed)
-        known[scene, "rx90", "projective"] = (
-            None if cell is None else self_calibrated("rx90", cell, NOISE_PX, seed)
-        )
+        known[scene, "rx90", "projective"] = None if cell is None else self_calibrated("rx90", cell, NOISE_PX, seed)
     return known
 
 
@@ -591,9 +574,7 @@ def _classical(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def _planned(
-    scene: str, task: AlignmentTask, calibration: TaskCalibration | None, profile: Profile
-) -> dict[str, Any]:
+def _planned(scene: str, task: AlignmentTask, calibration: TaskCalibration | None, profile: Profile) -> dict[str, Any]:
     """A planned path (figs 8.15, 8.16): ground truth, and the projective model's path beside it in the images."""
     assert calibration is not None
     knowledge = known_at_start(calibration, task, None)
@@ -601,15 +582,11 @@ def _planned(
     found, _ = triangulate(knowledge.matrices, set_points, np.ones(set_points.shape[:2]), 5)
     path, points = known_path(knowledge, found / (found @ knowledge.plane_at_infinity)[:, None], profile)
     sigmas = np.linspace(0.0, 1.0, 101)
-    planned = np.array(
-        [project_points(knowledge.matrices, points @ path.displacement(s).T)[0] for s in sigmas]
-    )
+    planned = np.array([project_points(knowledge.matrices, points @ path.displacement(s).T)[0] for s in sigmas])
     truth = true_path(task, profile)
     parts = truth.decomposition
     # Half a turn has two senses: the model's is compared with the nearer.
-    other = CartesianPath(
-        replace(parts, planar=replace(parts.planar, operator=-parts.planar.operator)), profile
-    )
+    other = CartesianPath(replace(parts, planar=replace(parts.planar, operator=-parts.planar.operator)), profile)
     apart, poses = np.inf, np.zeros((0, 4, 4))
     for sense in (truth, other):
         tried = np.array([sense.displacement(s) @ task.start for s in sigmas])

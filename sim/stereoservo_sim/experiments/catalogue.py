@@ -42,9 +42,7 @@ CONTENTS = (
     ThesisItem("fig. 3.5", "gripper: error over noise and number of motions", "gripper"),
     ThesisItem("fig. 3.6", "grid: single and cumulative estimates", "grid"),
     ThesisItem("fig. 3.7", "house: motion field, rectification of the grid", "house"),
-    ThesisItem(
-        "figs 4.1 to 4.7", "geometry of rotations; set-up, trajectories in a photograph", instead=DRAWN
-    ),
+    ThesisItem("figs 4.1 to 4.7", "geometry of rotations; set-up, trajectories in a photograph", instead=DRAWN),
     ThesisItem("table 4.1", "image errors in calibration and prediction", "pan-tilt"),
     ThesisItem("fig. 4.8", "histograms of the calibration errors", "pan-tilt"),
     ThesisItem("fig. 4.9", "feed-forward prediction over 35 trials", "pan-tilt"),
@@ -56,13 +54,9 @@ CONTENTS = (
     ThesisItem("table 5.2", "intrinsic parameters", "robot"),
     ThesisItem("table 5.3", "angles between axes", "robot"),
     ThesisItem("table 5.4", "link lengths", "robot"),
-    ThesisItem(
-        "figs 6.1 to 6.7", "inverse kinematics: drawings; its solutions are counted", "inverse-kinematics"
-    ),
+    ThesisItem("figs 6.1 to 6.7", "inverse kinematics: drawings; its solutions are counted", "inverse-kinematics"),
     ThesisItem("figs 7.1 to 7.13", "tasks, Cartesian motions, visibility", instead=DRAWN),
-    ThesisItem(
-        "table 8.1, figs 8.1 to 8.5", "hand-eye beside base-eye, block schemas, set-points", instead=DRAWN
-    ),
+    ThesisItem("table 8.1, figs 8.1 to 8.5", "hand-eye beside base-eye, block schemas, set-points", instead=DRAWN),
     ThesisItem("figs 8.6 to 8.12", "tasks A, B, C: decay, image and joint motion", "tasks-abc"),
     ThesisItem("figs 8.13 to 8.22", "the benchmark of half a turn", "benchmark-180"),
     ThesisItem("8.7, 9.3", "projective beside Euclidean modelling", "projective-vs-euclidean"),
@@ -170,7 +164,5 @@ def find_experiment(name: str) -> Experiment:
     """Experiment of that name. Raises ExperimentError, which lists the valid names."""
     if name not in EXPERIMENTS:
         known = ", ".join(sorted(EXPERIMENTS))
-        raise ExperimentError(
-            "experiment", f"no experiment {name!r}; known: {known}", known=sorted(EXPERIMENTS)
-        )
+        raise ExperimentError("experiment", f"no experiment {name!r}; known: {known}", known=sorted(EXPERIMENTS))
     return EXPERIMENTS[name]

@@ -135,9 +135,7 @@ def dots(light: Lighting, seed: int) -> Iterator[Look]:
 def edges(light: Lighting, seed: int) -> Iterator[Look]:
     """The vertices of the cell ``edges`` by the detector `edges`."""
     cell = solid_cell()
-    start = {
-        "left": dict(zip(cell.body.ids.tolist(), cell.truth_pixels(cell.base)["left"].tolist(), strict=True))
-    }
+    start = {"left": dict(zip(cell.body.ids.tolist(), cell.truth_pixels(cell.base)["left"].tolist(), strict=True))}
     with tempfile.TemporaryDirectory(prefix="stereoservo-light-") as folder:
         (Path(folder) / "wedge.part").write_text(part_text(cell.body, start), "utf-8")
         detector = EdgeDetector({"part": "wedge.part"}, context_of("left", Path(folder)))
@@ -231,10 +229,7 @@ def _taught_and_reached(
 
 def _said(event: Event) -> str:
     """An event's reasons in words."""
-    return (
-        "; ".join(str(getattr(reason, "message", "") or reason.code) for reason in event.reasons)
-        or event.message
-    )
+    return "; ".join(str(getattr(reason, "message", "") or reason.code) for reason in event.reasons) or event.message
 
 
 def goal_row(light_name: str, seeds: int, seed: int) -> dict[str, Any]:
@@ -284,9 +279,7 @@ def show_changing_light(answer: dict[str, Any], console: Console) -> None:
 def draw_changing_light(answer: dict[str, Any]) -> Figures:
     """Chi-square a freedom of each detector over the lights, in order."""
     curves = {
-        name: [
-            row["chi2_per_freedom"] for row in answer["detectors"] if row["detector"] == name and row["found"]
-        ]
+        name: [row["chi2_per_freedom"] for row in answer["detectors"] if row["detector"] == name and row["found"]]
         for name in DETECTORS
     }
     return {"changing-light": sorted_values(curves, "chi-square a freedom", 1.0)}

@@ -228,9 +228,7 @@ def carry(seed: int) -> dict[str, Any]:
     plates = workpiece_cell()
     assert plates.workpiece is not None
     solid = wedge(FIRST_ID, height=HEIGHT)
-    solid = wedge(
-        FIRST_ID, scale=_extent(_corners(plates.workpiece.body)) / _extent(solid.vertices), height=HEIGHT
-    )
+    solid = wedge(FIRST_ID, scale=_extent(_corners(plates.workpiece.body)) / _extent(solid.vertices), height=HEIGHT)
     # The plates' front is their -z, the solid's its top at +z: half a turn about x.
     turned = solid.vertices * np.array([1.0, -1.0, -1.0]) + np.array([0.0, 0.0, solid.vertices[:, 2].max()])
     turned = turned @ (rotation("y", FACING_DEG[1]) @ rotation("x", FACING_DEG[0]))[:3, :3].T
@@ -238,8 +236,7 @@ def carry(seed: int) -> dict[str, Any]:
     solid = replace(solid, vertices=turned, light=light)
     edges = replace(plates, workpiece=Workpiece(solid, plates.workpiece.stand))
     moves = [
-        Moved(tuple(rng.uniform(-0.03, 0.03, 3).tolist()), tuple(rng.uniform(-15, 15, 3).tolist()))
-        for _ in range(2)
+        Moved(tuple(rng.uniform(-0.03, 0.03, 3).tolist()), tuple(rng.uniform(-15, 15, 3).tolist())) for _ in range(2)
     ]
     then, now = (plates.workpiece.pose(moved) for moved in moves)
     settings = RenderSettings(float(rng.uniform(0.5, 1.2)), float(rng.uniform(1.0, 4.0)))
@@ -250,9 +247,7 @@ def carry(seed: int) -> dict[str, Any]:
     truth = _carried_truth(plates, goal, now @ np.linalg.inv(then))
     by_dots = _seen_twice(_CarryScene(plates, then, now, settings), rng, None)
     by_edges = _seen_twice(_CarryScene(edges, then, now, settings), rng, solid)
-    row["markers_px"], row["refused"] = _error(
-        model, body, *by_dots, TaughtTarget("goal", "workpiece"), truth
-    )
+    row["markers_px"], row["refused"] = _error(model, body, *by_dots, TaughtTarget("goal", "workpiece"), truth)
     lines = _common_edges(solid, *by_edges)
     row["edges"] = len(lines)
     target = TaughtTarget("goal", "workpiece", (), lines)
@@ -314,9 +309,7 @@ def _seen(scene: _CarryScene, pose: FloatArray, rng: np.random.Generator, solid:
     known = set(part.body.ids.tolist())
     for camera in scene.cell.rig.cameras:
         pixels = camera.image_of(part.marker_positions(pose))[0] + rng.uniform(-START_PX, START_PX)
-        detector = _detector(
-            camera.name, solid, dict(zip(part.body.ids.tolist(), pixels.tolist(), strict=True))
-        )
+        detector = _detector(camera.name, solid, dict(zip(part.body.ids.tolist(), pixels.tolist(), strict=True)))
         renderer = Renderer(scene.cell, camera, scene.settings)
         found: dict[int, list[tuple[FloatArray, FloatArray]]] = {}
         for k in range(FRAMES):
@@ -355,9 +348,7 @@ def _common_edges(solid: SolidBody, then: Seen, now: Seen) -> tuple[tuple[int, i
         for a, b in zip(outline, (*outline[1:], outline[0]), strict=True)
     }
     ids = solid.ids
-    return tuple(
-        (int(ids[a]), int(ids[b])) for a, b in sorted(pairs) if int(ids[a]) in both and int(ids[b]) in both
-    )
+    return tuple((int(ids[a]), int(ids[b])) for a, b in sorted(pairs) if int(ids[a]) in both and int(ids[b]) in both)
 
 
 def _error(
@@ -409,7 +400,5 @@ def _taught(model: CellModel, seen: Seen) -> TaughtGoal:
 
 def draw_edge_transfer(answer: dict[str, Any]) -> Figures:
     """Share of the goals with at most so much error."""
-    curves = {
-        way: [row[f"{way}_px"] for row in answer["rows"] if row[f"{way}_px"] is not None] for way in WAYS
-    }
+    curves = {way: [row[f"{way}_px"] for row in answer["rows"] if row[f"{way}_px"] is not None] for way in WAYS}
     return {"edge-transfer": sorted_values(curves, "error of the set-points [px]")}

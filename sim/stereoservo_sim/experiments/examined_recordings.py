@@ -117,9 +117,7 @@ def examined_case(seed: int) -> ExaminedCase:
     dropped = kind == "dropped_frames" or bool(rng.random() < ALSO_DROPPED)
     if dropped:
         views = _with_drops(views, truth, rng)
-    in_trials = any(
-        0 < one.frame < truth.trial_frames for one in truth.faults if one.kind != "dropped_frames"
-    )
+    in_trials = any(0 < one.frame < truth.trial_frames for one in truth.faults if one.kind != "dropped_frames")
     return ExaminedCase(seed, views, tuple(truth.faults), poses, imperfect, in_trials, truth.sigma)
 
 
@@ -157,9 +155,7 @@ def _recorded(truth: _Truth, kind: str, rng: np.random.Generator) -> RecordedVie
         late[camera, frame:] = size
         truth.faults.append(TrueFault("late_stamps", name, frame, size))
     later = np.arange(len(times)) >= frame
-    shown = np.array(
-        [[np.interp(times + late[c], truth.path_times, q) for q in truth.path.T] for c in range(2)]
-    )
+    shown = np.array([[np.interp(times + late[c], truth.path_times, q) for q in truth.path.T] for c in range(2)])
     shown = shown.transpose(0, 2, 1)
     if kind == "camera_moved":
         size = float(np.exp(rng.uniform(*np.log(BUMPS))))
@@ -200,9 +196,7 @@ def _bumped(
         turn = np.degrees(scale) * axis / np.linalg.norm(axis)
         move = translation(*(0.3 * scale * shift))
         poses = cell.poses.copy()
-        poses[camera] = (
-            rotation("x", turn[0]) @ rotation("y", turn[1]) @ rotation("z", turn[2]) @ move @ poses[camera]
-        )
+        poses[camera] = rotation("x", turn[0]) @ rotation("y", turn[1]) @ rotation("z", turn[2]) @ move @ poses[camera]
         seen = replace(cell, poses=poses)
         apart = seen.pixels(sample)[camera] - cell.pixels(sample)[camera]
         scale *= size / float(np.sqrt((apart**2).sum(axis=-1).mean()))
@@ -362,9 +356,7 @@ def run_examined_recordings(seeds: int, seed: int = 0, progress: ProgressCall = 
         rows.append(count_row(f"{kind}: onset within {WITHIN} frames", len(near), len(hit)))
     rows.append(count_row("recordings with a false cause", sum(bool(c.falsely) for c in judged), len(judged)))
     quiet = [case for case in judged if not [one for one in case.true if one != "dropped_frames"]]
-    rows.append(
-        count_row("of those to which nothing was done", sum(bool(c.falsely) for c in quiet), len(quiet))
-    )
+    rows.append(count_row("of those to which nothing was done", sum(bool(c.falsely) for c in quiet), len(quiet)))
     rows.append(count_row("not told, with the reason", sum(c.not_told for c in judged), len(judged)))
     rows.append(count_row("named beside another cause", sum(bool(c.unsure) for c in judged), len(judged)))
     return {

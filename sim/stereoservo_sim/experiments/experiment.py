@@ -72,9 +72,7 @@ def of_error(
         verdict = "worse"
     elif MARGIN * ours < thesis:
         verdict = "better"
-    return Comparison(
-        item, what, _text(thesis, unit), _text(ours, unit), verdict, why if verdict == "worse" else ""
-    )
+    return Comparison(item, what, _text(thesis, unit), _text(ours, unit), verdict, why if verdict == "worse" else "")
 
 
 def of_limit(

@@ -159,9 +159,9 @@ def run_grid(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]
     return {
         **answer_of(rows, THESIS, ASSUMPTIONS),
         "rendered": rendered,
-        "one_image_e_d_mm": expected_errors(
-            scenes[0], None, _with_known_plane(pair_covariance(rig, scenes[0], SIGMA))
-        )[0],
+        "one_image_e_d_mm": expected_errors(scenes[0], None, _with_known_plane(pair_covariance(rig, scenes[0], SIGMA)))[
+            0
+        ],
     }
 
 
@@ -210,9 +210,7 @@ def _one_sequence(
         single: dict[str, tuple[FloatArray, FloatArray]] = {"linear": (svd.plane, points[before])}
         try:
             direction = (svd.generator @ svd.plane)[None]
-            fit = bundle_translations(
-                cameras, pixels[[before, n]], points[before], svd.plane, direction, SIGMA
-            )
+            fit = bundle_translations(cameras, pixels[[before, n]], points[before], svd.plane, direction, SIGMA)
             single["non-linear"] = fit.plane, fit.points
         except GeometryError:
             failed["single", n, "non-linear"] += 1
@@ -335,9 +333,7 @@ def draw_grid(answer: dict[str, Any]) -> Figures:
     for axis, structure in zip(axes, ("upgrade only", "full"), strict=True):
         for estimate, style in (("single", ".:"), ("cumulative", ".-")):
             for method, colour in (("linear", "#d55e00"), ("non-linear", "#0072b2")):
-                rows = rows_of(
-                    answer["rows"], "e_d_mm", estimate=estimate, method=method, structure=structure
-                )
+                rows = rows_of(answer["rows"], "e_d_mm", estimate=estimate, method=method, structure=structure)
                 draw_errors(axis, rows, "motion", "e_d_mm", style, colour, f"{estimate}, {method}")
         axis.axhspan(*THESIS["e_d_mm"], color="0.85", zorder=0, label="thesis")
         axis.set_yscale("log")
@@ -410,8 +406,7 @@ def house_by_pictures(seed: int) -> dict[str, Any]:
     rng, rig, shifts = np.random.default_rng([seed, 3]), converging_rig(DISTANCE), scene_shifts()
     body = house_body(rng)
     pictures = {
-        camera.name: [body.picture(camera, shift, rng, NOISE_GREY) for shift in shifts]
-        for camera in rig.cameras
+        camera.name: [body.picture(camera, shift, rng, NOISE_GREY) for shift in shifts] for camera in rig.cameras
     }
     tracks = landmark_tracks(pictures, LearningSettings(tilts=1, most=LANDMARKS))
     sigma = float(np.sqrt(np.mean(tracks.sigmas**2)))
@@ -543,9 +538,7 @@ def _draw_rectification() -> Figure:
         axis = figure.add_subplot(1, 2, k, projection="3d")
         for face in points.reshape(2, 7, 7, 3):
             for line in (*face, *face.transpose(1, 0, 2)):
-                axis.plot(
-                    line[:, 0], line[:, 2], -line[:, 1], ".-", color="#0072b2", markersize=3, linewidth=0.7
-                )
+                axis.plot(line[:, 0], line[:, 2], -line[:, 1], ".-", color="#0072b2", markersize=3, linewidth=0.7)
         axis.view_init(elev=40, azim=-75)
         axis.set_title(title, fontsize=9)
         axis.set(xticklabels=[], yticklabels=[], zticklabels=[])

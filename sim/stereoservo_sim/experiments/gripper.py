@@ -265,9 +265,7 @@ def _collect_bounds(
             bounds[sigma, len(shifts), f"{structure}, F estimated"].append((sigma * d, sigma * (q or 0.0)))
 
 
-def _planes(
-    cameras: FloatArray, pixels: FloatArray, sigma: float
-) -> dict[str, tuple[FloatArray | None, FloatArray]]:
+def _planes(cameras: FloatArray, pixels: FloatArray, sigma: float) -> dict[str, tuple[FloatArray | None, FloatArray]]:
     """Plane at infinity by each method, and the corresponding structure; None where it fails."""
     rest = triangulate(cameras, pixels[0])
     weighting = image_weighting(cameras, rest)

@@ -139,9 +139,7 @@ def flatness(model: CellModel, tags: tuple[int, ...]) -> Flatness:
         )
     points = from_homogeneous(model.scene_points @ model.projective_to_euclidean.T)
     if len(points) < 4:
-        return Flatness(
-            None, f"only {len(points)} corners of table tags could be triangulated", shared, points
-        )
+        return Flatness(None, f"only {len(points)} corners of table tags could be triangulated", shared, points)
     smallest = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[2]
     return Flatness(float(smallest / np.sqrt(len(points)) * 1e3), None, shared, points)
 
@@ -217,9 +215,7 @@ def read_poses(path: Path) -> dict[int, FloatArray]:
             raise _csv_error(path, line, COLUMNS[0], cells[0], "an index that no earlier line has")
         poses[index] = pose
     if not poses:
-        raise ExperimentError(
-            "csv", f"{path} holds no pose; rows of {','.join(COLUMNS)} are needed", file=str(path)
-        )
+        raise ExperimentError("csv", f"{path} holds no pose; rows of {','.join(COLUMNS)} are needed", file=str(path))
     return poses
 
 

@@ -143,9 +143,7 @@ def run_homing(*, seeds: int, seed: int, progress: ProgressCall, trials: int = T
             "every image errs by 0.3 px an axis by itself, the home image too",
         ],
         "failed": failed,
-        "example": np.round(np.degrees(found["calibrated"][0].errors), 6).tolist()
-        if found["calibrated"]
-        else [],
+        "example": np.round(np.degrees(found["calibrated"][0].errors), 6).tolist() if found["calibrated"] else [],
     }
 
 
@@ -183,9 +181,7 @@ def compare_homing(answer: dict[str, Any]) -> list[Comparison]:
             "that no estimator keeps all below it at this noise"
         )
         found.append(
-            of_limit(
-                "fig. 4.10", f"{joint}, largest error", limit, row["largest_deg"], "°", why, "better than"
-            )
+            of_limit("fig. 4.10", f"{joint}, largest error", limit, row["largest_deg"], "°", why, "better than")
         )
         found.append(of_limit("fig. 4.10", f"{joint}, rms", limit, row["rms_deg"], "°", why, "better than"))
     return found

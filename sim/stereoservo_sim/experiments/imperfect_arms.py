@@ -123,9 +123,7 @@ def model_of(case: RandomCase, wrong: Imperfections, kind: str) -> CellModel:
     gears = wrong.mechanics
     assert gears is not None
     if kind == "exact":
-        play, sag, ripple = (
-            np.array([getattr(g, name) for g in gears]) for name in ("play", "sag", "ripple")
-        )
+        play, sag, ripple = (np.array([getattr(g, name) for g in gears]) for name in ("play", "sag", "ripple"))
         random = np.hypot(0.5 * play, ripple / np.sqrt(2.0))
         off = np.full(len(gears), ZERO_OFFSET / np.sqrt(3.0))
         stated = np.sqrt(random**2 + sag**2 + off**2)
@@ -228,9 +226,7 @@ def run_imperfect_arms(
         "error_px": _spread([goal.error_px for goal in reached]),
         "later_px": _spread([goal.later_px for goal in reached]),
         "seconds": _spread([goal.seconds for goal in reached]),
-        "refused_goals": dict(
-            Counter(goal.codes[0] for goal in goals if goal.outcome == "refused" and goal.codes)
-        ),
+        "refused_goals": dict(Counter(goal.codes[0] for goal in goals if goal.outcome == "refused" and goal.codes)),
         "no_model": dict(Counter(case.code for case in judged if case.code)),
         "false": [msgspec.to_builtins(goal) for goal in false],
         "lost": [msgspec.to_builtins(goal) for goal in lost],
@@ -335,9 +331,7 @@ def drawn_creep(cell: SyntheticCell, rng: np.random.Generator) -> Creep:
         twist[3 * (1 - k) : 3 * (2 - k)] = 1e-5 * direction
         sizes.append(twist * (TURNED, 1.0 - TURNED)[k] / _rms(cell, Creep(camera, twist), 1.0, cell.home))
     twist = sizes[0] + sizes[1]
-    return Creep(
-        camera, twist * CREEP_PX / 60.0 / _rms(cell, Creep(camera, 1e-3 * twist), 1.0, cell.home) * 1e-3
-    )
+    return Creep(camera, twist * CREEP_PX / 60.0 / _rms(cell, Creep(camera, 1e-3 * twist), 1.0, cell.home) * 1e-3)
 
 
 def _rms(cell: SyntheticCell, creep: Creep, seconds: float, q: FloatArray) -> float:
@@ -367,9 +361,7 @@ def judged_creep(seed: int, *, creeps: bool, goals: int = CREEP_GOALS) -> list[C
         off = (cell.markers(driven.links[None]) - cell.markers(place[None]))[0, :, :3]
         beside_mm = 1e3 * float(np.linalg.norm(off, axis=1).max())
         found.append(
-            CreepVerdict(
-                seed, kind, k, ended, end.codes, end.verdict, farthest(shown, wanted), crept, beside_mm
-            )
+            CreepVerdict(seed, kind, k, ended, end.codes, end.verdict, farthest(shown, wanted), crept, beside_mm)
         )
         if ended in ("held", "refused"):
             break
@@ -397,9 +389,7 @@ def run_creeping_cameras(seeds: int, seed: int = 0, progress: ProgressCall = sil
         f"{TOLERANCE_PX:g} px",
         "rows": [
             count_row("creep: called reached", len(crept), len(found[True])),
-            count_row(
-                "creep: reached beyond tolerance", sum(g.error_px > TOLERANCE_PX for g in crept), len(crept)
-            ),
+            count_row("creep: reached beyond tolerance", sum(g.error_px > TOLERANCE_PX for g in crept), len(crept)),
             count_row("creep: falsely called reached", len(false), len(crept)),
             count_row("healthy: called reached", sum(g.outcome == "reached" for g in healthy), len(healthy)),
             count_row("healthy: cameras said to disagree", len(held), len(healthy)),
@@ -416,9 +406,7 @@ def run_creeping_cameras(seeds: int, seed: int = 0, progress: ProgressCall = sil
     }
 
 
-draw_creeping_cameras = drawing_sorted(
-    "creeping_cameras", "errors_px", "true error [px]", CREEP_FALSE * TOLERANCE_PX
-)
+draw_creeping_cameras = drawing_sorted("creeping_cameras", "errors_px", "true error [px]", CREEP_FALSE * TOLERANCE_PX)
 """True errors of goals called reached, beside what would be false."""
 
 

@@ -83,9 +83,7 @@ def _directions(rng: np.random.Generator, count: int, least: float = 0.3) -> Flo
 
 def sliding(count: int) -> Callable[[np.random.Generator], EuclideanAxes]:
     """Arm of prismatic joints in general directions."""
-    return lambda rng: EuclideanAxes(
-        _directions(rng, count), np.zeros((count, 3)), np.zeros(count, dtype=bool)
-    )
+    return lambda rng: EuclideanAxes(_directions(rng, count), np.zeros((count, 3)), np.zeros(count, dtype=bool))
 
 
 def one(rng: np.random.Generator) -> EuclideanAxes:
@@ -228,9 +226,7 @@ def point_singularity(axes: EuclideanAxes, rng: np.random.Generator) -> Singular
 
 
 def _by_points(solver: Callable[[EuclideanAxes, FloatArray, FloatArray], FloatArray]) -> Judge:
-    def judge(
-        axes: EuclideanAxes, H: FloatArray, points: FloatArray | None, rng: np.random.Generator
-    ) -> FloatArray:
+    def judge(axes: EuclideanAxes, H: FloatArray, points: FloatArray | None, rng: np.random.Generator) -> FloatArray:
         assert points is not None
         return solver(axes, points, np.einsum("nij,nj->ni", H[:, :3, :3], points) + H[:, :3, 3])
 
@@ -241,9 +237,7 @@ def _by_poses(solver: Callable[[EuclideanAxes, FloatArray], FloatArray]) -> Judg
     return lambda axes, H, points, rng: solver(axes, H)
 
 
-def _searched(
-    axes: EuclideanAxes, H: FloatArray, points: FloatArray | None, rng: np.random.Generator
-) -> FloatArray:
+def _searched(axes: EuclideanAxes, H: FloatArray, points: FloatArray | None, rng: np.random.Generator) -> FloatArray:
     found = [metric.all_solutions(axes, goal, SEARCH, rng) for goal in H]
     wide = np.full((len(H), max(map(len, found)), len(axes.directions)), np.nan)
     for row, solutions in zip(wide, found, strict=True):
@@ -257,16 +251,12 @@ FAMILIES: dict[str, ArmFamily] = {
     "prismatic 3": ArmFamily(sliding(3), _by_points(metric.prismatic), True, bounded=False),
     "revolute": ArmFamily(one, _by_points(metric.revolute), True, point_on_first_axis),
     "two revolute, general": ArmFamily(two, _by_points(metric.two_revolute), True, point_on_first_axis),
-    "two revolute, parallel": ArmFamily(
-        parallel_pair, _by_points(metric.two_parallel), True, stretched_point
-    ),
+    "two revolute, parallel": ArmFamily(parallel_pair, _by_points(metric.two_parallel), True, stretched_point),
     "arm": ArmFamily(shoulder_and_elbow, _by_points(metric.arm), True, point_singularity),
     "wrist, square": ArmFamily(
         square_wrist, _by_poses(lambda axes, H: metric.wrist(axes, H[:, :3, :3])), False, aligned_wrist
     ),
-    "wrist, any angles": ArmFamily(
-        concurrent, _by_poses(lambda axes, H: metric.wrist(axes, H[:, :3, :3])), False
-    ),
+    "wrist, any angles": ArmFamily(concurrent, _by_poses(lambda axes, H: metric.wrist(axes, H[:, :3, :3])), False),
     "PUMA": ArmFamily(lambda rng: from_rows(PUMA_ROWS), _by_poses(metric.with_wrist), False, arm_singularity),
     "arm with wrist": ArmFamily(
         lambda rng: joined(shoulder_and_elbow(rng), square_wrist(rng)),
@@ -464,9 +454,7 @@ def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
     if pose.free is not None:
         return answer.outcome == "continuum" and any(pose.free in free for free in answer.free_joints)
     apart = differences(hidden.axes, pose.joints[None], answer.joints - hidden.chain.zero)
-    return bool(apart[0] <= 1e-3) and (
-        answer.outcome == "isolated" or kept_along(hidden, answer, goal, pose.point)
-    )
+    return bool(apart[0] <= 1e-3) and (answer.outcome == "isolated" or kept_along(hidden, answer, goal, pose.point))
 
 
 def kept_along(hidden: Hidden, answer: InverseSolutions, goal: FloatArray, point: FloatArray | None) -> bool:

@@ -118,9 +118,7 @@ def run_late_drives(seeds: int, seed: int = 0, progress: ProgressCall = silent) 
     known = [case for case in judged if not case.code]
     driven = [case for case in known if case.ends["true"] == "goal_reached"]
     within = [
-        c
-        for c in driven
-        if c.ends["learnt"] == "goal_reached" and c.errors_px["learnt"] <= WITHIN * TOLERANCE_PX
+        c for c in driven if c.ends["learnt"] == "goal_reached" and c.errors_px["learnt"] <= WITHIN * TOLERANCE_PX
     ]
     more = [case for case in within if case.overshoot["learnt"] > case.overshoot["true"] + MORE]
     return {
@@ -130,8 +128,7 @@ def run_late_drives(seeds: int, seed: int = 0, progress: ProgressCall = silent) 
             count_row("more overshoot", len(more), len(within)),
         ],
         "overshoot": {
-            name: float(np.max([case.overshoot[name] for case in within])) if within else None
-            for name in MODELS
+            name: float(np.max([case.overshoot[name] for case in within])) if within else None for name in MODELS
         },
         "overshoots": {name: [case.overshoot[name] for case in within] for name in MODELS},
         "ends": {name: dict(Counter(case.ends[name] for case in known)) for name in MODELS},
@@ -283,9 +280,7 @@ def run_late_pictures(seeds: int, seed: int = 0, progress: ProgressCall = silent
         reached = sum(case.ends[name] == "goal_reached" for case in known)
         rows.append(count_row(f"goal reached, offset {name}", reached, len(known)))
     both = [c for c in known if c.ends["learnt"] == c.ends["true"] == "goal_reached"]
-    errors = {
-        name: float(np.mean([c.errors_px[name] for c in both])) if both else None for name in KNOWLEDGE[:2]
-    }
+    errors = {name: float(np.mean([c.errors_px[name] for c in both])) if both else None for name in KNOWLEDGE[:2]}
     return {
         "title": f"late-pictures: cases {seed} to {seed + seeds - 1}",
         "rows": rows,

@@ -331,9 +331,7 @@ def point_on_line(calibration: TaskCalibration) -> OnLine:
     """Goal ``incidence``: marker 0 onto a line; the remaining freedoms unused, or used for set-points."""
     world = World(calibration, start_pose())
     line_pixels, line_points = world.seen_points(np.array([(-0.2, -0.15, 1.05, 1.0), (0.3, -0.05, 1.0, 1.0)]))
-    on_line = incidence_task(
-        ("point-on-line",), ((0,),), (line_points,), world.knowledge.plane_at_infinity, 0.01
-    )
+    on_line = incidence_task(("point-on-line",), ((0,),), (line_points,), world.knowledge.plane_at_infinity, 0.01)
     targets = world.points_at(goal_pose())
     set_points, _ = project_points(world.knowledge.matrices, targets)
 
@@ -572,9 +570,7 @@ def _profiles() -> Figure:
     }
     for axis, (profile, shapes) in zip(axes, SHAPES.items(), strict=True):
         for (name, (colour, style)), shape in zip(names.items(), shapes, strict=True):
-            axis.plot(
-                shares, [progress(shape, s) for s in shares], style, color=colour, linewidth=2.0, label=name
-            )
+            axis.plot(shares, [progress(shape, s) for s in shares], style, color=colour, linewidth=2.0, label=name)
         axis.set_title(profile, fontsize=9)
         axis.tick_params(labelsize=7)
         axis.grid(alpha=0.25)

@@ -152,9 +152,7 @@ def arm(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
     found = []
     for first in projected_roots(-w1, goal, c1, w2, p @ w2).T:
         rest = two_parallel(axes.part(slice(1, 3)), p, about(-w1, c1, first, goal))
-        found.append(
-            np.concatenate([np.broadcast_to(first[:, None, None], (len(first), 2, 1)), rest], axis=2)
-        )
+        found.append(np.concatenate([np.broadcast_to(first[:, None, None], (len(first), 2, 1)), rest], axis=2))
     return np.concatenate(found, axis=1)
 
 

@@ -76,9 +76,7 @@ CONDITIONS = (
     *(CarryCondition(" + ".join(pair), pair) for pair in combinations(ALL, 2)),
     CarryCondition("all four", ALL),
     CarryCondition("all four, two carried on the way", ALL, MOBILE),
-    CarryCondition(
-        "left + high, high carried, the others covered", ("left", "high"), ("high",), ("right", "wide")
-    ),
+    CarryCondition("left + high, high carried, the others covered", ("left", "high"), ("high",), ("right", "wide")),
 )
 
 
@@ -185,9 +183,7 @@ def fly(
             cell.wait_for(_stands_again(name), LIMIT_S)
         for name in condition.covered:
             cell.cameras[ALL.index(name)].blackout = True  # type: ignore[attr-defined]
-        ended = cell.wait_for(
-            lambda e: e.id == goal.id and e.kind in ("goal_reached", "goal_aborted"), 2 * LIMIT_S
-        )
+        ended = cell.wait_for(lambda e: e.id == goal.id and e.kind in ("goal_reached", "goal_aborted"), 2 * LIMIT_S)
         cell.run_for(0.5)
         newest = history.newest()
         assert newest is not None
@@ -251,9 +247,7 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _row(
-    condition: CarryCondition, flown: list[CarriedGoalResult], whole: list[CarriedGoalResult]
-) -> dict[str, Any]:
+def _row(condition: CarryCondition, flown: list[CarriedGoalResult], whole: list[CarriedGoalResult]) -> dict[str, Any]:
     cameras = [one.camera_px for one in flown if one.camera_px is not None]
     return {
         "cameras": condition.name,

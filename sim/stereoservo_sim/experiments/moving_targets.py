@@ -290,9 +290,7 @@ def _goal(world: SimulatedCell, law: LawName, follows: bool, shown: BoolArray) -
             if shown[c].any()
         }
     )
-    goal = Goal(
-        "0000abcd", target, law=law, gain=GAIN, tolerance_px=0.06 if follows else 0.001, time_limit_s=600.0
-    )
+    goal = Goal("0000abcd", target, law=law, gain=GAIN, tolerance_px=0.06 if follows else 0.001, time_limit_s=600.0)
     if not follows:
         return goal
     part = world.workpiece
@@ -303,15 +301,12 @@ def _goal(world: SimulatedCell, law: LawName, follows: bool, shown: BoolArray) -
         camera.name: named(part.body.ids, world.in_world(camera, world.base).image_of(positions)[0])
         for camera in world.rig.cameras
     }
-    return msgspec.structs.replace(
-        goal, follow_markers=tuple(int(i) for i in part.body.ids), follow_seen=seen
-    )
+    return msgspec.structs.replace(goal, follow_markers=tuple(int(i) for i in part.body.ids), follow_seen=seen)
 
 
 def _named(ids: Any, pixels: FloatArray, decimals: int) -> dict[int, tuple[float, float]]:
     return {
-        int(i): (round(float(u), decimals), round(float(v), decimals))
-        for i, (u, v) in zip(ids, pixels, strict=True)
+        int(i): (round(float(u), decimals), round(float(v), decimals)) for i, (u, v) in zip(ids, pixels, strict=True)
     }
 
 
@@ -398,9 +393,7 @@ def run_moving_faults(*, seeds: int, seed: int, progress: ProgressCall) -> dict[
     rows: list[dict[str, Any]] = []
     conditions = [(place, fault) for place in CELLS for fault in FAULTS]
     motions = list(MOTIONS)
-    found = crossed(
-        lambda c, k: disturb(*c, motions[(k - seed) % len(motions)], k), conditions, seeds, seed, progress
-    )
+    found = crossed(lambda c, k: disturb(*c, motions[(k - seed) % len(motions)], k), conditions, seeds, seed, progress)
     for (place, fault), flown in zip(conditions, found, strict=True):
         named = [one for one in flown if one.verdict]
         delays = [one.delay_s for one in flown if one.right] or [float("nan")]
@@ -488,9 +481,7 @@ def _pixels(world: SimulatedCell, q: FloatArray) -> FloatArray:
     return np.array(list(world.truth_pixels(q).values()))
 
 
-def _bump(
-    cell: LockstepCell, world: SimulatedCell, q: FloatArray, size_px: float, rng: np.random.Generator
-) -> str:
+def _bump(cell: LockstepCell, world: SimulatedCell, q: FloatArray, size_px: float, rng: np.random.Generator) -> str:
     """Turn one camera about a random axis in its own frame."""
     c = int(rng.integers(len(cell.cameras)))
     axis = rng.standard_normal(3)

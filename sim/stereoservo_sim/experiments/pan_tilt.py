@@ -125,9 +125,7 @@ def general_positions(cell: SyntheticCell, rng: np.random.Generator, count: int)
     return np.asarray(cell.home + rng.uniform(-1, 1, (count, 2)) * (cell.ranges - STEP))
 
 
-def tracked(
-    exact: FloatArray, noise: Noise, rng: np.random.Generator, first: FloatArray | None = None
-) -> FloatArray:
+def tracked(exact: FloatArray, noise: Noise, rng: np.random.Generator, first: FloatArray | None = None) -> FloatArray:
     """Pixels (c, s, m, 2) of tracks through s images with the tracker's noise; ``first`` (c, m, 2): the error that the
     first image has already.
     """
@@ -276,9 +274,7 @@ def separate_rotations(trials: TrialData) -> SeenChain:
         pixels, sigmas = trials.pixels[:, stops], trials.sigmas[:, stops]
         start = linear_generator("revolute", cameras, points[stops], usable[:, stops], pixels, sigmas, angles)
         if start is None:
-            raise GeometryError(
-                "degenerate", f"the images of joint {trials.joint_names[joint]!r} show no rotation"
-            )
+            raise GeometryError("degenerate", f"the images of joint {trials.joint_names[joint]!r} show no rotation")
         structure = common_points(start, "revolute", points[stops], angles)
         fit = bundle_rotation(cameras, pixels.swapaxes(0, 1), structure, start, angles, sigmas.swapaxes(0, 1))
         generators.append(fit.generator)
@@ -328,9 +324,7 @@ def mountain_body(cell: SyntheticCell, rng: np.random.Generator) -> TexturedBody
                 + (row - 0.5 * (ROWS - 1)) * DEEP * away
                 + (0.04 + RISE * row) * up
             )
-            faces.append(
-                Face(texture(rng, TEXELS, TEXTURE), middle - 0.5 * across + 0.5 * rise, across, -rise)
-            )
+            faces.append(Face(texture(rng, TEXELS, TEXTURE), middle - 0.5 * across + 0.5 * rise, across, -rise))
     return TexturedBody(faces)
 
 
@@ -344,25 +338,19 @@ def head_before_pictures(rng: np.random.Generator, positions: int) -> SeenHead:
     pan, tilt = trajectories(cell)
     general = general_positions(cell, rng, positions)
     ways = {"pan": pan, "tilt": tilt, "general": np.vstack([pan[:1], general])}
-    pictures = {
-        way: [[_picture(cell, body, c, q, rng) for q in path] for c in range(2)] for way, path in ways.items()
-    }
+    pictures = {way: [[_picture(cell, body, c, q, rng) for q in path] for c in range(2)] for way, path in ways.items()}
     first = {name: [pictures["pan"][c][0]] for c, name in enumerate(NAMES)}
     landmarks, _ = learn_landmarks(first, None, LearningSettings(tilts=1, most=POINTS))
     start = np.array([landmarks.camera(name).pixels for name in NAMES])
     tracked = {
-        way: np.array(
-            [follow([pictures["pan"][c][0], *shown[c][1:]], start[c], REACH_PX[way]) for c in range(2)]
-        )
+        way: np.array([follow([pictures["pan"][c][0], *shown[c][1:]], start[c], REACH_PX[way]) for c in range(2)])
         for way, shown in pictures.items()
     }
     points = body.points(_camera(cell, 0, pan[0]), start[0], np.zeros(3))
     kept = np.isfinite(points).all(axis=1)
     for pixels in tracked.values():
         kept &= np.isfinite(pixels).all(axis=(0, 1, 3))
-    kept[kept] = on_epipolar_lines(
-        np.concatenate([pixels[:, :, kept] for pixels in tracked.values()], axis=1)
-    )
+    kept[kept] = on_epipolar_lines(np.concatenate([pixels[:, :, kept] for pixels in tracked.values()], axis=1))
     order = rng.permutation(np.flatnonzero(kept))
     seen = cell.with_body(points[order])
     tracks = Tracks(
@@ -387,9 +375,7 @@ def _camera(cell: SyntheticCell, c: int, q: FloatArray) -> PinholeCamera:
     return PinholeCamera(NAMES[c], cell.intrinsics[c], pose, cell.width, cell.height)
 
 
-def _picture(
-    cell: SyntheticCell, body: TexturedBody, c: int, q: FloatArray, rng: np.random.Generator
-) -> ImageArray:
+def _picture(cell: SyntheticCell, body: TexturedBody, c: int, q: FloatArray, rng: np.random.Generator) -> ImageArray:
     return body.picture(_camera(cell, c, q), np.zeros(3), rng, NOISE_GREY)
 
 
@@ -446,9 +432,7 @@ def step_errors(
     """Predicted less extracted pixels (pairs, c, m, 2) [px]: from ``pixels`` (c, s, m, 2) of one image to ``target`` of
     the other.
     """
-    return np.array(
-        [feed_forward(seen, positions[i], pixels[:, i], positions[j])[0] - target[:, j] for i, j in pairs]
-    )
+    return np.array([feed_forward(seen, positions[i], pixels[:, i], positions[j])[0] - target[:, j] for i, j in pairs])
 
 
 def measures(errors: FloatArray) -> dict[str, float]:
@@ -487,9 +471,7 @@ def errors_of(seen: SeenHead, calibrating: int) -> dict[str, dict[str, FloatArra
     answer: dict[str, dict[str, FloatArray]] = {}
     for condition, (positions, pixels, exact, pairs) in _sequences(seen).items():
         pixels, exact = pixels[:, :, calibrating:], exact[:, :, calibrating:]
-        answer[condition] = {
-            name: step_errors(head, positions, pixels, pixels, pairs) for name, head in heads.items()
-        }
+        answer[condition] = {name: step_errors(head, positions, pixels, pixels, pairs) for name, head in heads.items()}
         answer[condition]["exact"] = step_errors(heads["calibrated"], positions, exact, exact, pairs)
     return answer
 
@@ -609,9 +591,7 @@ def _histograms(errors: FloatArray) -> dict[str, Any]:
     }
 
 
-def _row(
-    noise: Noise, condition: str, found: dict[tuple[Noise, str, str], list[dict[str, float]]]
-) -> dict[str, Any]:
+def _row(noise: Noise, condition: str, found: dict[tuple[Noise, str, str], list[dict[str, float]]]) -> dict[str, Any]:
     ours = found.get((noise, condition, "calibrated"), [])
     beside = {
         "perfect_calibration_delta_lr": found.get((noise, condition, "perfect"), []),
@@ -651,12 +631,8 @@ def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
         )  # fmt: skip
         for key, name in names.items():
             why = f"{row['perfect_calibration_delta_lr']['median']:.2f} px with the head known: noise"
-            found.append(
-                of_error("table 4.1", f"{row['condition']}: {name}", said[key], row[key]["median"], "px", why)
-            )
-    moved = next(
-        row for row in answer["rows"] if (row["condition"], row["noise"]) == ("feed-forward", "drifting")
-    )
+            found.append(of_error("table 4.1", f"{row['condition']}: {name}", said[key], row[key]["median"], "px", why))
+    moved = next(row for row in answer["rows"] if (row["condition"], row["noise"]) == ("feed-forward", "drifting"))
     equal = [(row["condition"], row["delta_l"]["median"], row["delta_r"]["median"]) for row in answer["rows"]
              if row["noise"] == "drifting" and row["condition"] != "feed-forward"]  # fmt: skip
     return [
@@ -680,8 +656,7 @@ def _compared_pictures(answer: dict[str, Any]) -> list[Comparison]:
     """Table 4.1, fig. 4.9 and the tracker of 4.5.1 beside what is had through pictures, the largest of all heads."""
     rows = answer["rendered"]
     largest = {
-        condition: max(row["delta_lr"] for row in rows if row["condition"] == condition)
-        for condition in CONDITIONS
+        condition: max(row["delta_lr"] for row in rows if row["condition"] == condition) for condition in CONDITIONS
     }
     step, drift = max(row["tracker_px"] for row in rows), min(row["drift_px"] for row in rows)
     return [

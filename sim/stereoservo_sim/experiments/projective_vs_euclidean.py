@@ -73,9 +73,7 @@ def run_projective_vs_euclidean(
                 }
             )
     workers = default_jobs() if jobs is None else jobs
-    results = results_of(
-        cases, tasks, workers, lambda done, total: progress("projective-vs-euclidean", done, total)
-    )
+    results = results_of(cases, tasks, workers, lambda done, total: progress("projective-vs-euclidean", done, total))
     return {
         "title": TITLE.format(count=seeds),
         "noise_px": NOISE_PX,
@@ -90,11 +88,7 @@ def compare_projective_vs_euclidean(answer: dict[str, Any]) -> list[Comparison]:
     """9.3 asks for the comparison and has no figure; 8.7 saw that exact models overlap."""
     found = []
     for law in LAWS_COMPARED:
-        rows = {
-            (row["model"], row["points"], row["focal_error"]): row
-            for row in answer["rows"]
-            if row["law"] == law
-        }
+        rows = {(row["model"], row["points"], row["focal_error"]): row for row in answer["rows"] if row["law"] == law}
         own, exact = rows["projective", "triangulated", None], rows["metric", "triangulated", 0.0]
         apart = [row["line_deviation_mm"]["median"] for row in (own, exact)]
         found.append(

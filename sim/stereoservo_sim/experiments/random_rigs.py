@@ -137,10 +137,7 @@ def held_out_ratio(case: RandomCase, trials: TrialData, result: CalibrationFit) 
     exact = case.cell.pixels(positions)[:, :, kept][seen]
     data = Measurements(order - result.model.zero, camera, stop, marker, exact, np.ones(len(exact)))
     errors = residuals(solution.rig, data)
-    roots = (
-        jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data)
-        @ solution.determined.root
-    )
+    roots = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data) @ solution.determined.root
     moments = roots.T @ roots * max(1.0, solution.determined.variance)
     mean = float(np.trace(moments))
     freedom = mean**2 / float((moments**2).sum())
@@ -178,9 +175,7 @@ def run_random_rigs(seeds: int, seed: int = 0, progress: ProgressCall = silent) 
         "rows": _rows(verdicts),
         "failures_by_cause": _causes(verdicts),
         "not_successes": _no_successes(verdicts),
-        "thesis": {
-            "note": "none: the thesis starts from a good guess (5.4.4) and calibrates one robot (5.5)"
-        },
+        "thesis": {"note": "none: the thesis starts from a good guess (5.4.4) and calibrates one robot (5.5)"},
     }
 
 
@@ -331,17 +326,13 @@ AROUND = {"revolute": 0.2, "prismatic": 0.05}
 """How far from the cell's base the drawn configuration may be [rad or m]."""
 
 
-def run_shipped_arms(
-    seeds: int, cell: str = "", seed: int = 0, progress: ProgressCall = silent
-) -> dict[str, Any]:
+def run_shipped_arms(seeds: int, cell: str = "", seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
     """Cases ``seed`` to ``seed + seeds - 1`` of every shipped arm, or of ``cell`` alone: rows, and what is no success.
 
     Raises ExperimentError for a cell that is not one of these, ValueError for fewer than one case.
     """
     if cell and cell not in ARMS:
-        raise ExperimentError(
-            "option", f"--cell {cell!r}: no arm of that name is shipped; there are {', '.join(ARMS)}"
-        )
+        raise ExperimentError("option", f"--cell {cell!r}: no arm of that name is shipped; there are {', '.join(ARMS)}")
     names = (cell,) if cell else ARMS
     found = crossed(lambda name, k: judged_case(arm_case(name, k)), names, seeds, seed, progress, "cases")
     rows = []
@@ -371,9 +362,7 @@ def arm_case(name: str, seed: int) -> RandomCase:
     """Case ``seed`` of the shipped cell ``name``, reproducible bit for bit."""
     cell = _cell(name)
     rng = np.random.default_rng([seed, 7])
-    low, high = (
-        np.array([getattr(j, f"position_{side}") for j in cell.robot.joints]) for side in ("min", "max")
-    )
+    low, high = (np.array([getattr(j, f"position_{side}") for j in cell.robot.joints]) for side in ("min", "max"))
     around = np.array([AROUND[joint.kind] for joint in cell.robot.joints])
     redraws = 0
     while True:
@@ -414,9 +403,7 @@ def _cell(name: str) -> SimulatedCell:
     path = shipped_cell_path(name)
     file = load_cell_file(path)
     cell = true_cell(file, path.parent)
-    return (
-        seen_as_joints(file.joints.options, cell) if file.joints.driver == TwistJointDriver.driver else cell
-    )
+    return seen_as_joints(file.joints.options, cell) if file.joints.driver == TwistJointDriver.driver else cell
 
 
 def notes_shipped_arms(answer: dict[str, Any]) -> Iterator[str]:
@@ -539,9 +526,7 @@ def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
     """
     home, ranges = case.cell.home, case.cell.ranges
     counts = ((1, case.stops // 2), (-1, case.stops - 1 - case.stops // 2))
-    shares = [0.0] + [
-        stop_offset(side, k, count, 1.0 / count) for side, count in counts for k in range(1, count + 1)
-    ]
+    shares = [0.0] + [stop_offset(side, k, count, 1.0 / count) for side, count in counts for k in range(1, count + 1)]
     motors, moved = [], []
     for joint in range(len(home)):
         for share in shares:

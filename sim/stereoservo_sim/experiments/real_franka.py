@@ -285,9 +285,7 @@ def run_real_franka(
     """
     for tag in (hand_tag, *table_tags):
         if not 0 <= tag < TAG_IDS:
-            raise ExperimentError(
-                "tag_id", f"tag {tag} is not in {DICTIONARY_NAME}: 0..{TAG_IDS - 1}", tag=tag
-            )
+            raise ExperimentError("tag_id", f"tag {tag} is not in {DICTIONARY_NAME}: 0..{TAG_IDS - 1}", tag=tag)
     table_tags = tuple(tag for tag in table_tags if tag != hand_tag)
     tell: ProgressCall = progress or (lambda stage, done, total: None)
     data = load_hand_eye_set(directory)
@@ -300,9 +298,7 @@ def run_real_franka(
     fold = indices % FOLDS
     try:
         tell("fit", 0, 4)
-        whole = fit_poses(
-            views, np.ones(len(indices), dtype=bool), standing=seen.standing, table_tags=table_tags
-        )
+        whole = fit_poses(views, np.ones(len(indices), dtype=bool), standing=seen.standing, table_tags=table_tags)
         tell("fit", 1, 4)
         held_out = cross_validate(views, fold)
         tell("fit", 2, 4)
@@ -338,9 +334,7 @@ def pose_views(
     return PoseViews(cameras, displacements, positions, generators, zero, pixels, noise)
 
 
-def observe(
-    data: HandEyeSet, hand_tag: int, table_tags: tuple[int, ...], progress: ProgressCall
-) -> Observations:
+def observe(data: HandEyeSet, hand_tag: int, table_tags: tuple[int, ...], progress: ProgressCall) -> Observations:
     """Find the hand tag in every image, and the table tags in each camera's median image."""
     cells = tag_cells(hand_tag)
     found, sizes, backgrounds, standing = [], [], [], []
@@ -418,18 +412,12 @@ def fit_poses(
     Raises CalibrationError, and ExperimentError (``too_few_poses``).
     """
     trials, kept = views.trials(stops)
-    static = (
-        _static([standing[c] for c in kept], table_tags, float(np.nanmedian(trials.sigmas)))
-        if standing
-        else None
-    )
+    static = _static([standing[c] for c in kept], table_tags, float(np.nanmedian(trials.sigmas))) if standing else None
     fit = fit_model(msgspec.structs.replace(trials, static=static), epoch=1, options=options or FitOptions())
     return PoseFit(fit, kept, views)
 
 
-def _static(
-    standing: list[dict[int, FloatArray]], tags: tuple[int, ...], sigma: float
-) -> StaticObservations | None:
+def _static(standing: list[dict[int, FloatArray]], tags: tuple[int, ...], sigma: float) -> StaticObservations | None:
     """Corners of tags that stand still, each a marker: STANDING plus four times the tag's id, plus its number."""
     found = [tag for tag in tags if any(tag in camera for camera in standing)]
     if not found:
@@ -469,9 +457,7 @@ def judged(fitted: PoseFit, out: BoolArray) -> HeldOut:
     errors[:, ~out] = np.nan
     known = np.isfinite(errors).all(axis=3)
     squares, deviations = np.full(known.shape, np.nan), np.full(known.shape, np.nan)
-    squares[known] = np.einsum(
-        "ka,kab,kb->k", errors[known], np.linalg.inv(covariances[known]), errors[known]
-    )
+    squares[known] = np.einsum("ka,kab,kb->k", errors[known], np.linalg.inv(covariances[known]), errors[known])
     deviations[known] = np.sqrt(np.trace(covariances[known], axis1=1, axis2=2) / 2.0)
     return HeldOut(errors, squares, deviations)
 
@@ -753,9 +739,7 @@ def _draw_residuals(result: RealFrankaResult, figure: Any) -> None:
     for index, name in enumerate(_names(result, list(range(len(seen.cameras))))):
         errors = result.held_out.errors[index].reshape(-1, 2)
         cloud.plot(errors[:, 0], errors[:, 1], ".", markersize=4, label=name)
-    cloud.set(
-        xlabel="u, predicted − measured [px]", ylabel="v [px]", title="held-out corners", aspect="equal"
-    )
+    cloud.set(xlabel="u, predicted − measured [px]", ylabel="v [px]", title="held-out corners", aspect="equal")
     cloud.grid(alpha=0.3)
     cloud.legend()
     both = {
@@ -765,9 +749,7 @@ def _draw_residuals(result: RealFrankaResult, figure: Any) -> None:
     finite = {label: held.distances for label, held in both.items()}
     edges = np.linspace(0, max(float(np.percentile(d, 99.5)) for d in finite.values()), 40)
     for label, distance in finite.items():
-        bars.hist(
-            distance, bins=edges, histtype="step", label=f"{label}: median {np.median(distance):.2f} px"
-        )
+        bars.hist(distance, bins=edges, histtype="step", label=f"{label}: median {np.median(distance):.2f} px")
     bars.set(xlabel="distance [px]", ylabel="corners", title="held-out distance")
     bars.legend()
 
@@ -789,9 +771,7 @@ def _draw_overlay(result: RealFrankaResult, figure: Any) -> None:
             axis.plot(*predicted[closed].T, "--", color="tab:red", linewidth=0.8, label=labels[1])
             axis.annotate(str(result.indices[inside][i]), measured.max(axis=0), fontsize=6, color="tab:blue")
         corners, arrows = pixels.reshape(-1, 2), MAGNIFIED * errors.reshape(-1, 2)
-        axis.quiver(
-            *corners.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.002, color="tab:purple"
-        )
+        axis.quiver(*corners.T, *arrows.T, angles="xy", scale_units="xy", scale=1, width=0.002, color="tab:purple")
         axis.set(title=f"{name}, errors x{MAGNIFIED}", xticks=[], yticks=[])
         if inside.any():
             axis.legend(fontsize=7)
@@ -843,13 +823,10 @@ def show_real_franka(answer: dict[str, Any], console: Console) -> None:
     )
     measures = {"median [px]": "median_px", "rms [px]": "rms_px", "largest [px]": "max_px"}
     lines = [
-        [name, *(f"{figures[key]:.3f}" for key in measures.values())]
-        for name, figures in answer["variants"].items()
+        [name, *(f"{figures[key]:.3f}" for key in measures.values())] for name, figures in answer["variants"].items()
     ]
     whole_table(console, "variants", {"": "left", **dict.fromkeys(measures, "right")}, lines)
     images = answer["images"]
     console.print(f"{images['with_hand_tag']} of {images['read']} images show tag {answer['hand_tag']}")
     if answer["not_predicted"]:
-        console.print(
-            f"{answer['not_predicted']} corners not predicted: too few views of that camera are left"
-        )
+        console.print(f"{answer['not_predicted']} corners not predicted: too few views of that camera are left")

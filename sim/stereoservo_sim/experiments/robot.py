@@ -209,9 +209,7 @@ def cramer_rao(cell: SyntheticCell, trials: TrialData) -> FloatArray:
 
     def at(x: FloatArray) -> FloatArray:
         there = rig_at(rig, charts, x)
-        return tables_of(
-            replace(parts, generators=there.generators, cameras=there.cameras, points=there.points), exact
-        )
+        return tables_of(replace(parts, generators=there.generators, cameras=there.cameras, points=there.points), exact)
 
     # A hundredth of a standard deviation to either side of the truth.
     slopes = np.array([(at(0.01 * axis) - at(-0.01 * axis)) / 0.02 for axis in root.T])
@@ -232,9 +230,7 @@ class ImageErrors:
     joint: npt.NDArray[np.int64]
 
 
-def image_errors(
-    model: CellModel, trials: TrialData, home: FloatArray, home_pixels: FloatArray
-) -> ImageErrors:
+def image_errors(model: CellModel, trials: TrialData, home: FloatArray, home_pixels: FloatArray) -> ImageErrors:
     """Table 5.1 of a fitted model: image distances of its trials.
 
     Fixed points are triangulated from one stereo image, ``home_pixels`` (c, m, 2) taken at ``home`` (n,), with the
@@ -248,9 +244,7 @@ def image_errors(
     of_joint = trials.trials[data.stop]
     free = residuals(rig, data).reshape(-1, 2)
     free_spread = _remaining(jacobian_at(rig, data))
-    ideal = np.array(
-        [undistort(lens, pixels) for lens, pixels in zip(parts.lenses, home_pixels, strict=True)]
-    )
+    ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(parts.lenses, home_pixels, strict=True)])
     seen = triangulate(parts.cameras, ideal)
     points = seen / seen[:, 3:]
     given = RigModel(rig.kinds, rig.generators, rig.cameras, points, rig.lenses)
@@ -272,9 +266,7 @@ def _rig(parts: FramedModel, generators: FloatArray, points: FloatArray) -> RigM
     return RigModel(parts.kinds, generators, parts.cameras, points, parts.lenses)
 
 
-def jacobian_at(
-    rig: RigModel, data: Measurements, *, cameras: bool = True, points: bool = True
-) -> FloatArray:
+def jacobian_at(rig: RigModel, data: Measurements, *, cameras: bool = True, points: bool = True) -> FloatArray:
     """Jacobian (2 k, p) of the metric bundle at ``rig``."""
     charts = full_charts(rig, "metric", cameras=cameras, points=points)
     return jacobian(rig, charts, np.zeros(charts.size), data)
@@ -561,9 +553,7 @@ def show_robot(answer: dict[str, Any], console: Console) -> None:
     """Print one table for each of the thesis's in both settings, then the summary."""
     implied = answer["implied"]
     _show_tables(answer["rows"], f"{answer['sigma_px']:g} px, {100 * BASELINE:.0f} cm", console)
-    _show_tables(
-        implied["rows"], f"{implied['sigma_px']:g} px, {100 * implied['baseline_m']:.0f} cm", console
-    )
+    _show_tables(implied["rows"], f"{implied['sigma_px']:g} px, {100 * implied['baseline_m']:.0f} cm", console)
     motions = answer["trial_motions"]
     for setting, test in (("assumed", answer["efficiency"]), ("implied", implied["efficiency"])):
         console.print(
@@ -581,11 +571,7 @@ def _show_tables(rows: list[dict[str, Any]], setting: str, console: Console) -> 
         ("5.4", "links [mm]"),
     ):
         first = number == "5.1"
-        names = (
-            ("", "ours", "noise", "thesis")
-            if first
-            else ("", "true", "rms error", "bound", "thesis", "error")
-        )
+        names = ("", "ours", "noise", "thesis") if first else ("", "true", "rms error", "bound", "thesis", "error")
         lines = []
         for row in rows:
             if row["table"] != number:
@@ -633,9 +619,7 @@ def _draw_tracks(answer: dict[str, Any], figure: Any) -> None:
 def _draw_residuals(answer: dict[str, Any], figure: Any) -> None:
     edges = np.array(answer["histograms"]["edges_sigmas"])
     middle, width = 0.5 * (edges[1:] + edges[:-1]), edges[1] - edges[0]
-    for j, (axis, counts) in enumerate(
-        zip(figure.subplots(2, 3).ravel(), answer["histograms"]["axes"], strict=True)
-    ):
+    for j, (axis, counts) in enumerate(zip(figure.subplots(2, 3).ravel(), answer["histograms"]["axes"], strict=True)):
         total = max(1, sum(counts))
         axis.bar(middle, np.array(counts) / (total * width), width=width, alpha=0.6)
         axis.plot(middle, norm.pdf(middle), color="black", linewidth=1)
@@ -649,9 +633,7 @@ def _draw_errors(answer: dict[str, Any], figure: Any) -> None:
         rows = [row for row in answer["rows"] if row["table"] == table and row["thesis_error"] is not None]
         rows = [row for row in rows if row["bound"] > 0.0]
         places = np.arange(len(rows))
-        for k, (key, label) in enumerate(
-            (("thesis_error", "thesis"), ("rms_error", "ours, rms"), ("bound", "bound"))
-        ):
+        for k, (key, label) in enumerate((("thesis_error", "thesis"), ("rms_error", "ours, rms"), ("bound", "bound"))):
             axis.bar(places + 0.27 * (k - 1), [max(row[key], 1e-4) for row in rows], 0.27, label=label)
         axis.set_xticks(places, [row["condition"] for row in rows], rotation=60, ha="right")
         axis.set(yscale="log", ylabel=f"error [{unit}]", title=f"table {table}")

@@ -65,9 +65,7 @@ def singular_case(seed: int) -> tuple[SyntheticCell, FloatArray, FloatArray, flo
         else:
             start[1] = _over_the_base(start, offset)
         turns = (
-            rotation("x", 180)
-            @ rotation("y", float(rng.uniform(-25, 25)))
-            @ rotation("x", float(rng.uniform(-25, 25)))
+            rotation("x", 180) @ rotation("y", float(rng.uniform(-25, 25))) @ rotation("x", float(rng.uniform(-25, 25)))
         )
         cell = placed(
             ("revolute",) * 6,
@@ -129,12 +127,8 @@ def run_singularities(seeds: int, seed: int = 0, progress: ProgressCall = silent
     return {
         "title": f"singularities: cases {seed} to {seed + seeds - 1}",
         "rows": rows,
-        "refused": dict(
-            Counter(f"{v.law} {v.codes[0]}" for v in verdicts if v.outcome == "refused" and v.codes)
-        ),
-        "seconds": {
-            law: [v.seconds for v in verdicts if v.law == law and v.outcome == "reached"] for law in LAWS
-        },
+        "refused": dict(Counter(f"{v.law} {v.codes[0]}" for v in verdicts if v.outcome == "refused" and v.codes)),
+        "seconds": {law: [v.seconds for v in verdicts if v.law == law and v.outcome == "reached"] for law in LAWS},
         "lost": lost,
         "thesis": {"note": "none: 8.5 leaves singularities to the planner"},
     }

@@ -202,9 +202,7 @@ def through_pictures(
     rows, steepest = [], np.eye(4)
     for name, calibration, predicts in RUNS:
         pictures = PlatePictures(predicts)
-        result, trace = run_task(
-            tasks[name], known[calibration], replace(settings, coasts=predicts), pictures
-        )
+        result, trace = run_task(tasks[name], known[calibration], replace(settings, coasts=predicts), pictures)
         if (name, calibration, predicts) == HARD:
             steepest = trace.poses[int(trace.facing.argmin())]
         lacking = np.array(pictures.found) < IN_BOTH
@@ -220,9 +218,7 @@ def through_pictures(
                 "incomplete_frames": int(lacking.sum()),
                 "smallest_facing": float(trace.facing.min()),
                 "extraction_rms_px": float(np.sqrt(np.mean(np.square(pictures.off)))),
-                "prediction_rms_px": float(np.sqrt(np.mean(np.square(pictures.ahead))))
-                if pictures.ahead
-                else None,
+                "prediction_rms_px": float(np.sqrt(np.mean(np.square(pictures.ahead)))) if pictures.ahead else None,
                 "prediction_worst_px": max(pictures.ahead, default=None),
             }
         )
@@ -234,10 +230,7 @@ def draw_pictures(answer: dict[str, Any]) -> Figure:
     pictures, rng = PlatePictures(predicts=False), np.random.default_rng(0)
     figure = picture(11, 4)
     axes = figure.subplots(2, len(answer["tasks"]) + 1)
-    columns = [
-        (f"task {task['task']}", ((task["start"], "start"), (task["goal"], "goal")))
-        for task in answer["tasks"]
-    ]
+    columns = [(f"task {task['task']}", ((task["start"], "start"), (task["goal"], "goal"))) for task in answer["tasks"]]
     columns.append(("task B, inclined most", ((answer["steepest"], "left"), (answer["steepest"], "right"))))
     for column, (title, shown) in zip(axes.T, columns, strict=True):
         for axis, (pose, name) in zip(column, shown, strict=True):
@@ -252,9 +245,7 @@ def compare_pictures(rows: list[dict[str, Any]]) -> list[Comparison]:
     """8.6, figs 8.9 and 8.10 beside the runs through pictures."""
 
     def run(name: str, calibration: str, predicts: bool) -> dict[str, Any]:
-        (found,) = (
-            r for r in rows if (r["task"], r["calibration"], r["prediction"]) == (name, calibration, predicts)
-        )
+        (found,) = (r for r in rows if (r["task"], r["calibration"], r["prediction"]) == (name, calibration, predicts))
         return found
 
     own, alone = run("B", "projective", True), run("B", "projective", False)
@@ -286,11 +277,7 @@ def compare_pictures(rows: list[dict[str, Any]]) -> list[Comparison]:
 def _end(row: dict[str, Any]) -> str:
     if row["converged"]:
         return "converges"
-    return (
-        "the markers are lost, the run ends"
-        if row["reason"] == "EXTRACTION_LOST"
-        else f"fails: {row['reason']}"
-    )
+    return "the markers are lost, the run ends" if row["reason"] == "EXTRACTION_LOST" else f"fails: {row['reason']}"
 
 
 # -- the experiment --------------------------------------------------------------------------------------------
@@ -357,9 +344,7 @@ def abc_tasks(seed: int) -> tuple[AlignmentTask, ...]:
     return tuple(found)
 
 
-def drawn(
-    rng: np.random.Generator, number: int, seed: int, angle_deg: float, distance_m: float
-) -> AlignmentTask:
+def drawn(rng: np.random.Generator, number: int, seed: int, angle_deg: float, distance_m: float) -> AlignmentTask:
     """A random task about 1 m away that the RX 90 reaches and whose straight path keeps the plate in view."""
     cell = rx90_cell()
     while True:
@@ -371,9 +356,7 @@ def drawn(
             return AlignmentTask(number, seed, angle_deg, distance_m, unit(rng), start, goal)
 
 
-def run_tasks_abc(
-    *, seeds: int, seed: int, progress: ProgressCall, gains: tuple[float, ...] = GAINS
-) -> dict[str, Any]:
+def run_tasks_abc(*, seeds: int, seed: int, progress: ProgressCall, gains: tuple[float, ...] = GAINS) -> dict[str, Any]:
     """All tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's
     kind.
 
@@ -402,9 +385,7 @@ def run_tasks_abc(
         task = drawn(np.random.default_rng([seed, 100 + i]), 100 + i, seed, *DRAWN["B"])
         for name, model in known.items():
             more[name].append(run_task(task, model, _settings("current", SHOWN_GAIN, seed))[0].reason)
-    rendered, steepest = through_pictures(
-        dict(zip(DRAWN, tasks, strict=True)), _settings("current", SHOWN_GAIN, seed)
-    )
+    rendered, steepest = through_pictures(dict(zip(DRAWN, tasks, strict=True)), _settings("current", SHOWN_GAIN, seed))
     coarser = [_coarser(level, dict(zip(DRAWN, tasks, strict=True)), seed) for level in COARSER]
     progress("tasks-abc", total, total)
     return {
@@ -447,9 +428,7 @@ def compare_tasks_abc(answer: dict[str, Any]) -> list[Comparison]:
         reached = [row["gain"] for row in own if row["converged"]]
         asked = ", ".join(f"{row['gain']:g}" for row in own)
         told = f"at gains {', '.join(f'{gain:g}' for gain in reached)} of {asked}"
-        found.append(
-            of_statement("fig. 8.6", f"task {name}, projective", "realized successfully", told, bool(reached))
-        )
+        found.append(of_statement("fig. 8.6", f"task {name}, projective", "realized successfully", told, bool(reached)))
     rates = [(row["rate_over_gain"], row["r_squared"]) for row in rows
              if row["calibration"] == "projective" and row["converged"]]  # fmt: skip
     low, high, straight = min(r for r, _ in rates), max(r for r, _ in rates), min(r for _, r in rates)
@@ -509,9 +488,7 @@ def _row(
     }
 
 
-def _curve(
-    name: str, calibration: str, settings: LoopSettings, trace: Trace, task: AlignmentTask
-) -> dict[str, Any]:
+def _curve(name: str, calibration: str, settings: LoopSettings, trace: Trace, task: AlignmentTask) -> dict[str, Any]:
     """Data of a run for the figures."""
     return {
         "task": name,
@@ -582,9 +559,7 @@ def draw_tasks_abc(answer: dict[str, Any]) -> Figures:
                 draw_images(axis, np.array(curve["pixels"])[:, c], colour, calibration)
             for j, q in enumerate(np.array(curve["joints_deg"]).T):
                 label = f"joint {j + 1}" if dash == "-" else None
-                joint_axes[k].plot(
-                    curve["seconds"], q - q[0], dash, color=COLOURS[j], linewidth=0.9, label=label
-                )
+                joint_axes[k].plot(curve["seconds"], q - q[0], dash, color=COLOURS[j], linewidth=0.9, label=label)
         for c, axis in enumerate(line):
             labelled(axis, f"task {name}, {('left', 'right')[c]}; ring: end", "u [px]", "v [px]")
             axis.set_xlim(0, WIDTH)

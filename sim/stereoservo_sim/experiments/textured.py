@@ -109,9 +109,7 @@ def _box(H: FloatArray, side: int, camera: PinholeCamera) -> tuple[int, int, int
     """Left, top, right, bottom [px] of the image of a face, right and bottom beyond; of one before the camera."""
     corners = np.array([[0, 0, 1], [side, 0, 1], [side, side, 1], [0, side, 1.0]]) @ H.T
     if corners[:, 2].min() <= 0.0:
-        raise ValueError(
-            "a face reaches behind the camera; all corners of a textured body must lie before it"
-        )
+        raise ValueError("a face reaches behind the camera; all corners of a textured body must lie before it")
     ends = corners[:, :2] / corners[:, 2:]
     size = [camera.width, camera.height]
     low = np.clip(np.floor(ends.min(axis=0)), 0, size).astype(int)
@@ -137,10 +135,7 @@ def board_points(distance: float) -> FloatArray:
     """The inner corners (98, 3) [m] of both boards, row by row, the common edge ``distance`` [m] ahead."""
     across, up = np.meshgrid(EDGE + SIDE * np.arange(1, SQUARES), SIDE * (np.arange(CORNERS) - 3.0))
     half = np.sqrt(0.5)
-    sides = [
-        np.stack([turn * half * across, up, half * across], axis=-1)[:, ::turn].reshape(-1, 3)
-        for turn in (-1, 1)
-    ]
+    sides = [np.stack([turn * half * across, up, half * across], axis=-1)[:, ::turn].reshape(-1, 3) for turn in (-1, 1)]
     return np.asarray(np.vstack(sides) + np.array([0.0, 0.0, distance]))
 
 
@@ -154,9 +149,7 @@ def boards(distance: float) -> TexturedBody:
     grey = gaussian_filter(BRIGHT + (DARK - BRIGHT) * dark, SOFT)
     edge = np.array([0.0, -high, distance])
     down = np.array([0.0, 2.0 * high, 0.0])
-    return TexturedBody(
-        [Face(grey, edge, length * np.array([side * half, 0.0, half]), down) for side in (-1.0, 1.0)]
-    )
+    return TexturedBody([Face(grey, edge, length * np.array([side * half, 0.0, half]), down) for side in (-1.0, 1.0)])
 
 
 def _stripes(length: float, begin: float) -> tuple[FloatArray, FloatArray]:
@@ -222,9 +215,7 @@ def follow(pictures: Sequence[ImageArray], first: FloatArray, reach: int) -> Flo
             there = _displacement(before, after, found[k - 1, i], way, reach)
             if np.isnan(there).any():
                 continue
-            back = _displacement(
-                after, before, found[k - 1, i] + there, -np.rint(there).astype(int), BACK_REACH
-            )
+            back = _displacement(after, before, found[k - 1, i] + there, -np.rint(there).astype(int), BACK_REACH)
             if np.hypot(*(there + back)) < BACK_PX:
                 found[k, i] = found[k - 1, i] + there
     return found
@@ -239,9 +230,7 @@ def _shift(before: ImageArray, after: ImageArray, points: FloatArray) -> IntArra
     return np.array([column - left, row - top])
 
 
-def _displacement(
-    before: ImageArray, after: ImageArray, point: FloatArray, way: IntArray, reach: int
-) -> FloatArray:
+def _displacement(before: ImageArray, after: ImageArray, point: FloatArray, way: IntArray, reach: int) -> FloatArray:
     """Displacement (2,) [px] of the window around a ``point`` (2,), near ``way`` (2,); NaN where none is found."""
     u, v = (int(x) for x in np.rint(point))
     x, y = u + int(way[0]), v + int(way[1])

@@ -49,9 +49,7 @@ def answer_of_all(found: list[Reproduction], seed: int) -> dict[str, Any]:
     return {
         "experiment": "all",
         "seed": seed,
-        "rows": [
-            {"experiment": one.experiment.name, **row._asdict()} for one in found for row in one.compared
-        ],
+        "rows": [{"experiment": one.experiment.name, **row._asdict()} for one in found for row in one.compared],
         "verdicts": tally(compared),
         "thesis": {item.number: item.experiment or item.instead for item in CONTENTS},
     }
@@ -134,9 +132,7 @@ def _listed(answer: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
     found = [(f"all {len(answer['rows'])} rows", answer["rows"])]
     if "implied" in answer:
         implied = answer["implied"]
-        found.append(
-            (f"the same with {implied['sigma_px']:g} px and {implied['baseline_m']:g} m", implied["rows"])
-        )
+        found.append((f"the same with {implied['sigma_px']:g} px and {implied['baseline_m']:g} m", implied["rows"]))
     if answer.get("rendered"):
         found.append(("through rendered pictures", answer["rendered"]))
     return found
@@ -144,9 +140,7 @@ def _listed(answer: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
 
 def _rows_table(rows: list[dict[str, Any]]) -> str:
     names = list(dict.fromkeys(name for row in rows for name in row))
-    return _table(
-        [escape(n) for n in names], [[escape(cell_text(row.get(n))) for n in names] for row in rows]
-    )
+    return _table([escape(n) for n in names], [[escape(cell_text(row.get(n))) for n in names] for row in rows])
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

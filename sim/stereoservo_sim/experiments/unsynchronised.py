@@ -104,16 +104,9 @@ def fly(condition: TimingCondition, seed: int) -> list[TimedGoalResult]:
     course = watch.course()
     times, positions = watch.log.end()
     truth = true_cell(cell)
-    judged = [
-        judge_goal(goal.name, goal.law, outcomes[goal.name], course, times, positions, truth)
-        for goal in GOALS
-    ]
-    started = [
-        event.id for event in course.events if event.kind == "goal_started" and event.name == "cartesian3"
-    ]
-    return [
-        TimedGoalResult(one, watch.innovation(goal_id)) for one, goal_id in zip(judged, started, strict=True)
-    ]
+    judged = [judge_goal(goal.name, goal.law, outcomes[goal.name], course, times, positions, truth) for goal in GOALS]
+    started = [event.id for event in course.events if event.kind == "goal_started" and event.name == "cartesian3"]
+    return [TimedGoalResult(one, watch.innovation(goal_id)) for one, goal_id in zip(judged, started, strict=True)]
 
 
 def cell_of(condition: TimingCondition) -> CellFile:
@@ -175,9 +168,7 @@ def _figures(one: TimedGoalResult) -> dict[str, float]:
     }  # fmt: skip
 
 
-def _row(
-    condition: TimingCondition, flown: list[TimedGoalResult], trigger: list[TimedGoalResult]
-) -> dict[str, Any]:
+def _row(condition: TimingCondition, flown: list[TimedGoalResult], trigger: list[TimedGoalResult]) -> dict[str, Any]:
     figures = [_figures(one) for one in flown]
     beside = [_figures(one) for one in trigger]
     row: dict[str, Any] = {

@@ -90,9 +90,7 @@ class SerialArm:
     composition = Composition.BASE_FIRST
     limits = RX90_LIMITS
 
-    def __init__(
-        self, cell: SyntheticCell, joints: FloatArray, mechanics: Sequence[Mechanics] | None = None
-    ) -> None:
+    def __init__(self, cell: SyntheticCell, joints: FloatArray, mechanics: Sequence[Mechanics] | None = None) -> None:
         self._cell = cell
         self.joints = joints.copy()
         self.pose = cell.flange(joints) @ PLATE_ON_FLANGE
@@ -175,9 +173,7 @@ class Reach:
 def rx90_reach(cell: SyntheticCell, start: FloatArray, goal: FloatArray) -> Reach | None:
     """Configurations of the RX 90 for two poses (4, 4) of the plate within its limits; None where there are none."""
     back = np.linalg.inv(PLATE_ON_FLANGE)
-    found = [
-        inverse_kinematics(np.linalg.inv(cell.base) @ pose @ back, RX90_LIMITS) for pose in (start, goal)
-    ]
+    found = [inverse_kinematics(np.linalg.inv(cell.base) @ pose @ back, RX90_LIMITS) for pose in (start, goal)]
     if not (len(found[0]) and len(found[1])):
         return None
     travel = np.abs(found[0][:, None] - found[1][None]).max(axis=-1)

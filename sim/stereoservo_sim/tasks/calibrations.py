@@ -116,9 +116,7 @@ def calibrate(
     return self_calibrated(arm, cell, noise_px, seed, mechanics)
 
 
-def metric_model(
-    arm: ArmName, cell: SyntheticCell, focal_error: float, hand_eye_error_deg: float
-) -> TaskCalibration:
+def metric_model(arm: ArmName, cell: SyntheticCell, focal_error: float, hand_eye_error_deg: float) -> TaskCalibration:
     """Metric model with focal lengths too long by a share, and the arm rotated about each task's own axis."""
     facts: dict[str, object] = {"focal_error": focal_error, "hand_eye_error_deg": hand_eye_error_deg}
     return TaskCalibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
@@ -137,9 +135,7 @@ def self_calibrated(
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
     sigma = max(noise_px / np.sqrt(FRAMES), LEAST_SIGMA_PX)
     gears = mechanics_of(mechanics)
-    trials = (
-        cell.trials(sigma, rng, STOPS) if gears is None else mechanical_trials(cell, gears, sigma, rng, STOPS)
-    )
+    trials = cell.trials(sigma, rng, STOPS) if gears is None else mechanical_trials(cell, gears, sigma, rng, STOPS)
     result = fit_model(trials, epoch=1)
     facts = {
         "stops_per_joint": STOPS,
@@ -223,16 +219,12 @@ def _coarse(calibration: TaskCalibration, task: AlignmentTask, serial: bool) -> 
     turn = Rotation.from_rotvec(np.radians(calibration.hand_eye_error_deg) * task.error_axis).as_matrix()
     if not serial:
         basis = cartesian_twists(middle, turn)
-        return Knowledge(
-            Composition.SIMULTANEOUS, matrices, centres, infinity, basis, None, calibration.cell.kinds
-        )
+        return Knowledge(Composition.SIMULTANEOUS, matrices, centres, infinity, basis, None, calibration.cell.kinds)
     error = np.eye(4)
     error[:3, :3], error[:3, 3] = turn, middle - turn @ middle
     cell = calibration.cell
     generators = conjugate(error, twists(cell, cell.home))
-    return Knowledge(
-        Composition.BASE_FIRST, matrices, centres, infinity, generators, None, cell.kinds, cell.home
-    )
+    return Knowledge(Composition.BASE_FIRST, matrices, centres, infinity, generators, None, cell.kinds, cell.home)
 
 
 def _camera_centres(matrices: FloatArray, infinity: FloatArray) -> FloatArray:

@@ -34,9 +34,7 @@ def run_campaign(
     The answer has the tasks in their order and what `summary` makes of them.
     """
     started = time.perf_counter()
-    calibration = calibrate(
-        settings.arm, settings.calibration, settings.noise_px, settings.seed, settings.mechanics
-    )
+    calibration = calibrate(settings.arm, settings.calibration, settings.noise_px, settings.seed, settings.mechanics)
     results: dict[int, TaskResult] = {}
     tell(0, len(tasks))
     for batch in _batches(tasks, calibration, settings, jobs):

@@ -205,9 +205,7 @@ def _placed_arm(task: AlignmentTask, calibration: TaskCalibration, settings: Loo
         start = twist_start(_way(task, settings))
         return None if start is None else TwistArm(start)
     reach = rx90_reach(calibration.cell, task.start, task.goal)
-    return (
-        None if reach is None else SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
-    )
+    return None if reach is None else SerialArm(calibration.cell, reach.start, mechanics_of(settings.mechanics))
 
 
 def _way(task: AlignmentTask, settings: LoopSettings) -> FloatArray:
@@ -229,9 +227,7 @@ class Controller:
     only.
     """
 
-    def __init__(
-        self, knowledge: Knowledge, task: AlignmentTask, settings: LoopSettings, limits: FloatArray
-    ) -> None:
+    def __init__(self, knowledge: Knowledge, task: AlignmentTask, settings: LoopSettings, limits: FloatArray) -> None:
         self._knowledge = knowledge
         self._dt_s = 1.0 / settings.rate_hz
         self._law = _law(settings.law, knowledge)
@@ -247,9 +243,7 @@ class Controller:
         self._cameras = cameras_used(settings.law)
         self._wanted = np.ones(self._set_points.shape[:2])
         self._wanted[self._cameras :] = 0.0
-        self._centre_weights = (
-            np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
-        )
+        self._centre_weights = np.full(4, 0.25) if settings.centre == "middle" else np.eye(4)[int(settings.centre)]
         self._task: Task | None = None
         self._plans = settings.law in LAWS and LAWS[settings.law].planned
         self._look_steps = round(LOOK_S * settings.rate_hz) if self._plans else 0
@@ -312,9 +306,7 @@ class Controller:
         targets = found / (found @ knowledge.plane_at_infinity)[:, None]
         # What triangulation errs by in the same way, here and there, then cancels.
         if knowledge.points is not None and not self.estimate.triangulates:
-            pose = goal_pose(
-                _arrays(knowledge), knowledge.basis, points, targets, ok, FACE, self._set_points, every
-            )
+            pose = goal_pose(_arrays(knowledge), knowledge.basis, points, targets, ok, FACE, self._set_points, every)
             targets = pose.points
         return Task(
             set_points=self._set_points,
@@ -426,9 +418,7 @@ def _run(
         task_errors[k] = controller.task_error
         if reason:
             break
-    trace = Trace(
-        poses[:steps], errors[:steps], facing[:steps], joints[:steps], task_errors[: max(steps - 1, 0)]
-    )
+    trace = Trace(poses[:steps], errors[:steps], facing[:steps], joints[:steps], task_errors[: max(steps - 1, 0)])
     flags = (back_face, out_of_view)
     result = _judged(task, settings, trace, flags, margin, (reason, refused), window)
     return msgspec.structs.replace(result, stopped=stopped), trace
@@ -463,9 +453,7 @@ def _judged(
     if back_face or out_of_view:
         reason = reason or ("BACK_FACE" if back_face else "OUT_OF_VIEW")
     above = np.flatnonzero(~(trace.errors_px < SUCCESS_PX))
-    iterations = (
-        int(above[-1]) + 1 if converged and len(above) else (0 if converged else len(trace.poses) - 1)
-    )
+    iterations = int(above[-1]) + 1 if converged and len(above) else (0 if converged else len(trace.poses) - 1)
     moves, turns = _rest_velocity(trace.poses[-window:], dt_s)
     finite = last[np.isfinite(last)]
     return TaskResult(
@@ -477,9 +465,7 @@ def _judged(
         back_face=back_face,
         out_of_view=out_of_view,
         line_deviation_mm=1e3 * float(line_deviations(trace.poses, task.start, task.goal).max()),
-        floor_px=noise_floor_px(
-            task.goal, settings.noise_px, settings.gain, dt_s, cameras_used(settings.law)
-        ),
+        floor_px=noise_floor_px(task.goal, settings.noise_px, settings.gain, dt_s, cameras_used(settings.law)),
         rest_mm_s=1e3 * moves if converged else None,
         rest_mrad_s=1e3 * turns if converged else None,
         closest_view_px=float(margin) if np.isfinite(margin) else None,
@@ -503,9 +489,7 @@ def _rest_velocity(poses: FloatArray, dt_s: float) -> tuple[float, float]:
 
 
 def _unreachable(task: AlignmentTask, settings: LoopSettings) -> tuple[TaskResult, Trace]:
-    result = TaskResult(
-        task.id, settings.law, None, 0, None, False, False, None, None, None, None, None, "UNREACHABLE"
-    )
+    result = TaskResult(task.id, settings.law, None, 0, None, False, False, None, None, None, None, None, "UNREACHABLE")
     none = np.zeros(0)
     return result, Trace(task.start[None], none, none, np.zeros((0, 6)), np.zeros((0, 0)))
 
@@ -549,9 +533,7 @@ def euclidean_points(
         X_star = np.where(known[:, None], X_star / np.where(known, X_star[:, 3], 1.0)[:, None], 0.0)
         metres = np.tile(np.eye(3, 4), (X.shape[0], 1, 1))
         operators = np.ascontiguousarray(H @ scene.operators @ np.linalg.inv(H))
-        jacobian = (
-            JacobianChoice.CURRENT if options.jacobian == JacobianChoice.FIXED_DEPTH else options.jacobian
-        )
+        jacobian = JacobianChoice.CURRENT if options.jacobian == JacobianChoice.FIXED_DEPTH else options.jacobian
         seen = (_seen(scene, task) > 0.0).astype(np.float64)
         velocity, conditioning = step_by_points(
             operators, (X, X_star, seen, metres), (held_gain(options), int(jacobian), options.damping)

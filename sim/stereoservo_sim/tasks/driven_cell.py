@@ -169,9 +169,7 @@ class DrivenCell:
                 model_update=model_update,
             )
         )  # fmt: skip
-        self.verdicts += [
-            event.name for event in outputs.events if event.kind == "health" and event.name != "ok"
-        ]
+        self.verdicts += [event.name for event in outputs.events if event.kind == "health" and event.name != "ok"]
         if outputs.driver_request:
             self._active = outputs.driver_request == "activate"
         if self._seq % round(RATE_HZ / CAMERA_HZ) == 0:
@@ -187,21 +185,15 @@ class DrivenCell:
     ) -> GoalEnd:  # fmt: skip
         """Drive to set-points (c, m, 2) [px], of which the markers in view count, until an event ends the goal."""
         ids = self.cell.marker_ids
-        inside = (wanted > -0.5).all(axis=-1) & (
-            wanted < (self.cell.width - 0.5, self.cell.height - 0.5)
-        ).all(axis=-1)
+        inside = (wanted > -0.5).all(axis=-1) & (wanted < (self.cell.width - 0.5, self.cell.height - 0.5)).all(axis=-1)
         target = FeatureTarget(
             {
-                f"cam{c}": {
-                    ids[i]: (float(pixels[i, 0]), float(pixels[i, 1])) for i in np.flatnonzero(inside[c])
-                }
+                f"cam{c}": {ids[i]: (float(pixels[i, 0]), float(pixels[i, 1])) for i in np.flatnonzero(inside[c])}
                 for c, pixels in enumerate(wanted)
             }
         )
         name = str(uuid.UUID(int=self._seq + 1))
-        outputs = self.step(
-            RunGoal(Goal(name, target, law=law, gain=gain, damping=damping, time_limit_s=time_limit_s))
-        )
+        outputs = self.step(RunGoal(Goal(name, target, law=law, gain=gain, damping=damping, time_limit_s=time_limit_s)))
         limit = round(2.0 * time_limit_s * RATE_HZ)  # what waits for its cameras is not timed by the core
         for cycle in range(limit):
             for event in outputs.events:
@@ -263,9 +255,7 @@ class DrivenCell:
         late_ns = round(1e9 * (wrong.late_s + wrong.jitter_s * self._rng.uniform()))
         now = self.cell if wrong.creep is None else wrong.creep.moved(self.cell, self.seconds)
         exact = now.pixels(self._links_at(self._now_ns - late_ns)[None])[:, 0]
-        inside = (exact > -0.5).all(axis=-1) & (exact < (self.cell.width - 0.5, self.cell.height - 0.5)).all(
-            axis=-1
-        )
+        inside = (exact > -0.5).all(axis=-1) & (exact < (self.cell.width - 0.5, self.cell.height - 0.5)).all(axis=-1)
         covariance = max(wrong.noise_px, LEAST_SIGMA_PX) ** 2 * np.eye(2)
         ids = np.array(self.cell.marker_ids)
         for c, there in enumerate(inside):

@@ -127,11 +127,7 @@ def _pose(rng: np.random.Generator) -> FloatArray:
 def _visible(pose: FloatArray) -> bool:
     """Whether both cameras see the plate's front, at the required distance from the borders."""
     seen: PlateView = sight(pose)
-    return (
-        seen.in_view
-        and seen.margin_px >= BORDER_PX
-        and seen.facing > float(np.cos(np.radians(MAX_VIEW_ANGLE_DEG)))
-    )
+    return seen.in_view and seen.margin_px >= BORDER_PX and seen.facing > float(np.cos(np.radians(MAX_VIEW_ANGLE_DEG)))
 
 
 def _direction(rng: np.random.Generator) -> FloatArray:

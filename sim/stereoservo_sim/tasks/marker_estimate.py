@@ -51,9 +51,7 @@ class MarkerEstimate:
     def moved(self, operators: FloatArray, step: FloatArray) -> None:
         """Predict after a joint motion by ``step`` (n,), with ``operators`` (n, 4, 4) before it."""
         before, _ = project_points(self._knowledge.matrices, self.points)
-        self.points = transform_points(
-            displace(operators, int(self._knowledge.composition), step), self.points
-        )
+        self.points = transform_points(displace(operators, int(self._knowledge.composition), step), self.points)
         after, _ = project_points(self._knowledge.matrices, self.points)
         self._rests = bool(np.abs(after - before).max() < REST_PX_S * self._dt_s)
 
@@ -73,9 +71,7 @@ class MarkerEstimate:
         self.points = corrected(basis, matrices, self.points, pixels, weights, share)
         predicted, _ = project_points(matrices, self.points)
         # What no displacement explains is averaged marker by marker.
-        self._residual += np.where(
-            weights[..., None] > 0.0, share * (pixels - predicted - self._residual), 0.0
-        )
+        self._residual += np.where(weights[..., None] > 0.0, share * (pixels - predicted - self._residual), 0.0)
         self.pixels = predicted + self._residual
 
     def _triangulate(self, pixels: FloatArray, weights: FloatArray) -> None:

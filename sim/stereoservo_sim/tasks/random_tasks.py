@@ -29,9 +29,7 @@ def random_tasks(seed: int, count: int) -> tuple[AlignmentTask, ...]:
     return tuple(tasks)
 
 
-def random_ends(
-    rng: np.random.Generator, angle_deg: float, distance_m: float
-) -> tuple[FloatArray, FloatArray]:
+def random_ends(rng: np.random.Generator, angle_deg: float, distance_m: float) -> tuple[FloatArray, FloatArray]:
     """Start and goal (4, 4) at a distance in a random direction and rotated about a random axis, in view or not."""
     goal, start = np.eye(4), np.eye(4)
     goal[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
@@ -44,9 +42,7 @@ def random_ends(
 def visible(pose: FloatArray) -> bool:
     """Whether both cameras see the plate's front, at the required distance from the borders."""
     seen = sight(pose)
-    return (
-        seen.in_view and seen.margin_px > BORDER_PX and seen.facing > np.cos(np.radians(MAX_VIEW_ANGLE_DEG))
-    )
+    return seen.in_view and seen.margin_px > BORDER_PX and seen.facing > np.cos(np.radians(MAX_VIEW_ANGLE_DEG))
 
 
 def unit(rng: np.random.Generator) -> FloatArray:

@@ -80,9 +80,7 @@ def read_tasks(path: Path) -> tuple[AlignmentTask, ...]:
             header = _header(path, number, fields)
             continue
         if len(fields) != len(header):
-            raise TaskFileError(
-                path, number, "", f"{len(fields)} fields; the header has {len(header)} columns"
-            )
+            raise TaskFileError(path, number, "", f"{len(fields)} fields; the header has {len(header)} columns")
         task = _task(path, number, dict(zip(header, fields, strict=True)))
         if task.id in lines:
             raise TaskFileError(path, number, "id", f"{task.id} stands in line {lines[task.id]}, too")
@@ -211,9 +209,7 @@ def _integer(path: Path, number: int, row: dict[str, str], name: str) -> int:
     except ValueError:
         value = -1
     if not 0 <= value <= MAX_ID:
-        raise TaskFileError(
-            path, number, name, f"{row[name][:40]!r}; an integer from 0 to {MAX_ID} is needed"
-        )
+        raise TaskFileError(path, number, name, f"{row[name][:40]!r}; an integer from 0 to {MAX_ID} is needed")
     return value
 
 
@@ -239,7 +235,5 @@ def tasks_text(tasks: Sequence[AlignmentTask], source: str) -> str:
     for task in tasks:
         poses = (f"{v:.12g}" for v in (*task.start.ravel(), *task.goal.ravel()))
         axis = (f"{v:.9g}" for v in task.error_axis)
-        writer.writerow(
-            [task.id, task.seed, f"{task.angle_deg:.6f}", f"{task.distance_m:.6f}", *axis, *poses]
-        )
+        writer.writerow([task.id, task.seed, f"{task.angle_deg:.6f}", f"{task.distance_m:.6f}", *axis, *poses])
     return out.getvalue()

@@ -131,9 +131,7 @@ class SolidBody(MarkerBody):
     def marker_normals(self) -> FloatArray:
         """Mean unit normal of the faces that meet in each vertex, (n, 3)."""
         faces = self.face_normals
-        touching = np.array(
-            [[row in outline for outline in self.outlines] for row in range(len(self.vertices))]
-        )
+        touching = np.array([[row in outline for outline in self.outlines] for row in range(len(self.vertices))])
         normals = touching.astype(np.float64) @ faces
         mean: FloatArray = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         return mean
@@ -147,9 +145,7 @@ class SolidBody(MarkerBody):
         """Grey levels (f,) of the faces with the body at ``pose`` (4, 4) in the world."""
         light = self.light / np.linalg.norm(self.light)
         normals = self.face_normals @ pose[:3, :3].T
-        levels: FloatArray = (
-            AMBIENT + 0.5 * SKY * (1.0 + normals[:, 2]) + DIFFUSE * np.maximum(0.0, normals @ light)
-        )
+        levels: FloatArray = AMBIENT + 0.5 * SKY * (1.0 + normals[:, 2]) + DIFFUSE * np.maximum(0.0, normals @ light)
         return levels
 
 
@@ -157,9 +153,7 @@ WEDGE_BASE = np.array([(-0.10, -0.08), (0.09, -0.09), (0.115, 0.05), (0.02, 0.10
 WEDGE_INSETS = (0.045, 0.032, 0.050, 0.036, 0.040)
 
 
-def wedge(
-    first_id: int = FIRST_ID, *, scale: float = 1.0, height: tuple[float, float] = (0.04, 0.11)
-) -> SolidBody:
+def wedge(first_id: int = FIRST_ID, *, scale: float = 1.0, height: tuple[float, float] = (0.04, 0.11)) -> SolidBody:
     """A skew five-sided frustum on the flange: ``height`` [m] of its base and of its smaller top along the axis."""
     along = np.roll(WEDGE_BASE, -1, axis=0) - WEDGE_BASE
     inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
@@ -169,9 +163,7 @@ def wedge(
     ]  # sides stay plane: edges of the top are parallel to those of the base
     count = len(WEDGE_BASE)
     base = np.column_stack([scale * WEDGE_BASE, np.full(count, height[0])])
-    upper = np.column_stack(
-        [scale * np.array(top), np.full(count, height[0] + scale * (height[1] - height[0]))]
-    )
+    upper = np.column_stack([scale * np.array(top), np.full(count, height[0] + scale * (height[1] - height[0]))])
     sides = tuple((k, (k + 1) % count, (k + 1) % count + count, k + count) for k in range(count))
     outlines = (tuple(range(count)), tuple(range(count, 2 * count)), *sides)
     return SolidBody((), np.zeros((0, 4, 4)), np.concatenate([base, upper]), outlines, first_id=first_id)

@@ -95,9 +95,7 @@ class StereoRig:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise KeyError(
-            f"no camera {name!r} in the simulated rig; cameras: {', '.join(c.name for c in self.cameras)}"
-        )
+        raise KeyError(f"no camera {name!r} in the simulated rig; cameras: {', '.join(c.name for c in self.cameras)}")
 
 
 def inverse_pose(pose: FloatArray) -> FloatArray:

@@ -36,9 +36,7 @@ def _add_span(row: npt.NDArray[np.float64], first: int, u0: float, u1: float, we
 
 
 @kernel
-def _blend(
-    image: npt.NDArray[np.float32], v: int, first: int, row: npt.NDArray[np.float64], level: float
-) -> None:
+def _blend(image: npt.NDArray[np.float32], v: int, first: int, row: npt.NDArray[np.float64], level: float) -> None:
     for i in range(row.shape[0]):
         if row[i] > 0.0:
             c = min(row[i], 1.0)

@@ -142,10 +142,7 @@ class TrueJointHistory:
         at = self._at(index)
         data = bytes(self._buffer[at : at + self._body.size + 4])
         fields = self._body.unpack_from(data, 0)
-        if (
-            fields[0] != index + 1
-            or zlib.crc32(data[:-4]) != struct.unpack_from("<I", data, self._body.size)[0]
-        ):
+        if fields[0] != index + 1 or zlib.crc32(data[:-4]) != struct.unpack_from("<I", data, self._body.size)[0]:
             return None
         n = self.joints
         return fields[1], np.array(fields[2 : 2 + n]), np.array(fields[2 + n :])

@@ -75,9 +75,7 @@ class Lighting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             middle = np.float32((t_s / self.shadow_s % 1.0) * way - self.shadow_px)
             across = np.abs(u + np.float32(SLANT) * v - middle) - np.float32(0.5 * self.shadow_px)
             # a logistic edge as steep as a Gaussian one of this sigma
-            lit *= 1.0 - np.float32(self.shadow) / (
-                1.0 + np.exp(np.clip(across / self.soft_px * 1.7, -60, 60))
-            )
+            lit *= 1.0 - np.float32(self.shadow) / (1.0 + np.exp(np.clip(across / self.soft_px * 1.7, -60, 60)))
         if self.spot:
             angle = 2.0 * np.pi * t_s / self.spot_s
             u0, v0 = width * (0.5 + 0.15 * np.cos(angle)), height * (0.5 + 0.15 * np.sin(angle))

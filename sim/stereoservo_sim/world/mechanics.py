@@ -109,8 +109,7 @@ def preset(name: MechanicsPreset, joints: int) -> tuple[Mechanics, ...]:
     one = PRESETS[name]
     golden = np.pi * (3.0 - np.sqrt(5.0))
     return tuple(
-        msgspec.structs.replace(one, ripple_phase=float((0.7 + golden * k) % (2.0 * np.pi)))
-        for k in range(joints)
+        msgspec.structs.replace(one, ripple_phase=float((0.7 + golden * k) % (2.0 * np.pi))) for k in range(joints)
     )
 
 
@@ -172,9 +171,7 @@ def quantised(angle: FloatArray, step: FloatArray) -> FloatArray:
     return np.where(fine, angle, np.round(angle / unit) * unit)
 
 
-def play_at_rest(
-    play: FloatArray, load: FloatArray, friction: FloatArray, approach: FloatArray
-) -> FloatArray:
+def play_at_rest(play: FloatArray, load: FloatArray, friction: FloatArray, approach: FloatArray) -> FloatArray:
     """Offset of the link in its play, at rest after a long way in the direction ``approach`` (its sign counts).
 
     The load decides where it is above ``friction``; else the link lies behind the motion, and in the middle where
@@ -192,9 +189,7 @@ def at_rest(
     directions (s, n); without drift.
     """
     offset = gear_offset(mechanics, motor) + column(mechanics, "sag") * load
-    offset = offset + play_at_rest(
-        column(mechanics, "play"), load, column(mechanics, "play_friction"), approach
-    )
+    offset = offset + play_at_rest(column(mechanics, "play"), load, column(mechanics, "play_friction"), approach)
     link = motor + offset
     on_joint = np.array([joint.encoder_side == "joint" for joint in mechanics])
     return link, quantised(np.where(on_joint, link, motor), column(mechanics, "encoder_step"))
@@ -203,9 +198,7 @@ def at_rest(
 def gear_offset(mechanics: Sequence[Mechanics], motor: FloatArray) -> FloatArray:
     """Ripple and coupling at motor angles (..., n): what depends on nothing else."""
     names = ("ripple", "ripple_order", "ripple_phase")
-    return ripple(motor, *(column(mechanics, name) for name in names)) + coupled(
-        motor, column(mechanics, "coupling")
-    )
+    return ripple(motor, *(column(mechanics, name) for name in names)) + coupled(motor, column(mechanics, "coupling"))
 
 
 # -- gravity --------------------------------------------------------------------------------------------------
@@ -234,9 +227,7 @@ def gravity_load(robot: Robot, q: FloatArray) -> FloatArray:
     """Loads (n,) of a robot at ``q`` (n,): gravity torques over a bound of what each joint can have to bear."""
     frames, _ = joint_frames(robot, q)
     centres = np.einsum("nij,nj->ni", frames[:, :3, :3], robot.centres) + frames[:, :3, 3]
-    torques = gravity_torques(
-        frames[:, :3, 3], frames[:, :3, 2], centres, robot.masses, prismatic=robot.prismatic
-    )
+    torques = gravity_torques(frames[:, :3, 3], frames[:, :3, 2], centres, robot.masses, prismatic=robot.prismatic)
     return torques / largest_torques(robot)
 
 
@@ -309,9 +300,7 @@ class Transmission:
         self.link = self.motor + self._geared() + self._play + self._sagged
 
     def _geared(self) -> FloatArray:
-        return ripple(self.motor, self._amplitude, self._order, self._phase) + coupled(
-            self.motor, self._coupling
-        )
+        return ripple(self.motor, self._amplitude, self._order, self._phase) + coupled(self.motor, self._coupling)
 
     @property
     def readings(self) -> FloatArray:
@@ -380,9 +369,7 @@ class _Delay:
             self._past.popleft()
         times = [t for t, _ in self._past]
         sent = np.array([q for _, q in self._past])
-        return np.array(
-            [np.interp(self._t - delay, times, sent[:, j]) for j, delay in enumerate(self._delay.tolist())]
-        )
+        return np.array([np.interp(self._t - delay, times, sent[:, j]) for j, delay in enumerate(self._delay.tolist())])
 
 
 # -- a plant behind them -------------------------------------------------------------------------------------
@@ -396,9 +383,7 @@ class MechanicalPlant:
     """
 
     def __init__(self, links: Plant, mechanics: Sequence[Mechanics], robot: Robot | None) -> None:
-        load: Callable[[FloatArray], FloatArray] = (
-            horizontal_load if robot is None else partial(gravity_load, robot)
-        )
+        load: Callable[[FloatArray], FloatArray] = horizontal_load if robot is None else partial(gravity_load, robot)
         self.links = links
         self.transmission = Transmission(mechanics, links.positions, load)
         self._offset_rates = np.zeros_like(links.positions)

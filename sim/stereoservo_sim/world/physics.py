@@ -158,9 +158,7 @@ class PybulletPlant(RigidPlant):
             rests[place] = position
         still = [0.0] * len(rests)
         self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's axes for the world's
-        balanced = self._bullet.calculateInverseDynamics(
-            self._arm, rests, still, still, physicsClientId=self._client
-        )
+        balanced = self._bullet.calculateInverseDynamics(self._arm, rests, still, still, physicsClientId=self._client)
         self._pull(GRAVITY)
         self.efforts = np.array(balanced)[self._places]
 

@@ -172,9 +172,7 @@ def random_pair(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         intrinsics.append([[own, 0, 319.5 + centre[0]], [0, own * aspect, 239.5 + centre[1]], [0, 0, 1]])
         roll = rng.uniform(-0.5, 0.5) * ROLL
         poses.append(
-            rotation("z", roll)
-            @ rotation("y", side * 0.5 * vergence)
-            @ translation(-side * 0.5 * baseline, 0, 0)
+            rotation("z", roll) @ rotation("y", side * 0.5 * vergence) @ translation(-side * 0.5 * baseline, 0, 0)
         )
     return np.array(intrinsics), np.array(poses)
 
@@ -212,9 +210,7 @@ def _drawn(rng: np.random.Generator, arm: str, body: FloatArray) -> SyntheticCel
     links = tuple(dh_link(*row) for row in rows)
     lenses = np.tile(pinhole(), (2, 1))
     none = np.zeros(len(rows))
-    cell = SyntheticCell(
-        np.eye(4), ("revolute",) * len(rows), links, body, intrinsics, poses, home, none, lenses
-    )
+    cell = SyntheticCell(np.eye(4), ("revolute",) * len(rows), links, body, intrinsics, poses, home, none, lenses)
     middle = translation(*body.mean(axis=0))
     cell = replace(cell, base=facing @ np.linalg.inv(cell.flange(home) @ middle))
     if not cell.in_view(home[None], MARGIN).all():

@@ -93,9 +93,7 @@ class Renderer:
             image[rows] = self._drawn(at_row(0.5 * (rows.start + rows.stop - 1)), workpiece, camera)[rows]
         return self._expose(image, rng, t_s)
 
-    def _drawn(
-        self, q: FloatArray, workpiece: FloatArray | None, camera: PinholeCamera
-    ) -> npt.NDArray[np.float32]:
+    def _drawn(self, q: FloatArray, workpiece: FloatArray | None, camera: PinholeCamera) -> npt.NDArray[np.float32]:
         """The image before the sensor's noise."""
         background, front = self._backdrop.image(q), []
         if self.settings.background == "arm":
@@ -238,9 +236,7 @@ def _draw_solid(
         for outline, level, normal in zip(body.outlines, body.shades(pose), normals, strict=True)
         if normal @ (camera.centre - placed[outline[0]]) > 0.0
     ]
-    outlines = [
-        pixels[rows] if camera.k1 == 0.0 else bend_outline(camera, pixels[rows]) for rows, _ in fronts
-    ]
+    outlines = [pixels[rows] if camera.k1 == 0.0 else bend_outline(camera, pixels[rows]) for rows, _ in fronts]
     region = _region([(outline.min(axis=0), outline.max(axis=0)) for outline in outlines], camera)
     if region is None:
         return None
@@ -505,12 +501,9 @@ class PybulletBackdrop(Backdrop):
             shadow=0, renderer=self._bullet.ER_TINY_RENDERER, physicsClientId=self._client,
         )  # fmt: skip
         grey = (
-            np.reshape(rgba, (camera.height // SHRINK, camera.width // SHRINK, 4))[..., :3].mean(axis=-1)
-            * BRIGHTNESS
+            np.reshape(rgba, (camera.height // SHRINK, camera.width // SHRINK, 4))[..., :3].mean(axis=-1) * BRIGHTNESS
         )
-        enlarged = cv2.resize(
-            grey.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR
-        )
+        enlarged = cv2.resize(grey.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(np.clip(enlarged, 0, 255), dtype=np.uint8)
 
 

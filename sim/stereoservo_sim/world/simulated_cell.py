@@ -71,9 +71,7 @@ class SimulatedCell:
         points = self.marker_positions(q)
         return {camera.name: self.in_world(camera, q).image_of(points)[0] for camera in self.rig.cameras}
 
-    def visible(
-        self, q: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
-    ) -> BoolArray:
+    def visible(self, q: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE) -> BoolArray:
         """Which markers ``camera`` of the rig sees at ``q`` (n,), (m,): as :meth:`turned_to`, and no link
         stands before them.
         """
@@ -82,9 +80,7 @@ class SimulatedCell:
         points = self.marker_positions(q)
         return seen & ~self._behind_arm(q, points, camera.centre)
 
-    def turned_to(
-        self, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
-    ) -> BoolArray:
+    def turned_to(self, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE) -> BoolArray:
         """Which markers of the body at ``pose`` have their whole dot in the image and their face turned to
         ``camera``, (m,).
 
@@ -174,9 +170,7 @@ def workpiece_cell() -> SimulatedCell:
     """
     cell = demo_cell()
     rig_to_workpiece = translation(-0.223, -0.155, 1.0) @ rotation("y", 12.0) @ rotation("z", 7.0)
-    return replace(
-        cell, workpiece=Workpiece(plate_body(), inverse_pose(cell.rig.world_to_rig) @ rig_to_workpiece)
-    )
+    return replace(cell, workpiece=Workpiece(plate_body(), inverse_pose(cell.rig.world_to_rig) @ rig_to_workpiece))
 
 
 @lru_cache(maxsize=1)

@@ -98,10 +98,7 @@ class SyntheticCell:
     def markers(self, positions: FloatArray) -> FloatArray:
         """Markers (s, m, 4) in the rig's frame at ``positions`` (s, n)."""
         body = np.hstack([self.body, np.ones((len(self.body), 1))])
-        to_rig = [
-            self.flange(q) if self.mount == "eye_to_hand" else np.linalg.inv(self.flange(q))
-            for q in positions
-        ]
+        to_rig = [self.flange(q) if self.mount == "eye_to_hand" else np.linalg.inv(self.flange(q)) for q in positions]
         return np.array([body @ pose.T for pose in to_rig])
 
     def depths(self, positions: FloatArray) -> FloatArray:
@@ -158,9 +155,7 @@ class SyntheticCell:
         return TrialData(
             joint_names=self.joint_names,
             joint_kinds=self.kinds,
-            cameras=tuple(
-                TrialCamera(f"cam{c}", self.width, self.height, self.mount) for c in range(len(self.poses))
-            ),
+            cameras=tuple(TrialCamera(f"cam{c}", self.width, self.height, self.mount) for c in range(len(self.poses))),
             marker_ids=self.marker_ids,
             positions=configurations,
             trials=moved,
@@ -173,9 +168,7 @@ class SyntheticCell:
         """The same cell with other markers (m, 3)."""
         return replace(self, body=np.asarray(body, dtype=np.float64))
 
-    def lens_of(
-        self, camera: int, k1: float, k2: float = 0.0, p1: float = 0.0, p2: float = 0.0
-    ) -> FloatArray:
+    def lens_of(self, camera: int, k1: float, k2: float = 0.0, p1: float = 0.0, p2: float = 0.0) -> FloatArray:
         """Lens (7,) of OpenCV's first coefficients about a camera's principal point, as with square pixels."""
         K, r0 = self.intrinsics[camera], 0.5 * self.width
         share = r0 / float(np.sqrt(K[0, 0] * K[1, 1]))
@@ -302,9 +295,7 @@ def seven(body: FloatArray | None = None) -> SyntheticCell:
 def gantry() -> SyntheticCell:
     """Cell of a 3P arm: along x, y, z."""
     links = (rotation("x", -90), rotation("y", 90), np.eye(4))
-    return placed(
-        ("prismatic",) * 3, links, two_faces(), np.zeros(3), (0.2, 0.15, 0.2), _facing(("x", 160), ("y", 20))
-    )
+    return placed(("prismatic",) * 3, links, two_faces(), np.zeros(3), (0.2, 0.15, 0.2), _facing(("x", 160), ("y", 20)))
 
 
 def gantry_with_wrist() -> SyntheticCell:

@@ -76,9 +76,7 @@ class Motion(Moved, frozen=True, forbid_unknown_fields=True):
         elapsed_s = elapsed_s if self.every_s is None else elapsed_s % self.every_s
         elapsed_s = elapsed_s if self.for_s is None else min(elapsed_s, self.for_s)
         swing = float(np.sin(2.0 * np.pi * self.swing_hz * elapsed_s))
-        shift = (
-            np.array(self.shift_m) + elapsed_s * np.array(self.velocity_m_s) + swing * np.array(self.swing_m)
-        )
+        shift = np.array(self.shift_m) + elapsed_s * np.array(self.velocity_m_s) + swing * np.array(self.swing_m)
         turned = elapsed_s * np.array(self.turn_rate_deg_s)
         axis, turn = np.array(self.about_m), np.array(self.turn_deg) + turned
         shift = shift + axis - Moved(turn_deg=tuple(turned.tolist())).matrix[:3, :3] @ axis

@@ -77,9 +77,7 @@ def test_the_stated_covariance_is_that_of_the_errors(known: bool, seeds: int) ->
     found = [normalised_error(2000 + seed, known) for seed in range(seeds)]
     total, freedoms = sum(one for one, _ in found), sum(count for _, count in found)
     low, high = chi2.ppf([0.0005, 0.9995], freedoms)
-    print(
-        f"NEES {total / freedoms:.3f} over {seeds} seeds, interval {low / freedoms:.3f} to {high / freedoms:.3f}"
-    )
+    print(f"NEES {total / freedoms:.3f} over {seeds} seeds, interval {low / freedoms:.3f} to {high / freedoms:.3f}")
     assert low < total < high
 
 
@@ -126,9 +124,7 @@ def refusals(first: int, last: int) -> dict[str, dict[str, int]]:
 
 def test_degenerate_views_are_refused_for_what_is_wrong() -> None:
     found = refusals(5000, 5030)
-    assert {
-        kind: set(codes) - CAUSES[kind] for kind, codes in found.items() if set(codes) - CAUSES[kind]
-    } == {}
+    assert {kind: set(codes) - CAUSES[kind] for kind, codes in found.items() if set(codes) - CAUSES[kind]} == {}
 
 
 @pytest.mark.slow
@@ -215,9 +211,7 @@ def test_places_are_where_the_body_was_held_still() -> None:
 # -- against OpenCV -----------------------------------------------------------------------------------------
 
 
-def opencv_stereo(
-    pixels: list[np.ndarray], layout: np.ndarray, size: tuple[int, int]
-) -> tuple[list[float], float]:
+def opencv_stereo(pixels: list[np.ndarray], layout: np.ndarray, size: tuple[int, int]) -> tuple[list[float], float]:
     """Focal lengths (fx of each camera) and baseline of cv2.stereoCalibrate with k1, k2, p1, p2."""
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
     points = [layout.astype(np.float32)] * len(pixels[0])
@@ -239,8 +233,7 @@ def held_against_opencv(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     report = json.loads(capsys.readouterr().out)
     left, right = (sorted((folder / name).iterdir()) for name in ("left", "right"))
     corners = [
-        [find_corners(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), 9, 6) for path in paths]
-        for paths in (left, right)
+        [find_corners(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), 9, 6) for path in paths] for paths in (left, right)
     ]
     both = [s for s in range(len(left)) if corners[0][s] is not None and corners[1][s] is not None]
     pixels = [[each[s] for s in both] for each in corners]
@@ -257,9 +250,7 @@ def held_against_opencv(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert report["next_views"][0]["would_be_px"] < report["next_views"][0]["deviation_px"]
 
 
-def test_rendered_pairs_as_opencv_has_them_and_as_they_are(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rendered_pairs_as_opencv_has_them_and_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = rendered_pictures(5, tmp_path / "pictures", places=9)
     held_against_opencv(tmp_path / "pictures", tmp_path, capsys)
     for K, camera in zip(truth.K, load_rig(tmp_path / "rig.json").cameras, strict=True):
@@ -272,9 +263,7 @@ def real_pairs() -> Path | None:
     return next((place for place in places if (place / "left01.jpg").exists()), None)
 
 
-@pytest.mark.skipif(
-    real_pairs() is None, reason="no left01.jpg: Debian's opencv-doc has it, or $STEREOSERVO_DATA"
-)
+@pytest.mark.skipif(real_pairs() is None, reason="no left01.jpg: Debian's opencv-doc has it, or $STEREOSERVO_DATA")
 def test_real_pairs_as_opencv_has_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = real_pairs()
     assert source is not None

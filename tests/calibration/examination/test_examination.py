@@ -113,9 +113,9 @@ def test_dropped_frames_are_counted_by_numbers_and_by_stamps() -> None:
     lost = np.zeros(200, dtype=bool)
     lost[[20, 21, 22, 90]] = True
     views = case.select(mine)
-    views = replace(
-        views, times=np.arange(200) / 30.0 + rng.normal(0.0, 1e-3, 200), numbers=np.arange(200)
-    ).select(~lost)
+    views = replace(views, times=np.arange(200) / 30.0 + rng.normal(0.0, 1e-3, 200), numbers=np.arange(200)).select(
+        ~lost
+    )
     assert gaps(views, 0) == [(20, 3), (87, 1)]
     assert gaps(replace(views, numbers=4 * views.numbers), 0) == [(20, 3), (87, 1)]
     assert gaps(replace(views, numbers=np.full(196, -1)), 0) == [(20, 3), (87, 1)]
@@ -200,7 +200,5 @@ def test_the_noise_of_frames_is_that_of_the_pixels_where_the_motion_is_even() ->
     rng = np.random.default_rng(6)
     views = examined_case(QUIET).views
     even = views.ranks[:, None, None] * rng.normal(size=(1, views.pixels.shape[1], 2))
-    noisy = replace(
-        views, pixels=even + rng.normal(0.0, 3.0, views.pixels.shape), sigmas=np.ones(views.sigmas.shape)
-    )
+    noisy = replace(views, pixels=even + rng.normal(0.0, 3.0, views.pixels.shape), sigmas=np.ones(views.sigmas.shape))
     assert frame_noise(noisy) == pytest.approx(3.0, rel=0.05)

@@ -42,9 +42,7 @@ def test_systemd_takes_the_unit(tmp_path):
 def test_udev_rules_are_matches_then_assignments():
     word = re.compile(r'[A-Z_]+(\{[\w$.]+\})?(==|!=|\+=|=)"[^"]*"')
     rules = [
-        line
-        for line in (FILES / "70-stereoservo-can.rules").read_text().splitlines()
-        if line[:1] not in ("#", "")
+        line for line in (FILES / "70-stereoservo-can.rules").read_text().splitlines() if line[:1] not in ("#", "")
     ]
     assert len(rules) == 5
     for rule in rules:

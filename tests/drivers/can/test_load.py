@@ -100,9 +100,7 @@ def test_background_takes_its_share():
     load = cycle_load(SYNC_AND_THREE_PDOS, 250.0, 1_000_000, heartbeats)
     assert load.background == 350 * 65
     assert load.share == pytest.approx((2005 * 250 + 350 * 65) / 1e6)
-    assert cycle_load(SYNC_AND_THREE_PDOS, load.rate_at(0.7), 1_000_000, heartbeats).share == pytest.approx(
-        0.7
-    )
+    assert cycle_load(SYNC_AND_THREE_PDOS, load.rate_at(0.7), 1_000_000, heartbeats).share == pytest.approx(0.7)
 
 
 def test_refusal_says_value_limit_and_what_fits():

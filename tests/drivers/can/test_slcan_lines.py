@@ -170,9 +170,7 @@ class TestAdapter:
         assert adapter.feed(b"C\r") == ([], b"\r")
         assert adapter.deliver(frames) == b""
 
-    @pytest.mark.parametrize(
-        "line", [b"t0800\r", b"C\r", b"F\r", b"S9\r", b"Q\r", b"s12\r", b"szzzz\r", b"t08\r"]
-    )
+    @pytest.mark.parametrize("line", [b"t0800\r", b"C\r", b"F\r", b"S9\r", b"Q\r", b"s12\r", b"szzzz\r", b"t08\r"])
     def test_closed_refuses(self, line):
         assert SlcanAdapter().feed(line) == ([], BEL)
 

@@ -76,9 +76,7 @@ class MakerDrive:
                 del dictionary.indices[index]
         for index in dictionary:
             entry = dictionary[index]
-            for variable in (
-                [entry] if isinstance(entry, canopen.objectdictionary.ODVariable) else entry.values()
-            ):
+            for variable in [entry] if isinstance(entry, canopen.objectdictionary.ODVariable) else entry.values():
                 if variable.value is None and variable.default is None and variable.fixed_size:
                     variable.default = 0
         for (index, subindex), value in values.items():
@@ -131,13 +129,7 @@ class MakerDrive:
         following = 0x1000 if self.state == 0x27 and self.get(0x6060) in (7, 8, 9) else 0
         if self.get(0x6060) == 1:
             following = 0x1000 * self._taken
-        return (
-            self.state
-            | 0x10 * (self.state != 0x40)
-            | 0x200
-            | (following & ~self.word)
-            | (self.word & ~0x1000)
-        )
+        return self.state | 0x10 * (self.state != 0x40) | 0x200 | (following & ~self.word) | (self.word & ~0x1000)
 
     # -- bus ------------------------------------------------------------------------------------------------
 
@@ -261,9 +253,7 @@ class MakerDrive:
         else:
             wanted = 0.0
         self.speed += (
-            float(np.clip(wanted - self.speed, -ramp * dt, ramp * dt))
-            if mode in (1, 3, 9)
-            else wanted - self.speed
+            float(np.clip(wanted - self.speed, -ramp * dt, ramp * dt)) if mode in (1, 3, 9) else wanted - self.speed
         )
         if self.blocked:
             self.speed = 0.0

@@ -67,9 +67,7 @@ def enabled() -> Cia402Codec:
         (("velocity", "following_error", "effort"), (("velocity", "following_error"), ("effort",))),
     ],
 )
-def test_feedback_fills_pdos_in_its_order(
-    feedback: tuple[str, ...], pdos: tuple[tuple[str, ...], ...]
-) -> None:
+def test_feedback_fills_pdos_in_its_order(feedback: tuple[str, ...], pdos: tuple[tuple[str, ...], ...]) -> None:
     assert tpdo_feedback(feedback) == pdos
     for mapping in tpdo_mappings(feedback):
         assert sum(entry & 0xFF for entry in mapping) <= 64
@@ -278,9 +276,7 @@ def test_ignored_emergencies_do_not_trip_but_are_shown() -> None:
     assert "0x8110" in codec.status_words()[0]
 
 
-@pytest.mark.parametrize(
-    ("state", "code"), [(0, "rebooted"), (4, "left_operational"), (127, "left_operational")]
-)
+@pytest.mark.parametrize(("state", "code"), [(0, "rebooted"), (4, "left_operational"), (127, "left_operational")])
 def test_nmt_states_while_watched(enabled: Cia402Codec, state: int, code: str) -> None:
     frame = CanFrame(0x702, bytes([state]))
     enabled.receive(frame)
@@ -403,9 +399,7 @@ def test_a_limit_stops_all_and_lets_the_joint_go_inward_only(direction: int, out
 
 
 @pytest.mark.parametrize(("switches", "hint"), [(0b10, "limit switch active"), (0, "no limit switch active")])
-def test_limit_switches_that_are_sent_tell_a_switch_at_once_from_a_limit_of_the_drive(
-    switches: int, hint: str
-) -> None:
+def test_limit_switches_that_are_sent_tell_a_switch_at_once_from_a_limit_of_the_drive(switches: int, hint: str) -> None:
     codec = codec_of(feedback=("velocity", "switches"))
     codec.watch()
     for node in (1, 2):

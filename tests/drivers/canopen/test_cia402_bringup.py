@@ -148,9 +148,7 @@ Make = Callable[..., Bench]
 def make_bench(tmp_path: Path) -> Make:
     """``make_bench(options, on_bus=options of what is really there, eds=of the emulated drives)``."""
 
-    def make(
-        options: CanOptions | None = None, on_bus: CanOptions | None = None, eds: Path = SHIPPED_EDS
-    ) -> Bench:
+    def make(options: CanOptions | None = None, on_bus: CanOptions | None = None, eds: Path = SHIPPED_EDS) -> Bench:
         options = options or make_options()
         settings = DrivesSettings(plant="ideal", bit_time=True, brake_ms=5.0, eds=str(eds))
         emulator = make_bus_emulator(on_bus or options, settings, t_ns=0)
@@ -320,9 +318,7 @@ def test_a_device_that_is_no_drive_is_refused(bench: Bench) -> None:
 @pytest.mark.parametrize("key", ["vendor_id", "product_code", "revision", "serial_number"])
 def test_another_identity_is_refused(make_bench: Make, key: str) -> None:
     joints = [make_joint(1), make_joint(2, **{key: 0x1234})]
-    message = make_bench(make_options(*joints), make_options(make_joint(1), make_joint(2))).refused(
-        "identity"
-    )
+    message = make_bench(make_options(*joints), make_options(make_joint(1), make_joint(2))).refused("identity")
     assert key in message
     assert "4660 (0x1234)" in message
     make_bench(make_options(*joints)).connect()
@@ -394,9 +390,7 @@ def test_an_object_that_neither_eds_nor_standard_know_is_refused(make_bench: Mak
 
 
 @pytest.mark.filterwarnings("ignore:The 'warn' method:DeprecationWarning")  # canopen's
-@pytest.mark.parametrize(
-    "text", ["", "no section", "[DeviceInfo]\nVendorNumber=1\n", "[6040]\nObjectType=9\n"]
-)
+@pytest.mark.parametrize("text", ["", "no section", "[DeviceInfo]\nVendorNumber=1\n", "[6040]\nObjectType=9\n"])
 def test_a_file_that_is_no_eds_is_refused(make_bench: Make, tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.eds").write_text(text)
     assert "bad.eds" in make_bench(make_options(eds="bad.eds")).refused("eds")
@@ -560,9 +554,7 @@ def test_reset_after_a_lost_heartbeat(make_bench: Make, abort_option: int, stubb
     assert bench.master.mode is Mode.RUNNING
 
 
-@pytest.mark.parametrize(
-    "fault", ["reboot 2", "remap 2", "fault 2 0x8611", "nmt stop", "nmt preop", "nmt reset"]
-)
+@pytest.mark.parametrize("fault", ["reboot 2", "remap 2", "fault 2 0x8611", "nmt stop", "nmt preop", "nmt reset"])
 def test_reset_configures_anew_whatever_has_happened(bench: Bench, fault: str) -> None:
     bench.connect()
     bench.run()
@@ -596,9 +588,7 @@ def test_reset_refuses_a_node_that_is_gone_and_one_that_is_there_twice(bench: Be
 
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_limit_switch_at_the_start_lets_the_joint_go_inward_only(
-    make_bench: Make, direction: int, side: int
-) -> None:
+def test_a_limit_switch_at_the_start_lets_the_joint_go_inward_only(make_bench: Make, direction: int, side: int) -> None:
     bench = make_bench(make_options(make_joint(1, direction=direction)))
     bench.node(1).axis.limit_switch = side
     bench.connect()
@@ -657,9 +647,7 @@ def test_a_drive_that_is_still_enabled_is_stopped_before_it_is_left(make_bench: 
     for node in (1, 2, 3):
         assert (bench.node(node).axis.velocity, bench.node(node).axis.powered) == (0.0, False)
         ends = [
-            event.kind
-            for event in bench.emulator.events
-            if event.node == node and event.kind in ("rest", "power_off")
+            event.kind for event in bench.emulator.events if event.node == node and event.kind in ("rest", "power_off")
         ]
         assert ends[-2:] == ["rest", "power_off"]
 

@@ -120,9 +120,7 @@ def test_codes_without_an_entry_take_their_group_s() -> None:
 
 
 def test_communication_errors_are_those_of_the_bus() -> None:
-    assert all(
-        is_communication_error(code) for code in (0x8110, 0x8120, 0x8130, 0x8140, 0x8210, 0x8250, 0x8700)
-    )
+    assert all(is_communication_error(code) for code in (0x8110, 0x8120, 0x8130, 0x8140, 0x8210, 0x8250, 0x8700))
     assert not any(is_communication_error(code) for code in (0, 0x2310, 0x8311, 0x8400, 0x8611, 0xFF01))
 
 

@@ -276,9 +276,7 @@ def test_what_is_raised_in_the_bus_thread_stops_the_arm(
     arm.drive(5)
 
 
-def test_a_bring_up_that_fails_with_a_defect_leaves_no_pump_behind(
-    arm: Arm, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bring_up_that_fails_with_a_defect_leaves_no_pump_behind(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise KeyError("a defect")
 

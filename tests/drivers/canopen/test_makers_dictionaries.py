@@ -128,10 +128,7 @@ def test_a_cut_cable_stops_a_makers_drive_by_its_own_watch(name):
         assert bench.drive.reason in watches
         assert (bench.bus.t_ns - cut) * 1e-9 < 0.15
     else:
-        assert (
-            abs(bench.position - before)
-            <= bench.options.joint[0].lead + bench.options.joint[0].largest_load_offset
-        )
+        assert abs(bench.position - before) <= bench.options.joint[0].lead + bench.options.joint[0].largest_load_offset
 
 
 def test_a_drive_without_any_watch_is_refused_until_the_cell_file_says_that_it_is_known():

@@ -206,8 +206,7 @@ class Loop:
             settings.command_timeout_s, 100.0,
         )  # fmt: skip
         limits = [
-            {"joint": j.name, "min": -2.9, "max": 2.9, "velocity": 1.0, "acceleration": 50.0}
-            for j in joints.joints
+            {"joint": j.name, "min": -2.9, "max": 2.9, "velocity": 1.0, "acceleration": 50.0} for j in joints.joints
         ]
         cell = check_cell(
             {

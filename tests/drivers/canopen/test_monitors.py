@@ -135,9 +135,7 @@ def delayed(axis_ids: tuple[int, ...], by_ns: int, jitter: np.random.Generator |
     def change(cycle: int, answers: list) -> list:
         return [
             (
-                delay
-                + (by_ns if f.id in axis_ids else 0)
-                + (int(jitter.integers(0, 400_000)) if jitter else 0),
+                delay + (by_ns if f.id in axis_ids else 0) + (int(jitter.integers(0, 400_000)) if jitter else 0),
                 f,
             )
             for delay, f in answers

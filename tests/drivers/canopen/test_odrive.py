@@ -233,9 +233,7 @@ class Drives:
             elif command == 4 and frame.data[0] == 0 and frame.data[3] == 0:
                 number = frame.data[2] << 8 | frame.data[1]
                 if number in self.properties:
-                    self.deliver(
-                        CanFrame(node * 32 + 5, bytes([0, *frame.data[1:3], 0]) + self.properties[number])
-                    )
+                    self.deliver(CanFrame(node * 32 + 5, bytes([0, *frame.data[1:3], 0]) + self.properties[number]))
             elif command == 7:
                 self.state = frame.data[0]
             elif command == 0x18:
@@ -416,9 +414,7 @@ def test_settings_that_do_not_keep_an_axis_safe_are_refused(tmp_path, changed, c
     assert not states_asked(link.sent, 3).count(8)
 
 
-@pytest.mark.parametrize(
-    "changed", [{"enable_watchdog": b"\x00"}, {"watchdog_timeout": struct.pack("<f", 0.0)}]
-)
+@pytest.mark.parametrize("changed", [{"enable_watchdog": b"\x00"}, {"watchdog_timeout": struct.pack("<f", 0.0)}])
 def test_an_axis_without_watchdog_is_used_where_the_cell_file_says_that_it_is_known(tmp_path, changed):
     link, start = with_endpoints(tmp_path, axis=joint(accept_missing=("watch",)), **changed)
     start.connect(link)
@@ -443,9 +439,7 @@ def test_a_drive_that_does_not_answer_on_its_settings_is_told(tmp_path):
     assert "no answer on axis0.config.enable_watchdog" in start.safety[3][1]
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[1]", '{"fw_version": "0.6.10", "hw_version": "4.4.58", "endpoints": {}}']
-)
+@pytest.mark.parametrize("text", ["", "[1]", '{"fw_version": "0.6.10", "hw_version": "4.4.58", "endpoints": {}}'])
 def test_a_file_that_is_no_list_of_endpoints_is_refused(tmp_path, text):
     (tmp_path / "flat.json").write_text(text)
     chosen = options(endpoints=("flat.json",))

@@ -78,9 +78,7 @@ def test_velocities_that_do_not_fit_the_drives_objects() -> None:
     assert "valid: up to 3.217" in text
     assert "max_acceleration" in refused(joint(counts_per_rev=2**23, gear_ratio=500.0, max_acceleration=7.0))
     # rpm of a motor without a gear: 0.01 rad/s is a tenth of an rpm.
-    assert "which is nothing" in refused(
-        joint(gear_ratio=1.0, velocity_units_per_rev_s=60.0, max_velocity=0.01)
-    )
+    assert "which is nothing" in refused(joint(gear_ratio=1.0, velocity_units_per_rev_s=60.0, max_velocity=0.01))
 
 
 def test_a_counter_that_wraps_within_the_limits() -> None:

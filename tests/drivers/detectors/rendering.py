@@ -56,9 +56,7 @@ def add_conic(coverage: Array, conic: Array) -> None:
     root = np.sqrt(np.where(hit, disc, 0.0))
     left, right = (-p - root) / a, (-p + root) / a
     columns = np.arange(width)
-    inside = np.clip(
-        np.minimum(right[:, None], columns + 0.5) - np.maximum(left[:, None], columns - 0.5), 0, 1
-    )
+    inside = np.clip(np.minimum(right[:, None], columns + 0.5) - np.maximum(left[:, None], columns - 0.5), 0, 1)
     inside[~hit] = 0
     coverage[first : last + 1] += inside.reshape(last - first + 1, LINES, width).mean(axis=1)
 
@@ -72,9 +70,7 @@ def add_blurred(coverage: Array, conic: Array, sigma: float) -> None:
     u0, v0 = np.floor(centre - half).astype(int)
     u1, v1 = np.ceil(centre + half).astype(int) + 1
     # fine pixel i of the patch has its centre at u0 - 1/2 + (i + 1/2) / FINE
-    to_pixels = np.array(
-        [[1 / FINE, 0, u0 - 0.5 + 0.5 / FINE], [0, 1 / FINE, v0 - 0.5 + 0.5 / FINE], [0, 0, 1]]
-    )
+    to_pixels = np.array([[1 / FINE, 0, u0 - 0.5 + 0.5 / FINE], [0, 1 / FINE, v0 - 0.5 + 0.5 / FINE], [0, 0, 1]])
     fine = np.zeros(((v1 - v0) * FINE, (u1 - u0) * FINE))
     add_conic(fine, to_pixels.T @ conic @ to_pixels)
     fine = cv2.GaussianBlur(fine, (0, 0), sigma * FINE)

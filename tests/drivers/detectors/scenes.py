@@ -25,9 +25,7 @@ class Still:
 
 def make_detector(**options) -> DotDetector:
     here = Path(".")
-    return DotDetector(
-        options, DriverContext(clock=Still(), cell="c", runtime_dir=here, cell_dir=here, camera="left")
-    )
+    return DotDetector(options, DriverContext(clock=Still(), cell="c", runtime_dir=here, cell_dir=here, camera="left"))
 
 
 @dataclass
@@ -69,9 +67,7 @@ def random_shot(rng, *, tilt=60.0, distance=(0.8, 2.0), clutter=0, clear_of_dots
     z = rng.uniform(*distance)
     for f, face in enumerate(DEFAULT_BODY):
         at = (180.0 + 280.0 * f + rng.uniform(-20, 20), 240.0 + rng.uniform(-60, 60))
-        H = look(
-            np.radians(rng.uniform(0, tilt)), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), z, at
-        )
+        H = look(np.radians(rng.uniform(0, tilt)), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), z, at)
         faces.append((H, face.positions, face.radius, face.half_side))
         truth.append(project(H, face.positions))
     truth = np.concatenate(truth)

@@ -34,9 +34,7 @@ def mirror_twins(name):
 
 def make_detector(**options) -> TagDetector:
     here = Path(".")
-    return TagDetector(
-        options, DriverContext(clock=Still(), cell="c", runtime_dir=here, cell_dir=here, camera="left")
-    )
+    return TagDetector(options, DriverContext(clock=Still(), cell="c", runtime_dir=here, cell_dir=here, camera="left"))
 
 
 def print_of(tag, family="36h11"):
@@ -45,9 +43,7 @@ def print_of(tag, family="36h11"):
 
 def random_view(rng, side=80.0, tilt=50.0, least_tilt=0.0):
     at = tuple(rng.uniform([150, 130], [490, 350]))
-    return tag_view(
-        side, rng.uniform(least_tilt, tilt), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), at
-    )
+    return tag_view(side, rng.uniform(least_tilt, tilt), rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), at)
 
 
 def prior_of(frame, tag, corners, sigma=1.0, **changes):
@@ -279,9 +275,7 @@ def test_no_quadrilaterals_are_searched_where_priors_are_right_and_few_times_whe
     cold = detector.detect(frame, None)
     assert len(cold.ids) == 48
     searched, quads = [], detector._quads
-    monkeypatch.setattr(
-        detector, "_quads", lambda d, image, tags: searched.append(image.size) or quads(d, image, tags)
-    )
+    monkeypatch.setattr(detector, "_quads", lambda d, image, tags: searched.append(image.size) or quads(d, image, tags))
     for off_px, most in ((0.7, 0), (60.0, 2 * frame.image.size)):
         searched.clear()
         places = corners + rng.normal(0.0, 0.7, corners.shape) + (off_px if most else 0.0)

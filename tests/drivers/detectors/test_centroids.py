@@ -21,9 +21,7 @@ def tilted_circle(rng, radius, tilt):
     centre = 31.5 + rng.uniform(0, 1, 2)
     a = rng.uniform(0, np.pi)
     H = np.eye(3)
-    H[:2, :2] = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ np.diag(
-        [1, np.cos(np.radians(tilt))]
-    )
+    H[:2, :2] = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ np.diag([1, np.cos(np.radians(tilt))])
     H[:2, 2] = centre
     return conic_of_circle(H, np.zeros(2), radius), centre
 
@@ -72,9 +70,7 @@ def test_size_tilt_and_blur_without_noise(radius, tilt, lens_blur):
 
 
 @pytest.mark.parametrize("noise", [1.0, 3.0, 10.0])
-@pytest.mark.parametrize(
-    ("radius", "tilt", "lens_blur"), [(4, 0, 0.7), (4, 60, 0.7), (8, 0, 0.7), (4, 0, 1.5)]
-)
+@pytest.mark.parametrize(("radius", "tilt", "lens_blur"), [(4, 0, 0.7), (4, 60, 0.7), (8, 0, 0.7), (4, 0, 1.5)])
 def test_covariances_are_the_scatter(radius, tilt, lens_blur, noise):
     """Sum of 2 n squared normalised errors ~ chi2(2 n), here with each dot's own noise estimate of about
     100 pixels.

@@ -97,9 +97,7 @@ class TestCornerDetector(DetectorContract):
         rng = np.random.default_rng(11)
         tool = pose(rotation(20, -30, 20), (0.02, -0.03, 1.0))
         ids, truth = self.cell.landmarks.ids.tolist(), self.cell.truth(tool).tolist()
-        return self.cell.image(tool, rng), {
-            marker: tuple(pixel) for marker, pixel in zip(ids, truth, strict=True)
-        }
+        return self.cell.image(tool, rng), {marker: tuple(pixel) for marker, pixel in zip(ids, truth, strict=True)}
 
 
 def motion(k: int) -> np.ndarray:
@@ -131,9 +129,7 @@ def run_track(cell, frames, noise, seed=7):
             points, found, _ = cv2.calcOpticalFlowPyrLK(before, image, points, None, winSize=(21, 21))
             alive &= found.ravel() == 1
         before = image
-        chained.append(
-            float(np.median(np.linalg.norm(points.reshape(-1, 2) - truth[cell.tool], axis=1)[alive]))
-        )
+        chained.append(float(np.median(np.linalg.norm(points.reshape(-1, 2) - truth[cell.tool], axis=1)[alive])))
     again = cell.detector().detect(frame(0, image), None)
     rows = cell.rows(again)
     fresh = np.linalg.norm((again.pixels - truth[rows])[cell.tool[rows]], axis=1)

@@ -22,9 +22,7 @@ def looked_at(detector, seed, n, change, **settings):
     errors, squares = [], []
     for _ in range(n):
         shot = random_shot(rng, **settings)
-        observation = detector.detect(
-            as_frame(change(shot.scene.clean(), rng)), shot.prior(rng.normal(0, 0.7, 2))
-        )
+        observation = detector.detect(as_frame(change(shot.scene.clean(), rng)), shot.prior(rng.normal(0, 0.7, 2)))
         assert observation.ids.tolist() == IDS.tolist()
         errors.append(shot.errors(observation))
         squares.append(normalised(errors[-1], observation.covariances))
@@ -152,9 +150,7 @@ def test_detection_at_the_edge_of_what_is_promised(detector):
     rng = np.random.default_rng(10)
     faces = 0
     for _ in range(1000):
-        shot = random_shot(
-            rng, tilt=70.0, distance=(0.8, 1.2), noise=10.0, lens_blur=1.5, gradient=0.5, clutter=9
-        )
+        shot = random_shot(rng, tilt=70.0, distance=(0.8, 1.2), noise=10.0, lens_blur=1.5, gradient=0.5, clutter=9)
         observation = detector.detect(shot.frame, None)
         assert (np.hypot(*shot.errors(observation).T) < 2.0).all()
         faces += int((observation.ids < 7).any()) + int((observation.ids >= 7).any())

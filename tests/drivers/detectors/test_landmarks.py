@@ -51,9 +51,7 @@ acceleration = 1.0
 def landmarks(m=9) -> Landmarks:
     rng = np.random.default_rng(1)
     picture = np.clip(texture(rng, 96), 0, 255).astype(np.uint8)
-    cameras = tuple(
-        CameraReference(name, picture, 2, rng.uniform(15, 80, (m, 2)), np.full(m, 0.02)) for name in "ab"
-    )
+    cameras = tuple(CameraReference(name, picture, 2, rng.uniform(15, 80, (m, 2)), np.full(m, 0.02)) for name in "ab")
     return Landmarks(np.arange(5, 5 + m), np.arange(m) % 3, cameras)
 
 
@@ -119,9 +117,7 @@ def test_patches_are_found_to_hundredths_of_a_pixel_with_honest_covariances():
     )
     assert found.found.mean() > 0.95
     errors = (found.pixels - (at - shift))[found.found]
-    squares = np.einsum(
-        "ki,ki->k", errors, np.linalg.solve(found.covariances[found.found], errors[..., None])[..., 0]
-    )
+    squares = np.einsum("ki,ki->k", errors, np.linalg.solve(found.covariances[found.found], errors[..., None])[..., 0])
     # The mean of n squares of two degrees of freedom has a deviation of 2/sqrt(n); the model is good to a fifth.
     assert abs(squares.mean() / 2 - 1.0) <= 0.25 + 4 / np.sqrt(len(squares))
     assert np.sqrt(np.mean(errors**2)) < 0.05

@@ -23,9 +23,7 @@ def test_corners_hold_in_light_that_is_not_even(light, rms_px, chi2):
     assert 0.5 < row["chi2_per_freedom"] < chi2
 
 
-@pytest.mark.parametrize(
-    "light", ["steady", "clipped white, x 1.6", "flicker 30 %, 100 Hz bands", "all of it"]
-)
+@pytest.mark.parametrize("light", ["steady", "clipped white, x 1.6", "flicker 30 %, 100 Hz bands", "all of it"])
 def test_dots_hold_in_light_that_changes(light):
     row = detector_row("dots", light, 3)
     print(row)

@@ -16,12 +16,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "cameras.md"
 
 def test_the_documented_detector_is_found_and_detects(tmp_path, monkeypatch):
     text = PAGE.read_text()
-    code = next(
-        block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class Brightest" in block
-    )
-    entry = re.search(
-        r"^    (\[project.*stereoservo\.detectors.*)\n    (brightest = .*)$", text, re.MULTILINE
-    )
+    code = next(block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class Brightest" in block)
+    entry = re.search(r"^    (\[project.*stereoservo\.detectors.*)\n    (brightest = .*)$", text, re.MULTILINE)
     name, target = (part.strip() for part in entry[2].replace('"', "").split("="))
     module = target.partition(":")[0]
     info = tmp_path / "acme_markers-1.0.dist-info"

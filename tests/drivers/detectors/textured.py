@@ -101,9 +101,7 @@ class Scene:
             for f, face in enumerate(faces):
                 H = plane_map(face, body, camera.P)
                 texel = np.linalg.inv(H) @ rays
-                depth = (
-                    1.0 / texel[2]
-                )  # of the scaled ray: that of the camera, since K's last row is (0, 0, 1)
+                depth = 1.0 / texel[2]  # of the scaled ray: that of the camera, since K's last row is (0, 0, 1)
                 x, y = texel[:2] / texel[2]
                 side = face.grey.shape[0]
                 seen = (x >= 0) & (y >= 0) & (x <= side - 1) & (y <= side - 1) & (depth > 0)

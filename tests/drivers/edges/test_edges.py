@@ -56,9 +56,7 @@ class TestEdgeDetector(DetectorContract):
     least_markers = 8
 
     def make_detector(self, context):
-        (context.cell_dir / "wedge.part").write_text(
-            part_text(CELL.body, {"left": truth_of(CELL, CELL.base)})
-        )
+        (context.cell_dir / "wedge.part").write_text(part_text(CELL.body, {"left": truth_of(CELL, CELL.base)}))
         return EdgeDetector({"part": "wedge.part"}, context)
 
     def make_scene(self):
@@ -73,9 +71,7 @@ def test_vertices_are_where_they_are_and_as_sure_as_they_say(tmp_path):
         light = rng.normal(size=3) * 0.5 + CELL.body.light
         cell = replace(CELL, body=replace(CELL.body, light=light))
         q = (CELL.base if k % 2 else DEMO_GOALS["near"]) + rng.uniform(-0.15, 0.15, 6)
-        image = picture(
-            q, cell, seed=k, blur=rng.uniform(0.5, 1.2), noise=rng.uniform(1, 4), background="plain"
-        )
+        image = picture(q, cell, seed=k, blur=rng.uniform(0.5, 1.2), noise=rng.uniform(1, 4), background="plain")
         truth = truth_of(cell, q)
         frame = frame_of(image, k + 1)
         found = detector.detect(frame, prior_of(frame, truth, rng.normal(0, 0.3, (len(truth), 2))))

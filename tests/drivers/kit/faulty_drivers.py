@@ -65,9 +65,7 @@ class Driver:
         self.beside = AuxiliaryMotion(AUXILIARY)
 
     def describe(self) -> JointDriverDescription:
-        joints = tuple(
-            JointSpec(name, "revolute", -1.0, 1.0, 1.0, 100.0, self.resolution) for name in ("a", "b")
-        )
+        joints = tuple(JointSpec(name, "revolute", -1.0, 1.0, 1.0, 100.0, self.resolution) for name in ("a", "b"))
         return JointDriverDescription("small", joints, 250.0, "clock", TIMEOUT_S, 500.0, auxiliary=AUXILIARY)
 
     def configure(self) -> None:

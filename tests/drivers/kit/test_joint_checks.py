@@ -96,9 +96,7 @@ def test_after_a_trip_a_command_moves_the_arm_again_or_is_refused(driver, after,
         ),
     ],
 )
-def test_an_exception_is_told_by_the_call_that_raised_it_with_what_to_do_there(
-    driver, measured, remedy, tmp_path
-):
+def test_an_exception_is_told_by_the_call_that_raised_it_with_what_to_do_there(driver, measured, remedy, tmp_path):
     result = run(driver, "keeps its description", tmp_path)
     assert result.verdict == "failed"
     assert result.measured.startswith(measured)

@@ -164,9 +164,7 @@ def camera(context: DriverContext) -> Iterator[Callable[..., VideoCameraDriver]]
     made: list[VideoCameraDriver] = []
 
     def make(source: str | int, **options: Any) -> VideoCameraDriver:
-        driver = VideoCameraDriver(
-            {"source": source, "width": WIDTH, "height": HEIGHT, **patient, **options}, context
-        )
+        driver = VideoCameraDriver({"source": source, "width": WIDTH, "height": HEIGHT, **patient, **options}, context)
         made.append(driver)
         return driver
 

@@ -212,9 +212,7 @@ def _mjpg_streamer(data: bytes) -> list[bytes]:
 
 
 def _axis(data: bytes) -> list[bytes]:
-    return [
-        b"--myboundary\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data) + data + b"\r\n"
-    ]
+    return [b"--myboundary\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data) + data + b"\r\n"]
 
 
 def _no_length(data: bytes) -> list[bytes]:

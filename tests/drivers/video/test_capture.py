@@ -211,12 +211,7 @@ def test_a_device_chooses_itself_where_that_is_asked(camera, device):
     driver.configure()
     settings = driver.statistics().settings
     assert settings["auto_exposure"] == (3.0, 3.0)  # aperture priority: what UVC cameras call automatic
-    assert (
-        settings["autofocus"]
-        == settings["auto_white_balance"]
-        == settings["exposure_changes_rate"]
-        == (1.0, 1.0)
-    )
+    assert settings["autofocus"] == settings["auto_white_balance"] == settings["exposure_changes_rate"] == (1.0, 1.0)
     assert not {"exposure", "focus", "white_balance"} & set(settings)
 
 
@@ -235,9 +230,7 @@ def test_a_value_out_of_range_is_told_with_the_range(camera, device):
 
 
 def test_a_size_that_a_device_has_not_is_told_with_its_modes(camera, device, monkeypatch):
-    monkeypatch.setattr(
-        device, "get", lambda what: 640.0 if what == cv2.CAP_PROP_FRAME_WIDTH else device.values[what]
-    )
+    monkeypatch.setattr(device, "get", lambda what: 640.0 if what == cv2.CAP_PROP_FRAME_WIDTH else device.values[what])
     with pytest.raises(DriverError) as caught:
         camera(0).configure()
     assert caught.value.code == "image_size"
@@ -288,15 +281,11 @@ def test_structures_requests_and_controls_are_those_of_the_kernels_header(tmp_pa
         + "\n".join(lines) + "\nreturn 0; }\n"
     )  # fmt: skip
     subprocess.run(["gcc", "-o", str(tmp_path / "header"), str(source)], check=True)
-    printed = subprocess.run(
-        [str(tmp_path / "header")], check=True, capture_output=True, text=True
-    ).stdout.split()
+    printed = subprocess.run([str(tmp_path / "header")], check=True, capture_output=True, text=True).stdout.split()
     assert dict(zip(expected, map(int, printed), strict=True)) == expected
 
 
-@pytest.mark.parametrize(
-    ("told", "believed"), [("ago", True), ("never", False), ("future", False), ("old", False)]
-)
+@pytest.mark.parametrize(("told", "believed"), [("ago", True), ("never", False), ("future", False), ("old", False)])
 def test_a_picture_has_the_time_at_which_the_kernel_took_it(camera, device, monkeypatch, told, believed):
     """One that waited in the queue of a busy computer is as old as it is."""
     stamps = []
@@ -305,9 +294,7 @@ def test_a_picture_has_the_time_at_which_the_kernel_took_it(camera, device, monk
         if what != cv2.CAP_PROP_POS_MSEC:
             return device.values.get(what, -1.0)
         now_ms = time.monotonic_ns() * 1e-6
-        stamps.append(
-            {"ago": now_ms - 40.0, "never": -1.0, "future": now_ms + 2e3, "old": now_ms - 2e3}[told]
-        )
+        stamps.append({"ago": now_ms - 40.0, "never": -1.0, "future": now_ms + 2e3, "old": now_ms - 2e3}[told])
         return stamps[-1]
 
     monkeypatch.setattr(device, "get", get)
@@ -382,9 +369,7 @@ def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered
 def test_pictures_of_one_time_stay_in_order():
     source = Hanging()
     step = threading.Semaphore(0)
-    reads = iter(
-        [SourcePicture(picture(1), 500), SourcePicture(picture(2), 500), SourcePicture(picture(3), 499)]
-    )
+    reads = iter([SourcePicture(picture(1), 500), SourcePicture(picture(2), 500), SourcePicture(picture(3), 499)])
 
     def read():
         step.acquire(timeout=60.0)

@@ -16,9 +16,7 @@ class TestNumberedPictures(CameraDriverContract):
     def make_driver(self, context: DriverContext) -> CameraDriver:
         for number in range(12):
             cv2.imwrite(str(context.cell_dir / f"p{number:04d}.png"), picture(number))
-        return VideoCameraDriver(
-            {"source": "p%04d.png", "width": WIDTH, "height": HEIGHT, "loop": True}, context
-        )
+        return VideoCameraDriver({"source": "p%04d.png", "width": WIDTH, "height": HEIGHT, "loop": True}, context)
 
 
 class TestMjpegStream(CameraDriverContract):

@@ -41,9 +41,7 @@ def opened(url, context, **options):
 @pytest.mark.parametrize("name", DIALECTS)
 def test_a_picture_is_delivered_before_the_next_one_begins(context, name):
     with dialect(name) as (url, send):
-        driver = VideoCameraDriver(
-            {"source": url, "width": WIDTH, "height": HEIGHT, "read_timeout_s": 60.0}, context
-        )
+        driver = VideoCameraDriver({"source": url, "width": WIDTH, "height": HEIGHT, "read_timeout_s": 60.0}, context)
         feeder = Feeder(send, 50.0)
         try:
             driver.configure()
@@ -73,9 +71,7 @@ SERVERS = {
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name in DIALECTS else ()) for name in SERVERS]
 )
-def test_every_picture_of_a_foreign_server_comes_and_those_it_left_out_are_counted(
-    context, name, capsys, monkeypatch
-):
+def test_every_picture_of_a_foreign_server_comes_and_those_it_left_out_are_counted(context, name, capsys, monkeypatch):
     make, options = SERVERS[name]
     monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", f"rtsp_transport;{'udp' if options else 'tcp'}")
     with make(RATE_HZ) as (url, send):

@@ -121,9 +121,7 @@ def test_a_camera_that_goes_away_is_told_and_taken_again_when_it_is_back(context
 
 
 @with_aravis
-def test_a_network_that_loses_packets_of_every_picture_is_the_cause_that_is_told(
-    context: Any, address: str
-) -> None:
+def test_a_network_that_loses_packets_of_every_picture_is_the_cause_that_is_told(context: Any, address: str) -> None:
     with fake_camera(address, "-r", "100"):
         driver = camera_at(address, context)
         end = time.monotonic() + 20.0

@@ -59,9 +59,7 @@ def test_a_part_is_stamped_when_its_first_byte_arrives_not_with_the_boundary_bef
 
 
 def test_a_part_shorter_than_it_says_is_cut_and_the_next_one_whole():
-    data = (
-        b"--edge\r\nContent-Length: 500\r\n\r\nhalf\r\n--edge\r\nContent-Length: 5\r\n\r\nwhole\r\n--edge\r\n"
-    )
+    data = b"--edge\r\nContent-Length: 500\r\n\r\nhalf\r\n--edge\r\nContent-Length: 5\r\n\r\nwhole\r\n--edge\r\n"
     cut, whole = MultipartParser("edge").feed(data, 0)
     assert cut.cut
     assert (whole.body, whole.cut) == (b"whole", False)
@@ -111,14 +109,10 @@ def test_a_chunked_body_comes_out_whole_however_it_comes_in(bodies, cuts):
     assert b"".join(decoder.feed(data[a:b]) for a, b in pairwise(edges)) == b"".join(bodies)
     assert decoder.ended
     whole = ChunkedDecoder()
-    assert (
-        b"".join(whole.feed(chunk[:-2]) for chunk in chunks[:1]) == bodies[0]
-    )  # its line end is not waited for
+    assert b"".join(whole.feed(chunk[:-2]) for chunk in chunks[:1]) == bodies[0]  # its line end is not waited for
 
 
-@pytest.mark.parametrize(
-    "data", [b"x\r\n", b"\r\n", b"-1\r\n", b"1\r\nabc\r\n", b"1" * 5000, b"f" * 17 + b"\r\n"]
-)
+@pytest.mark.parametrize("data", [b"x\r\n", b"\r\n", b"-1\r\n", b"1\r\nabc\r\n", b"1" * 5000, b"f" * 17 + b"\r\n"])
 def test_what_is_no_chunk_is_told(data):
     with pytest.raises(MultipartError) as caught:
         ChunkedDecoder().feed(data)

@@ -18,9 +18,7 @@ SETTINGS = {
     "restarts": (IMAGE, [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]),
     "optimized": (IMAGE, [cv2.IMWRITE_JPEG_OPTIMIZE, 1]),
 }
-ENCODED = {
-    name: cv2.imencode(".jpg", image, settings)[1].tobytes() for name, (image, settings) in SETTINGS.items()
-}
+ENCODED = {name: cv2.imencode(".jpg", image, settings)[1].tobytes() for name, (image, settings) in SETTINGS.items()}
 
 
 @pytest.mark.parametrize("name", ENCODED)

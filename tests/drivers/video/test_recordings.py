@@ -78,9 +78,7 @@ def play(driver):
     pytest.fail("no end")
 
 
-@pytest.mark.parametrize(
-    ("ending", "codec"), [("avi", "FFV1"), ("mkv", "FFV1"), ("mp4", "mp4v"), ("avi", "MJPG")]
-)
+@pytest.mark.parametrize(("ending", "codec"), [("avi", "FFV1"), ("mkv", "FFV1"), ("mp4", "mp4v"), ("avi", "MJPG")])
 def test_a_file_gives_each_frame_once_in_order(tmp_path, camera, ending, codec):
     write_video(tmp_path / f"v.{ending}", codec=codec)
     frames, end = play(camera(f"v.{ending}", pace="every", rate_hz=25.0, latency_s=0.01))
@@ -281,9 +279,7 @@ def test_a_foreign_sidecar_is_refused(tmp_path, camera):
 
 
 def test_a_file_of_ten_gigabytes_costs_no_memory_and_no_patience(tmp_path, camera):
-    os.truncate(
-        write_video(tmp_path / "v.avi"), 10 << 30
-    )  # sparse; behind the video there are zeros without an end
+    os.truncate(write_video(tmp_path / "v.avi"), 10 << 30)  # sparse; behind the video there are zeros without an end
     before = _peak_kib()
     frames, error = play(camera("v.avi", pace="every", read_timeout_s=0.1))
     assert [number_of(frame.image) for frame in frames] == list(range(20))

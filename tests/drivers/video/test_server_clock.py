@@ -75,9 +75,7 @@ def test_the_stated_deviation_covers_the_true_error(name):
         # evenly distributed over the round trip: root 3 at most, and what noise adds
         assert np.abs(rows[known, 2] / rows[known, 3]).max() < 1.8
         assert abs(clock.estimate.drift + CASES[name].get("drift", 50e-6)) < 5e-6
-        assert clock.jumps == {"set on by 0.5 s": 1, "set back by 0.5 s": 1, "held up for 10 s": 2}.get(
-            name, 0
-        )
+        assert clock.jumps == {"set on by 0.5 s": 1, "set back by 0.5 s": 1, "held up for 10 s": 2}.get(name, 0)
 
 
 def test_a_clock_that_was_set_is_refused_until_it_is_known_again():
@@ -148,9 +146,7 @@ class StampingServer(threading.Thread):
         connection, _ = self._listener.accept()
         with connection, self._listener:
             connection.recv(4096)
-            connection.sendall(
-                b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=b\r\n\r\n--b\r\n"
-            )
+            connection.sendall(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=b\r\n\r\n--b\r\n")
             number = 0
             while not self.ended.wait(0.02):
                 shutter = time.monotonic() + self._offset_s

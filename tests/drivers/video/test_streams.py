@@ -142,9 +142,7 @@ def test_pictures_without_lengths(camera, server):
         for number in range(10_000):
             if server.ended.wait(0.005):
                 return
-            handler.wfile.write(
-                b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg(picture(number)) + b"\r\n"
-            )
+            handler.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg(picture(number)) + b"\r\n")
 
     server.stream = stream
     frames = poll_until(start(camera(server.url)), 5)
@@ -173,9 +171,7 @@ def test_cut_pictures_are_withheld_and_whole_ones_go_on(camera, server):
                 return
             cut = number % 3 == 1
             headers = f"X-Sequence: {number}\r\n"
-            server.part(
-                handler, data[: len(data) // 2] if cut else data, headers, len(data) if number % 2 else None
-            )
+            server.part(handler, data[: len(data) // 2] if cut else data, headers, len(data) if number % 2 else None)
         server.ended.wait()
 
     server.stream = stream
@@ -241,9 +237,7 @@ def test_what_is_no_mjpeg_is_told(camera, server, told):
 
 def test_parts_that_are_no_jpeg_are_told(camera, server):
     def stream(handler):
-        handler.wfile.write(
-            b"--frame\r\nContent-Type: text/plain\r\nContent-Length: 2\r\n\r\nhi\r\n--frame\r\n"
-        )
+        handler.wfile.write(b"--frame\r\nContent-Type: text/plain\r\nContent-Length: 2\r\n\r\nhi\r\n--frame\r\n")
         server.ended.wait()
 
     server.stream = stream
@@ -266,9 +260,7 @@ def test_a_redirection_is_followed_and_a_circle_of_them_is_not(camera, server):
         other.close()
 
 
-def test_the_server_that_sends_on_says_nothing_of_the_clock_of_the_one_that_sends(
-    camera, server, monkeypatch
-):
+def test_the_server_that_sends_on_says_nothing_of_the_clock_of_the_one_that_sends(camera, server, monkeypatch):
     taken = []
     monkeypatch.setattr(ServerClock, "round_trip", lambda self, duration_ns: taken.append(duration_ns))
     near = MjpegServer()

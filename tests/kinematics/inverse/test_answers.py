@@ -343,9 +343,7 @@ def test_pan_and_tilt_with_the_cameras_on_it():
 
 
 def test_prismatic_joints_without_closed_form_need_limits():
-    axes = families.joined(
-        families.one(np.random.default_rng(0)), families.sliding(1)(np.random.default_rng(1))
-    )
+    axes = families.joined(families.one(np.random.default_rng(0)), families.sliding(1)(np.random.default_rng(1)))
     arm = hide(axes, np.random.default_rng(2))
     q = np.array([0.4, 0.2])
     H = arm.chain.displacement(arm.chain.zero + q)
@@ -404,9 +402,7 @@ def test_arms_of_few_joints_are_searched_in_their_stratum(name, stratum, count):
     n, rng = chain.joints, np.random.default_rng(8)
     limits = np.array([[-7.0, 7.0] if kind == "revolute" else [-0.5, 0.5] for kind in chain.kinds])
     for _ in range(3):
-        q = np.where(
-            [kind == "revolute" for kind in chain.kinds], rng.uniform(-2, 2, n), rng.uniform(-0.3, 0.3, n)
-        )
+        q = np.where([kind == "revolute" for kind in chain.kinds], rng.uniform(-2, 2, n), rng.uniform(-0.3, 0.3, n))
         H = chain.displacement(q)
         found = inverse_kinematics(chain, displacement=H, limits=limits)
         assert (found.case, found.outcome, len(found.joints)) == ("numerical", "isolated", count)
@@ -439,9 +435,7 @@ def test_seven_joints_inside_narrow_limits():
     arm = hide(from_rows(SEVEN_ROWS), np.random.default_rng(6))
     q = arm.chain.zero + np.array([0.3, 0.8, -0.4, -1.1, 0.5, 0.9, 0.2])
     limits = np.column_stack([q - 0.3, q + 0.3])
-    found = inverse_kinematics(
-        arm.chain, displacement=arm.chain.displacement(q), seed=q + 0.25, limits=limits
-    )
+    found = inverse_kinematics(arm.chain, displacement=arm.chain.displacement(q), seed=q + 0.25, limits=limits)
     assert found.reached
     assert (found.joints >= limits[:, 0] - 1e-6).all()
     assert (found.joints <= limits[:, 1] + 1e-6).all()

@@ -91,10 +91,7 @@ def test_sixteen_solutions():
 
 
 def test_reproduce_prints_one_finite_json_object_and_the_same_for_the_same_seed(app, tmp_path):
-    runs = [
-        CliRunner().invoke(app, ["inverse-kinematics", "--seeds", "2", "--seed", "5", "--json"])
-        for _ in range(2)
-    ]
+    runs = [CliRunner().invoke(app, ["inverse-kinematics", "--seeds", "2", "--seed", "5", "--json"]) for _ in range(2)]
     assert [run.exit_code for run in runs] == [0, 0]
     answer = json.loads(runs[0].stdout)
     assert runs[0].stdout == runs[1].stdout

@@ -69,9 +69,7 @@ def calibrated():
             cell = getattr(synthetic, name)()
             if change is not None:
                 link, (what, amount) = change
-                error = (
-                    synthetic.rotation("x", amount) if what == "tilt" else synthetic.translation(amount, 0, 0)
-                )
+                error = synthetic.rotation("x", amount) if what == "tilt" else synthetic.translation(amount, 0, 0)
                 links = list(cell.links)
                 links[link] = links[link] @ error
                 cell = replace(cell, links=tuple(links))

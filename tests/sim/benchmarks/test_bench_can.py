@@ -59,9 +59,7 @@ def test_a_peer_that_fails_is_told():
 @pytest.mark.process
 def test_six_drives_beside_an_empty_loop():
     figures = run_drives(100.0, 0.5, bit_time=False)
-    if (
-        figures["fault"] is not None
-    ):  # a machine that stalls trips the driver's monitors; that is a figure too
+    if figures["fault"] is not None:  # a machine that stalls trips the driver's monitors; that is a figure too
         assert set(figures["fault"]) == {"code", "message"}
         return
     assert figures["cycles"] + figures["skipped_cycles"] == pytest.approx(100.0 * figures["seconds"], abs=8)

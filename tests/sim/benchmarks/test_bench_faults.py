@@ -11,10 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
-from stereoservo_sim.benchmarks.faults import bench, inputs, service
-from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 
 from stereoservo.cli import main as cli
+from stereoservo_sim.benchmarks.faults import bench, inputs, service
+from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 
@@ -109,9 +109,7 @@ def test_rows_and_tables(one_case, monkeypatch):
 def test_a_sentence_that_differs_in_times_and_numbers_alone_is_printed_once():
     silent = "the gateway has given no sign of life for {} s, since {}. One that hangs for 5 s is killed"
     ended = "Its last run ended at {} {}: the supervisor (process {}) was killed (signal 9)"
-    note = (
-        "s/recordings/hil-can-{}.mcap: {} steps; it is set aside as model-000004.json.damaged-{}; of joint j1"
-    )
+    note = "s/recordings/hil-can-{}.mcap: {} steps; it is set aside as model-000004.json.damaged-{}; of joint j1"
     assert distinct_sentences(
         [
             silent.format("1.8", "18:49:47"),

@@ -22,9 +22,7 @@ from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_sim import cells
 
 CELL_FILES = {path.stem: path for path in sorted(Path(cells.__file__).parent.glob("*.toml"))}
-REAL_TIME = [
-    name for name, path in CELL_FILES.items() if {"drives", "cameras"} & load_cell_file(path).emulate.keys()
-]
+REAL_TIME = [name for name, path in CELL_FILES.items() if {"drives", "cameras"} & load_cell_file(path).emulate.keys()]
 ON_BELT = "conveyor"
 LOCKSTEP = [name for name in CELL_FILES if name not in (*REAL_TIME, *cells.ARMS, ON_BELT)]
 SEEDS = (0, 1, 2)
@@ -55,9 +53,7 @@ def in_lockstep(folders: pytest.TempPathFactory, runs: dict[str, tuple[str, int]
     """Lockstep demos of cells and seeds, by name, two at a time."""
     with ThreadPoolExecutor(2) as pool:
         demos = {
-            name: pool.submit(
-                run_demo, folders.mktemp(name), "--lockstep", "--cell", cell, "--seed", str(seed)
-            )
+            name: pool.submit(run_demo, folders.mktemp(name), "--lockstep", "--cell", cell, "--seed", str(seed))
             for name, (cell, seed) in runs.items()
         }
         yield demos
@@ -155,16 +151,11 @@ def test_more_seeds_do_likewise(tmp_path: Path, seed: int) -> None:
 
 def rippled(folder: Path, amplitude: float) -> Path:
     """The plain cell's file, with gears that ripple by so much [rad]."""
-    gears = (
-        f"j{j + 1} = {{ ripple = {amplitude}, ripple_order = 200, ripple_phase = {1.1 * j} }}"
-        for j in range(6)
-    )
+    gears = (f"j{j + 1} = {{ ripple = {amplitude}, ripple_order = 200, ripple_phase = {1.1 * j} }}" for j in range(6))
     text = CELL_FILES["demo"].read_text()
     assert text.count("[joints.options]\n") == 1
     path = folder / "demo.toml"
-    path.write_text(
-        text.replace("[joints.options]\n", f"[joints.options]\nmechanics = {{ {', '.join(gears)} }}\n")
-    )
+    path.write_text(text.replace("[joints.options]\n", f"[joints.options]\nmechanics = {{ {', '.join(gears)} }}\n"))
     return path
 
 
@@ -187,9 +178,7 @@ def test_drives_that_take_positions_with_sag_and_play(tmp_path: Path) -> None:
     lines = [f"mechanics.j{j + 1} = {servo}\n" for j in range(6)]
     path = tmp_path / "demo.toml"
     text = CELL_FILES["demo"].read_text()
-    path.write_text(
-        text.replace("[joints.options]\n", '[joints.options]\ndrives = "position"\n' + "".join(lines))
-    )
+    path.write_text(text.replace("[joints.options]\n", '[joints.options]\ndrives = "position"\n' + "".join(lines)))
     result = run_demo(tmp_path / "out", "--lockstep", "--cell", str(path))
     assert [goal["outcome"] for goal in result["goals"]] == ["reached"] * 3
     assert max(goal["final_error_px"] for goal in result["goals"]) <= 0.1
@@ -213,17 +202,13 @@ def test_joints_as_they_are(tmp_path: Path, name: str) -> None:
 @pytest.mark.timeout(len(LOCKSTEP) * len(SEEDS) * TIMEOUT_S)
 @pytest.mark.parametrize("cell", LOCKSTEP)
 def test_another_seed_is_another_model(every_demo: Demos, cell: str) -> None:
-    assert len({Path(every_demo[f"{cell}-{seed}"].result()["model"]).read_bytes() for seed in SEEDS}) == len(
-        SEEDS
-    )
+    assert len({Path(every_demo[f"{cell}-{seed}"].result()["model"]).read_bytes() for seed in SEEDS}) == len(SEEDS)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(len(LOCKSTEP) * len(SEEDS) * TIMEOUT_S)
 @pytest.mark.parametrize("cell", LOCKSTEP)
-def test_calibration_residual_is_the_measurement_noise_pooled_over_seeds(
-    every_demo: Demos, cell: str
-) -> None:
+def test_calibration_residual_is_the_measurement_noise_pooled_over_seeds(every_demo: Demos, cell: str) -> None:
     """Sum of squared residuals in sigmas against chi-square with measurements less parameters, both summed."""
     results = [every_demo[f"{cell}-{seed}"].result()["calibration"] for seed in SEEDS]
     total, freedom = sum(r["chi2"] for r in results), sum(r["degrees_of_freedom"] for r in results)
@@ -237,9 +222,7 @@ def test_calibration_residual_is_the_measurement_noise_pooled_over_seeds(
 @pytest.mark.timeout(TIMEOUT_S)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("cell", REAL_TIME)
-def test_every_cell_without_a_lockstep_does_likewise_in_real_processes(
-    tmp_path: Path, cell: str, seed: int
-) -> None:
+def test_every_cell_without_a_lockstep_does_likewise_in_real_processes(tmp_path: Path, cell: str, seed: int) -> None:
     result = run_demo(tmp_path, "--cell", cell, "--seed", str(seed))
     check(result)
     assert result["lockstep"] is False

@@ -141,9 +141,7 @@ def test_velocities_and_path_are_those_given(data):
             np.testing.assert_array_equal(axis.lines[j].get_ydata(), shown.velocities[:, j])
     figure = draw_paths(data.goals)
     distance = figure.axes[2].lines[0].get_ydata()
-    assert distance.max() == pytest.approx(
-        1e3 * 0.003 * np.sqrt(0.72), rel=1e-3
-    )  # across the line: (0.6, −0.6, 0)
+    assert distance.max() == pytest.approx(1e3 * 0.003 * np.sqrt(0.72), rel=1e-3)  # across the line: (0.6, −0.6, 0)
 
 
 def test_residual_histograms_count_every_finite_residual(data):

@@ -36,10 +36,7 @@ def rows_of(answer, **conditions):
 def half_turn():
     classical = [BenchmarkRun("centred", "free", law, model) for law, (model, _) in CLASSICAL.items()]
     cartesian = [BenchmarkRun("aside", "free", law) for law in CARTESIAN]
-    steps = [
-        BenchmarkRun("aside", "free", "cartesian3", gain=2.0, step=step)
-        for step in ("corrected", "first order")
-    ]
+    steps = [BenchmarkRun("aside", "free", "cartesian3", gain=2.0, step=step) for step in ("corrected", "first order")]
     return run_benchmark_180(seed=0, progress=silent, runs=[*classical, *cartesian, *steps, COMPARED[1]])
 
 
@@ -104,8 +101,7 @@ def test_classical_laws_show_the_back_or_run_far_away(half_turn):
 
 def test_the_corrected_step_leaves_the_line_less(half_turn):
     corrected, first = (
-        rows_of(half_turn, gain=2.0, step=step)[0]["line_deviation_mm"]
-        for step in ("corrected", "first order")
+        rows_of(half_turn, gain=2.0, step=step)[0]["line_deviation_mm"] for step in ("corrected", "first order")
     )
     assert first > 1.5 * corrected
 
@@ -126,9 +122,7 @@ def test_benchmark_figures_and_tables(half_turn, tmp_path):
     console = Console(record=True, width=300)
     EXPERIMENTS["benchmark-180"].show(half_turn, console)
     json.dumps(half_turn, allow_nan=False)
-    assert all(
-        path.stat().st_size > 10_000 for path in EXPERIMENTS["benchmark-180"].draw(half_turn, tmp_path)
-    )
+    assert all(path.stat().st_size > 10_000 for path in EXPERIMENTS["benchmark-180"].draw(half_turn, tmp_path))
 
 
 def test_verdicts_of_the_benchmark_are_the_known_ones(half_turn):
@@ -146,9 +140,7 @@ def test_an_rx90_is_placed_where_it_drives_the_benchmark():
     assert placed_rx90(task, 0, tries=1) is None
     runs = [BenchmarkRun("aside", "rx90", law) for law in CARTESIAN]
     runs.append(BenchmarkRun("aside", "rx90", "cartesian3", gain=1.0, step="first order"))
-    runs.append(
-        BenchmarkRun("aside", "rx90", "cartesian3", gain=1.0, step="first order", joint_speed_deg_s=5.0)
-    )
+    runs.append(BenchmarkRun("aside", "rx90", "cartesian3", gain=1.0, step="first order", joint_speed_deg_s=5.0))
     answer = run_benchmark_180(seed=0, progress=silent, runs=runs)
     assert all(row["converged"] and row["face_visible"] for row in answer["rows"])
     free, limited = (row["line_deviation_mm"] for row in answer["rows"][-2:])
@@ -194,9 +186,7 @@ def test_extraction_is_lost_on_the_hard_task_where_the_kinematics_do_not_predict
     assert own["final_error_px"] < 0.05
     assert own["prediction_worst_px"] < 1.0 < coarse["prediction_worst_px"]
     assert all(row["extraction_rms_px"] < 0.1 for row in abc["rendered"])
-    assert all(
-        row["converged"] and row["incomplete_frames"] == 0 for key, row in runs.items() if key[0] != "B"
-    )
+    assert all(row["converged"] and row["incomplete_frames"] == 0 for key, row in runs.items() if key[0] != "B")
 
 
 def test_verdicts_of_the_tasks_are_the_known_ones(abc):

@@ -41,9 +41,7 @@ def test_the_tasks_are_what_their_names_say():
         turn = task.start[:3, :3] @ task.goal[:3, :3].T
         angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
         assert angle == pytest.approx(task.angle_deg, abs=1e-3)
-        assert np.linalg.norm(task.start[:3, 3] - task.goal[:3, 3]) == pytest.approx(
-            task.distance_m, abs=1e-5
-        )
+        assert np.linalg.norm(task.start[:3, 3] - task.goal[:3, 3]) == pytest.approx(task.distance_m, abs=1e-5)
     assert round(tasks["large"].angle_deg) == 132
     assert tasks["roll"].angle_deg == 180.0
     for pose in (tasks["roll"].start, tasks["roll"].goal):
@@ -117,16 +115,13 @@ def test_the_marker_comes_onto_the_line(exact):
         normal = np.array([a[1] - b[1], b[0] - a[0]]) / np.linalg.norm(b - a)
         for drive in (on_line.alone, on_line.with_second):
             assert abs(normal @ (drive.pixels[-1, camera, 0] - a)) < 0.5
-    away = [
-        np.abs(drive.pixels[-1] - on_line.set_points).mean() for drive in (on_line.alone, on_line.with_second)
-    ]
+    away = [np.abs(drive.pixels[-1] - on_line.set_points).mean() for drive in (on_line.alone, on_line.with_second)]
     assert away[1] < 0.5 * away[0]
 
 
 def test_feed_forward_takes_the_lag_away(exact):
     streamed = laws_compared.streamed(exact)
     lag = [
-        np.abs(drive.pixels[-50:] - streamed.target[-50:]).max()
-        for drive in (streamed.fed_forward, streamed.without)
+        np.abs(drive.pixels[-50:] - streamed.target[-50:]).max() for drive in (streamed.fed_forward, streamed.without)
     ]
     assert lag[0] < 0.1 * lag[1]

@@ -39,9 +39,7 @@ def test_carried_cameras_go_ten_centimetres_and_ten_degrees_and_see_the_body_all
     np.testing.assert_allclose(begun, PLACES[name][1].matrix, atol=1e-9)
     way = np.linalg.inv(begun) @ ended
     assert np.linalg.norm(way[:3, 3]) == pytest.approx(0.10)
-    assert np.degrees(np.arccos((np.trace(way[:3, :3]) - 1) / 2)) == pytest.approx(
-        np.linalg.norm(PATHS[name].turn_deg)
-    )
+    assert np.degrees(np.arccos((np.trace(way[:3, :3]) - 1) / 2)) == pytest.approx(np.linalg.norm(PATHS[name].turn_deg))
     for share in np.linspace(0.0, 1.0, 5):
         camera = world.camera(view, 0.0, carried_to(name, share))
         for q in (world.base, GOAL, 0.5 * (world.base + GOAL)):

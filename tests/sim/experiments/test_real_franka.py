@@ -57,9 +57,7 @@ def render(quad, tag, rng, blur=0.6, noise=1.5, scale=8):
     print_ = np.pad(
         cv2.aruco.generateImageMarker(dictionary, tag, 6 * cell).astype(np.float32), cell, constant_values=255
     )
-    corners = (
-        np.array([[1, 1], [7, 1], [7, 7], [1, 7]]) * cell - 0.5
-    )  # of the print: edges between its pixels
+    corners = np.array([[1, 1], [7, 1], [7, 7], [1, 7]]) * cell - 0.5  # of the print: edges between its pixels
     fine = (quad + 0.5) * scale - 0.5
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), fine.astype(np.float32))
     size = (WIDTH * scale, HEIGHT * scale)
@@ -76,9 +74,7 @@ def truth():
     rng = np.random.default_rng(7)
     poses = np.tile(np.eye(4), (14, 1, 1))
     for i, pose in enumerate(poses):
-        down = Rotation.from_euler(
-            "zyx", [40 * (i % 5 - 2), 12 * (i % 3 - 1), 180 - 55 + 9 * (i % 4)], degrees=True
-        )
+        down = Rotation.from_euler("zyx", [40 * (i % 5 - 2), 12 * (i % 3 - 1), 180 - 55 + 9 * (i % 4)], degrees=True)
         pose[:3, :3] = down.as_matrix()
         pose[:3, 3] = np.array([0.45, 0.0, 0.35]) + rng.uniform(-0.1, 0.1, 3)
     tilted = Rotation.from_euler("x", 20, degrees=True).apply(QUAD * [1, -1, 1])

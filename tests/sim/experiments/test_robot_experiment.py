@@ -88,12 +88,8 @@ def test_bound_halves_with_the_noise_and_falls_with_the_stops():
     cell = thesis_cell()
     rng = np.random.default_rng(0)
     few = np.sqrt(np.diag(cramer_rao(cell, cell.trials(SIGMA, rng, positions=trial_motions(cell, stops=6)))))
-    fine = np.sqrt(
-        np.diag(cramer_rao(cell, cell.trials(SIGMA / 2, rng, positions=trial_motions(cell, stops=6))))
-    )
-    many = np.sqrt(
-        np.diag(cramer_rao(cell, cell.trials(SIGMA, rng, positions=trial_motions(cell, stops=12))))
-    )
+    fine = np.sqrt(np.diag(cramer_rao(cell, cell.trials(SIGMA / 2, rng, positions=trial_motions(cell, stops=6)))))
+    many = np.sqrt(np.diag(cramer_rao(cell, cell.trials(SIGMA, rng, positions=trial_motions(cell, stops=12)))))
     np.testing.assert_allclose(fine, few / 2, rtol=1e-3)
     assert (many < few).all()
 
@@ -136,9 +132,7 @@ def test_verdicts_of_the_tables_are_the_known_ones(answer):
 def test_implied_noise_is_that_of_table_51_and_its_bound_of_a_link_lies_above_the_thesis(answer):
     """With free points; the thesis's mean over its six axes."""
     free = [row for row in answer["implied"]["rows"] if row["table"] == "5.1" and "free" in row["condition"]]
-    assert np.mean([row["ours"]["median"] for row in free]) == pytest.approx(
-        np.mean(THESIS["5.1"]["free"]), rel=0.02
-    )
+    assert np.mean([row["ours"]["median"] for row in free]) == pytest.approx(np.mean(THESIS["5.1"]["free"]), rel=0.02)
     cell = thesis_cell(IMPLIED_BASELINE)
     motions = trial_motions(cell)
     bound = cramer_rao(cell, cell.trials(IMPLIED_SIGMA, np.random.default_rng(0), positions=motions))

@@ -59,9 +59,7 @@ def test_the_head_is_that_of_the_thesis():
     assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(BASELINE)
     axes = [pose[2, :3] for pose in cell.poses]
     assert np.degrees(np.arccos(axes[0] @ axes[1])) == pytest.approx(15.0)
-    assert np.linalg.norm(cell.markers(cell.home[None])[0, :, :3].mean(axis=0)) == pytest.approx(
-        DISTANCE, rel=1e-6
-    )
+    assert np.linalg.norm(cell.markers(cell.home[None])[0, :, :3].mean(axis=0)) == pytest.approx(DISTANCE, rel=1e-6)
     pan, tilt = trajectories(cell)
     assert np.allclose(np.degrees(np.diff(pan, axis=0)), [1.0, 0.0])
     assert np.allclose(np.degrees(np.diff(tilt, axis=0)), [0.0, 1.0])
@@ -177,9 +175,7 @@ def test_pan_tilt_answers_and_draws(tmp_path):
     for row in answer["rows"]:
         # Two rotations by themselves, as in the thesis, do as well on their own trajectories; more noise is common.
         assert row["separate_rotations_delta_lr"]["median"] < 1.5 * row["delta_lr"]["median"]
-    assert all(
-        path.stat().st_size > 10_000 for path in EXPERIMENTS["pan-tilt"].draw(answer, tmp_path / "new")
-    )
+    assert all(path.stat().st_size > 10_000 for path in EXPERIMENTS["pan-tilt"].draw(answer, tmp_path / "new"))
     assert len(answer["example"]["feed-forward"]["pairs"]) == 35
     for row in answer["rendered"]:
         assert row["points"] > 80

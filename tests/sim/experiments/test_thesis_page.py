@@ -76,9 +76,7 @@ def test_no_experiment_of_the_thesis_prints_raw_json():
 def test_verdicts_of_the_inverse_kinematics_are_the_known_ones():
     experiment = EXPERIMENTS["inverse-kinematics"]
     compared = experiment.compare(experiment.run(0, {"seeds": 10}, silent))
-    assert {(row.item, row.what) for row in compared} == {
-        key[1:] for key in KNOWN if key[0] == experiment.name
-    }
+    assert {(row.item, row.what) for row in compared} == {key[1:] for key in KNOWN if key[0] == experiment.name}
     assert changed(experiment.name, compared) == []
 
 

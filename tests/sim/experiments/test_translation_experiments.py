@@ -68,9 +68,7 @@ def test_measures_are_zero_for_any_affine_image_of_the_truth_and_known_where_one
     longer = X.copy()
     longer[k] = X[i] + 1.1 * (X[k] - X[i])
     only = ratio_error(longer, X, triplets[:1])
-    assert only == pytest.approx(
-        1e3 * 0.2 * np.linalg.norm(X[k] - X[i]) / 2
-    )  # ratio 2.2 for 2, half a length
+    assert only == pytest.approx(1e3 * 0.2 * np.linalg.norm(X[k] - X[i]) / 2)  # ratio 2.2 for 2, half a length
     assert distance_error(longer, X) > 0.1
 
 
@@ -123,9 +121,7 @@ def test_more_motions_and_less_noise_lower_the_bound():
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
 def test_gripper_stands_at_its_bound(gripper, structure, sigma):
     for m in (2, 4):
-        (row,) = rows_of(
-            gripper, sigma_px=sigma, motions=m, structure=structure, method="non-linear, free points"
-        )
+        (row,) = rows_of(gripper, sigma_px=sigma, motions=m, structure=structure, method="non-linear, free points")
         assert row["failed"] == 0
         # Errors spread by about half of their mean over seeds: three standard errors of 30 seeds.
         assert 0.7 < row["ratio_to_bound"] < 1.3
@@ -165,9 +161,7 @@ def test_gripper_non_linear_is_better_than_linear_and_motions_help(gripper):
         (row,) = rows_of(gripper, sigma_px=2.0, motions=m, structure="upgrade only", method=method)
         return row["e_d_mm"]["median"]
 
-    assert (
-        median("non-linear, free points", 4) < median("linear", 4) < median("linear, reconstructed points", 4)
-    )
+    assert median("non-linear, free points", 4) < median("linear", 4) < median("linear, reconstructed points", 4)
     assert median("non-linear, free points", 4) < median("non-linear, free points", 1)
 
 
@@ -180,9 +174,7 @@ def test_gripper_draws_both_measures(gripper, tmp_path):
 def test_grid_as_the_thesis_reports_it(grid):
     def means(estimate, method, structure, motions):
         rows = [
-            r
-            for r in rows_of(grid, estimate=estimate, method=method, structure=structure)
-            if r["motion"] in motions
+            r for r in rows_of(grid, estimate=estimate, method=method, structure=structure) if r["motion"] in motions
         ]
         assert len(rows) == len(motions)
         return np.array([r["e_d_mm"]["mean"] for r in rows])
@@ -233,13 +225,9 @@ def test_house_upgrades_the_grid_to_below_a_millimetre():
         assert row["failed"] == 0
         assert row["e_d_mm"]["p84"] < 1.0
     all_motions = rows_of(answer, method="non-linear", structure="upgrade only", motions=17)
-    assert np.mean([r["e_d_mm"]["mean"] / r["bound_e_d_mm"] for r in all_motions]) == pytest.approx(
-        1, abs=0.35
-    )
+    assert np.mean([r["e_d_mm"]["mean"] / r["bound_e_d_mm"] for r in all_motions]) == pytest.approx(1, abs=0.35)
     for row in rows_of(answer, method="linear", structure="upgrade only"):
-        (beside,) = rows_of(
-            answer, **{k: row[k] for k in ("sigma_px", "motions", "structure")}, method="non-linear"
-        )
+        (beside,) = rows_of(answer, **{k: row[k] for k in ("sigma_px", "motions", "structure")}, method="non-linear")
         assert beside["e_d_mm"]["median"] < row["e_d_mm"]["median"]
 
 

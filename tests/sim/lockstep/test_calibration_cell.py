@@ -75,9 +75,7 @@ def test_a_cell_without_ranges_calibrates_to_the_noise_floor(calibrated: Calibra
 def test_a_spread_joint_gives_every_trial_several_positions_of_the_body(tmp_path: Path) -> None:
     spread = {"joint": "j6", "positions": 3, "range": 0.5}
     ranges = dict(zip(NAMES, (0.2, 0.2, 0.2, 0.5, 0.4, 0.6), strict=True))
-    with LockstepCell(
-        cell_file(range=ranges, spread=spread, stops=5), cell_dir=tmp_path, runtime_dir=tmp_path
-    ) as cell:
+    with LockstepCell(cell_file(range=ranges, spread=spread, stops=5), cell_dir=tmp_path, runtime_dir=tmp_path) as cell:
         cell.run_for(0.5)
         operator = LockstepOperator(cell)
         operator.enable()

@@ -93,9 +93,7 @@ def test_trial_motions_are_done(operated: tuple[LockstepOperator, TrueJointHisto
     cell = operator.cell
     since = cell.events[-1].seq
     assert cell.submit(Calibrate("0000cafe")).accepted
-    end = cell.wait_for(
-        lambda event: event.kind in ("calibration_finished", "calibration_aborted"), 600.0, since
-    )
+    end = cell.wait_for(lambda event: event.kind in ("calibration_finished", "calibration_aborted"), 600.0, since)
     assert end.kind == "calibration_finished", end.message
     stops = [event for event in cell.events if event.kind == "calibration_sample"]
     assert len(stops) == 1 + 4 * 6 + 16

@@ -32,9 +32,7 @@ SHIPPED = load_cell_file(shipped_cell_path("conveyor"))
 
 def with_fakes(cell: CellFile) -> CellFile:
     cameras = tuple(
-        msgspec.structs.replace(
-            camera, driver="fake", detector="", detector_options={}, options={"noise_px": 0.1}
-        )
+        msgspec.structs.replace(camera, driver="fake", detector="", detector_options={}, options={"noise_px": 0.1})
         for camera in cell.camera
     )
     joints = msgspec.structs.replace(cell.joints, driver="fake", options={})
@@ -112,9 +110,7 @@ def test_part_is_met_carried_through_a_drop_out_and_reached_when_it_stands(tmp_p
         camera.blackout = False
     flight.cell.run_for(1.5)
     after = flight.largest_px(1.0)
-    print(
-        f"seed {SEED}: {steady:.2f} px at most, {blind:.2f} px in a drop-out of 0.3 s, {after:.2f} px after it"
-    )
+    print(f"seed {SEED}: {steady:.2f} px at most, {blind:.2f} px in a drop-out of 0.3 s, {after:.2f} px after it")
     assert steady <= 1.0
     assert blind <= 3.0
     assert after <= 1.0

@@ -89,9 +89,7 @@ def fly(tmp_path: Path, cell: CellFile, record: bool = False) -> Flown:
         seen.extend(inputs.observations)
 
     writers: list[ImageWriter] = []
-    with LockstepCell(
-        cell, cell_dir=tmp_path, runtime_dir=tmp_path, recording=recording, on_step=watch
-    ) as live:
+    with LockstepCell(cell, cell_dir=tmp_path, runtime_dir=tmp_path, recording=recording, on_step=watch) as live:
         if record:
             (tmp_path / "flight.images").mkdir()
             writers = record_pictures(live, tmp_path / "flight.images")

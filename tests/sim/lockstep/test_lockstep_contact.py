@@ -49,9 +49,7 @@ def fake_cell(contact: dict[str, Any]) -> CellFile:
 
 def to(cell: LockstepCell, **offsets: float) -> RunGoal:
     start = dict(zip(NAMES, demo_cell().base.tolist(), strict=True))
-    return RunGoal(
-        Goal("0000abcd", JointTarget({name: start[name] + offsets.get(name, 0.0) for name in NAMES}))
-    )
+    return RunGoal(Goal("0000abcd", JointTarget({name: start[name] + offsets.get(name, 0.0) for name in NAMES})))
 
 
 def codes(cell: LockstepCell) -> list[str]:
@@ -80,9 +78,7 @@ def test_calibration_teaches_what_the_drives_tell(calibrated: CellModel) -> None
     assert not loads.largest_efforts.any()
 
 
-def test_learnt_following_errors_stop_a_blocked_arm_and_let_it_go_back(
-    calibrated: CellModel, tmp_path: Path
-) -> None:
+def test_learnt_following_errors_stop_a_blocked_arm_and_let_it_go_back(calibrated: CellModel, tmp_path: Path) -> None:
     recording = tmp_path / "flight.mcap"
     with LockstepCell(fake_cell({}), cell_dir=tmp_path, runtime_dir=tmp_path, recording=recording) as cell:
         driver: Any = cell.joints
@@ -97,9 +93,7 @@ def test_learnt_following_errors_stop_a_blocked_arm_and_let_it_go_back(
         driver.faults.block_after = 1
         event = cell.wait_for(lambda e: e.id == "0000abcd" and e.kind == "goal_aborted", 0.1)
         assert (event.reasons[0].code, event.reasons[0].subject) == ("CONTACT_FOLLOWING", "j1")
-        assert event.reasons[0].threshold == pytest.approx(
-            0.5 / 250.0, rel=0.01
-        )  # the floor: one cycle's way
+        assert event.reasons[0].threshold == pytest.approx(0.5 / 250.0, rel=0.01)  # the floor: one cycle's way
         cell.run_for(1.0)
         assert cell.status is not None
         assert cell.status.lifecycle == "active"

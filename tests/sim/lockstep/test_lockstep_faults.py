@@ -221,9 +221,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellModel, Any
 
 
 @pytest.fixture(params=LINKS)
-def flight(
-    request: pytest.FixtureRequest, calibrated: tuple[CellModel, Any], tmp_path: Path
-) -> Iterator[Flight]:
+def flight(request: pytest.FixtureRequest, calibrated: tuple[CellModel, Any], tmp_path: Path) -> Iterator[Flight]:
     """A cell on its way to the goal, on each kind of links."""
     flight = Flight(tmp_path, LINKS[request.param](tmp_path), *calibrated)
     yield flight
@@ -284,12 +282,8 @@ FAULTS = {
     "write": Fault(fault(fail_write=1), "DRIVER_FAULT", "fault", ("stop", "stop", "deactivate")),
     "read": Fault(fault(fail_read=1), "DRIVER_FAULT", "fault", ("stop", "stop", "deactivate")),
     "encoder and stamp stand still": Fault(fault(freeze_encoder_after=1), "JOINTS_STALE", "active"),
-    "encoder stands still": Fault(
-        fault(stuck_encoder_after=1), "JOINT_NOT_FOLLOWING", "fault", ("stop", "deactivate")
-    ),
-    "commands do not arrive": Fault(
-        fault(drop_writes_after=1), "JOINT_NOT_FOLLOWING", "fault", ("stop", "deactivate")
-    ),
+    "encoder stands still": Fault(fault(stuck_encoder_after=1), "JOINT_NOT_FOLLOWING", "fault", ("stop", "deactivate")),
+    "commands do not arrive": Fault(fault(drop_writes_after=1), "JOINT_NOT_FOLLOWING", "fault", ("stop", "deactivate")),
     "cameras": Fault(blackout, "FEATURES_STALE", "active"),
     "joint stamps an hour ahead": Fault(stamps_of_the_future, "JOINT_STAMP", "active"),
     "frames an hour ahead": Fault(frames_of_the_future, "CAMERA_STAMP", "active"),
@@ -392,9 +386,7 @@ def test_a_camera_that_fails_is_reported_opened_again_and_the_goal_reached(fligh
     camera.poll = lost
     flight.cell.run_for(1.0)
     camera.poll = poll
-    event = flight.cell.wait_for(
-        lambda e: e.id == flight.goal.id and e.kind in ("goal_reached", "goal_aborted"), 30.0
-    )
+    event = flight.cell.wait_for(lambda e: e.id == flight.goal.id and e.kind in ("goal_reached", "goal_aborted"), 30.0)
     assert event.kind == "goal_reached"
     assert flight.cell.reports == [
         ("camera_lost", "camera right: the cable is out; trying again"),
@@ -407,9 +399,7 @@ def test_both_cameras_dark_for_two_seconds_changes_nothing_of_the_outcome(flight
     flight.cell.run_for(2.0)
     for camera in flight.cameras:
         camera.blackout = False
-    event = flight.cell.wait_for(
-        lambda e: e.id == flight.goal.id and e.kind in ("goal_reached", "goal_aborted"), 30.0
-    )
+    event = flight.cell.wait_for(lambda e: e.id == flight.goal.id and e.kind in ("goal_reached", "goal_aborted"), 30.0)
     assert event.kind == "goal_reached"
 
 

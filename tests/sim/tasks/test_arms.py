@@ -105,9 +105,7 @@ def test_free_arm_is_known_at_a_tasks_start_from_its_own_readings(drawn, kind):
             HOMOGENEOUS_MARKERS @ task.start.T,
         )
         X = np.einsum("cij,mj->cmi", camera_matrices(), HOMOGENEOUS_MARKERS @ task.start.T)
-        J = (truth[..., :2, :] - (X[..., :2] / X[..., 2:])[..., None] * truth[..., 2:, :]) / X[
-            ..., 2, None, None
-        ]
+        J = (truth[..., :2, :] - (X[..., :2] / X[..., 2:])[..., None] * truth[..., 2:, :]) / X[..., 2, None, None]
         error = np.abs(operators_in_images(knowledge, knowledge.points) - J).max() / np.abs(J).max()
         assert off < (1e-8 if kind == "exact" else 1.0)
         assert error < (1e-10 if kind == "exact" else 0.01)

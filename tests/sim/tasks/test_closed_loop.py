@@ -64,14 +64,9 @@ def test_the_judge_reads_its_own_trace(public_kind, learnt):
     task = public_kind[3]
     result, trace = run_task(task, learnt, SETTINGS)
     np.testing.assert_allclose(trace.poses[0], task.start)
-    errors = [
-        np.sqrt(((sight(pose).pixels - sight(task.goal).pixels) ** 2).sum(axis=-1)).max()
-        for pose in trace.poses
-    ]
+    errors = [np.sqrt(((sight(pose).pixels - sight(task.goal).pixels) ** 2).sum(axis=-1)).max() for pose in trace.poses]
     np.testing.assert_allclose(trace.errors_px, errors, atol=1e-9)
-    assert result.line_deviation_mm == pytest.approx(
-        1e3 * line_deviations(trace.poses, task.start, task.goal).max()
-    )
+    assert result.line_deviation_mm == pytest.approx(1e3 * line_deviations(trace.poses, task.start, task.goal).max())
     assert (trace.errors_px[result.iterations :] < 0.5).all()
     assert trace.errors_px[result.iterations - 1] >= 0.5
     assert result.final_error_px == pytest.approx(np.mean(errors[-50:]))

@@ -78,9 +78,7 @@ def test_the_cell_that_is_found_shows_the_arm_well(name: str) -> None:
     cell = shipped(name)
     assert seen_by_all(cell, cell.base)
     pose = flange_pose(cell.robot, cell.base)
-    values = np.linalg.svd(
-        body_jacobian(cell.robot, cell.base, pose[:3, 3] + 0.1 * pose[:3, 2]), compute_uv=False
-    )
+    values = np.linalg.svd(body_jacobian(cell.robot, cell.base, pose[:3, 3] + 0.1 * pose[:3, 2]), compute_uv=False)
     assert values[-1] > 0.05 * values[0]
     for q, joint in zip(cell.base, cell.robot.joints, strict=True):
         least = 0.25 if joint.kind == "revolute" else 0.05
@@ -115,9 +113,7 @@ def test_goals_are_seen_on_the_whole_way(name: str) -> None:
 
 
 def test_only_motions_that_make_a_group_go_straight() -> None:
-    assert [name for name in ARMS if not goes_straight(shipped(name).robot, shipped(name).base)] == [
-        "pan_tilt"
-    ]
+    assert [name for name in ARMS if not goes_straight(shipped(name).robot, shipped(name).base)] == ["pan_tilt"]
 
 
 def test_a_gripper_is_no_part_of_the_chain() -> None:
@@ -228,6 +224,4 @@ def test_cameras_on_the_arm_are_carried(tmp_path: Path) -> None:
     q = cell.base + 0.1
     assert np.array_equal(cell.body_pose(q), cell.stand)
     seen = cell.truth_pixels(q)
-    assert (
-        min(np.abs(seen[name] - pixels).max() for name, pixels in cell.truth_pixels(cell.base).items()) > 10.0
-    )
+    assert min(np.abs(seen[name] - pixels).max() for name, pixels in cell.truth_pixels(cell.base).items()) > 10.0

@@ -13,9 +13,7 @@ from stereoservo_sim.world.body import roof_body
 
 def edge_fraction(face: DotFace) -> float:
     """The ratio at which the edge dot divides edge 0-1, from corner 0."""
-    return float(
-        (face.positions[EDGE, 0] - face.positions[0, 0]) / (face.positions[1, 0] - face.positions[0, 0])
-    )
+    return float((face.positions[EDGE, 0] - face.positions[0, 0]) / (face.positions[1, 0] - face.positions[0, 0]))
 
 
 def test_ids_are_unique_and_as_published():

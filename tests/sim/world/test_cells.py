@@ -25,12 +25,8 @@ def test_the_deployed_cell_file_is_the_packaged_one(name: str) -> None:
 
 def test_the_demo_cell_is_the_first() -> None:
     assert demo_cell_path() == shipped_cell_path("demo")
-    assert demo_cell_path().read_text(encoding="utf-8") == (DEPLOYED / "demo.toml").read_text(
-        encoding="utf-8"
-    )
-    with pytest.raises(
-        ValueError, match="no cell 'fisheye' is shipped; there are demo, wide, eye_in_hand, workpiece"
-    ):
+    assert demo_cell_path().read_text(encoding="utf-8") == (DEPLOYED / "demo.toml").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="no cell 'fisheye' is shipped; there are demo, wide, eye_in_hand, workpiece"):
         shipped_cell_path("fisheye")
 
 

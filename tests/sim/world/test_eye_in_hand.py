@@ -41,9 +41,7 @@ def test_pixels_are_opencvs_of_the_body_seen_from_the_flange(k1: float) -> None:
             )
             np.testing.assert_allclose(cell.truth_pixels(q)[camera.name], expected[:, 0], atol=1e-9)
         frame = cell.rig.world_to_rig
-        np.testing.assert_allclose(
-            cell.marker_positions_rig(q), points @ frame[:3, :3].T + frame[:3, 3], atol=1e-12
-        )
+        np.testing.assert_allclose(cell.marker_positions_rig(q), points @ frame[:3, :3].T + frame[:3, 3], atol=1e-12)
 
 
 def test_the_body_stands_and_the_cameras_move() -> None:

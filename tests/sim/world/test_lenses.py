@@ -60,9 +60,7 @@ def test_markers_beyond_the_fold_are_not_seen() -> None:
     assert not (CELL.visible(q, camera) & beyond).any()
 
 
-def disc_moments(
-    camera: PinholeCamera, H: np.ndarray, centre: np.ndarray, radius: float
-) -> tuple[float, np.ndarray]:
+def disc_moments(camera: PinholeCamera, H: np.ndarray, centre: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
     """Area [px²] and centroid (2,) of a disc's raw image, by the midpoint rule in polar coordinates."""
     r = (np.arange(60) + 0.5) / 60 * radius
     t = (np.arange(120) + 0.5) / 120 * 2 * np.pi
@@ -152,9 +150,7 @@ def test_the_background_is_bent_like_the_markers(k1: float) -> None:
     for x, y in ((0.0, 0.0), (0.25, -0.15), (-0.3, 0.2), (0.3, 0.22)):
         point = (np.linalg.inv(pose) @ np.array([x, y, 1.0, 1.0]))[None, :3]
         wanted = camera.image_of(point)[0][0]
-        image = bending.image(blob_image(bending.pinhole, project(bending.pinhole.P, point)[0][0])).astype(
-            float
-        )
+        image = bending.image(blob_image(bending.pinhole, project(bending.pinhole.P, point)[0][0])).astype(float)
         v, u = np.mgrid[0:480, 0:640]
         near = (u - wanted[0]) ** 2 + (v - wanted[1]) ** 2 < 18**2
         found = np.array([(image * u)[near].sum(), (image * v)[near].sum()]) / image[near].sum()
@@ -167,9 +163,7 @@ def test_a_bent_outline_follows_the_lens_and_ends_at_its_rim() -> None:
     square = np.array([[100.0, 80.0], [500, 80], [500, 400], [100, 400]])
     bent = bend_outline(camera, square)
     along = np.linspace(0, 1, 20, endpoint=False)[:, None]  # of 400 px, in pieces of 20 px
-    np.testing.assert_allclose(
-        bent[:20], distort(camera.lens, (1 - along) * square[0] + along * square[1]), atol=1e-9
-    )
+    np.testing.assert_allclose(bent[:20], distort(camera.lens, (1 - along) * square[0] + along * square[1]), atol=1e-9)
     far = bend_outline(camera, 50.0 * (square - camera.K[:2, 2]) + camera.K[:2, 2])
     assert np.isfinite(far).all()
     assert np.linalg.norm(far - camera.K[:2, 2], axis=1).min() > 400  # outside of the image's corners

@@ -68,6 +68,4 @@ def test_an_encoder_on_the_motor_reports_the_motors_velocity():
     drives = bank(ripple=1e-3, ripple_order=100.0)
     run(drives, 0.5, 1000)
     assert np.isclose(drives.plant.reading_rates[0], 0.5)
-    assert np.isclose(
-        drives.plant.velocities[0], 0.5 * (1.0 + 0.1 * np.cos(100.0 * drives.plant.motors[0])), atol=2e-3
-    )
+    assert np.isclose(drives.plant.velocities[0], 0.5 * (1.0 + 0.1 * np.cos(100.0 * drives.plant.motors[0])), atol=2e-3)

@@ -19,9 +19,7 @@ FRICTION = 0.1
 STEP_S = 5e-4
 FAST, SLOW = 0.25, 0.02
 """Of the motor [rad/s]; where friction holds the link it must not get there by its own momentum."""
-LIMITS = (
-    f'limited="true" range="{-0.5 * PLAY} {0.5 * PLAY}" solreflimit="0.004 1" solimplimit="0.95 0.99 0.001"'
-)
+LIMITS = f'limited="true" range="{-0.5 * PLAY} {0.5 * PLAY}" solreflimit="0.004 1" solimplimit="0.95 0.99 0.001"'
 """A tendon whose ends may be the play apart."""
 
 GEARED_LINK = """

@@ -175,9 +175,7 @@ def test_noise_has_its_sigma_and_differs_from_frame_to_frame():
 
 def test_the_same_seed_gives_the_same_image():
     camera = CELL.rig.cameras[1]
-    images = [
-        Renderer(CELL, camera, RenderSettings()).render(CELL.base, np.random.default_rng(3)) for _ in range(2)
-    ]
+    images = [Renderer(CELL, camera, RenderSettings()).render(CELL.base, np.random.default_rng(3)) for _ in range(2)]
     assert np.array_equal(images[0], images[1])
 
 

@@ -76,9 +76,7 @@ def test_a_mimic_joint_on_the_way_to_the_flange_is_refused(tmp_path: Path) -> No
         *serial("j1", "j2", root="stage2_link"),
     ]
     for flange in ("", "j2_link", "stage2_link"):
-        with pytest.raises(
-            UrdfError, match=r"'stage2' mimics 'lift'.*mimic joints.*flange = 'lift_link'"
-        ) as caught:
+        with pytest.raises(UrdfError, match=r"'stage2' mimics 'lift'.*mimic joints.*flange = 'lift_link'") as caught:
             robot_of(tmp_path, rows, flange)
         assert "arm.urdf" in str(caught.value)
     with pytest.raises(UrdfError, match="'stage2' mimics 'lift'"):
@@ -240,9 +238,7 @@ WHOLE = f"""<?xml version="1.0"?>
 </robot>
 """.encode()
 OBJ = b"# a part\n" + 20 * b"v 0.0 0.0 0.0\nv 0.1 0.0 0.0\nv 0.0 0.1 0.2\n" + b"f 1 2 3\n"
-STL = (
-    bytes(80) + (2).to_bytes(4, "little") + 2 * (np.linspace(0.0, 0.5, 12, dtype="<f4").tobytes() + bytes(2))
-)
+STL = bytes(80) + (2).to_bytes(4, "little") + 2 * (np.linspace(0.0, 0.5, 12, dtype="<f4").tobytes() + bytes(2))
 
 
 def parts(folder: Path) -> None:
@@ -284,9 +280,7 @@ def structural_copies(whole: str, count: int, seed: int) -> list[str]:
     for _ in range(count):
         text = whole
         for _ in range(int(rng.integers(1, 4))):
-            pieces = (
-                re.split(r'("[^"]*"|<[^>]*>)', text) if rng.random() < 0.5 else re.split(r'("[^"]*")', text)
-            )
+            pieces = re.split(r'("[^"]*"|<[^>]*>)', text) if rng.random() < 0.5 else re.split(r'("[^"]*")', text)
             k = int(rng.integers(len(pieces) // 2)) * 2 + 1
             match int(rng.integers(4)):
                 case 0:

@@ -100,9 +100,7 @@ def test_the_file_moves_it_and_nonsense_is_refused_with_what_would_be_valid(tmp_
     assert file.now() == Moved()
     MovedFile(tmp_path).write(MOVED)
     assert file.now() == MOVED
-    (tmp_path / FILE_NAME).write_text(
-        '{"shift_m": [0.02, 0, 0.01], "turn_deg": [0, 0, 15]}\n'
-    )  # as from a shell
+    (tmp_path / FILE_NAME).write_text('{"shift_m": [0.02, 0, 0.01], "turn_deg": [0, 0, 15]}\n')  # as from a shell
     assert file.now() == Moved((0.02, 0.0, 0.01), (0.0, 0.0, 15.0))
     for text in (
         "",
@@ -156,9 +154,7 @@ def test_the_detector_finds_it_where_it_is_with_and_without_a_prior_of_the_body(
         image = Renderer(CELL, camera, RenderSettings()).render(SHOWN, np.random.default_rng(3), pose)
         frame = Frame(camera.name, 1, 0, 0, image)
         body = CELL.truth_pixels(SHOWN)[camera.name]
-        prior = Prior(
-            camera.name, 0, np.arange(14), body + 0.5, np.zeros((14, 2)), np.tile(np.eye(2), (14, 1, 1))
-        )
+        prior = Prior(camera.name, 0, np.arange(14), body + 0.5, np.zeros((14, 2)), np.tile(np.eye(2), (14, 1, 1)))
         truth = np.concatenate([body, camera.image_of(PART.marker_positions(pose))[0]])
         detector = DotDetector({"beside": ["c", "d"]}, context(tmp_path))
         assert detector.describe().marker_ids == (*BODY, *STANDING)
@@ -213,14 +209,10 @@ class Bench:
         self.cell = LockstepCell(
             file, cell_dir=path, runtime_dir=path, services={"world": self.history}, on_step=self._heed
         )
-        self.sights = VirtualSights(
-            {d.name: d.systematic_px for d in self.cell.descriptions}, self.cell.clock
-        )
+        self.sights = VirtualSights({d.name: d.systematic_px for d in self.cell.descriptions}, self.cell.clock)
         self.model = model
         self.store = TaughtStore(path / "taught.json")
-        self.teaching = TaughtGoalRegistry(
-            self.store, self.sights, lambda: self.model, EventLog("b", lambda _: None)
-        )
+        self.teaching = TaughtGoalRegistry(self.store, self.sights, lambda: self.model, EventLog("b", lambda _: None))
         self.operator = LockstepOperator(self.cell)
         self.operator._epoch = 0 if model is None else model.epoch
         self.workpiece = MovedFile(path)
@@ -254,8 +246,7 @@ class Bench:
         """Largest distance of the body's markers at joints ``there`` from ``expected`` (m, 3): [mm], [px]."""
         found = self.truth.marker_positions(there)
         pixels = [
-            np.linalg.norm(c.image_of(found)[0] - c.image_of(expected)[0], axis=1)
-            for c in self.truth.rig.cameras
+            np.linalg.norm(c.image_of(found)[0] - c.image_of(expected)[0], axis=1) for c in self.truth.rig.cameras
         ]
         return float(1e3 * np.linalg.norm(found - expected, axis=1).max()), float(np.max(pixels))
 

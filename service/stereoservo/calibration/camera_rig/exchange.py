@@ -64,9 +64,7 @@ def load_opencv(path: Path) -> tuple[RigCamera, ...]:
         return None
 
     def number(name: str, k: int) -> int:
-        node = next(
-            (n for n in (storage.getNode(f"{name}{k}"), storage.getNode(name)) if not n.empty()), None
-        )
+        node = next((n for n in (storage.getNode(f"{name}{k}"), storage.getNode(name)) if not n.empty()), None)
         return 0 if node is None else int(node.real())
 
     if (single := matrix("camera_matrix")) is not None:
@@ -282,18 +280,12 @@ def _camera(
     if len(distortion) > 5 and any(distortion[5:]):
         raise _bad(path, f"camera {name!r} has {len(distortion)} coefficients; k1, k2, p1, p2, k3 are valid")
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 1] != 0.0:
-        raise _bad(
-            path, f"camera {name!r}: a finite camera matrix (3, 3) without skew is needed, got {K.tolist()}"
-        )
+        raise _bad(path, f"camera {name!r}: a finite camera matrix (3, 3) without skew is needed, got {K.tolist()}")
     R = np.eye(3) if R is None else R
     if not np.abs(R.T @ R - np.eye(3)).max() < ROTATION or np.linalg.det(R) < 0:
         raise _bad(path, f"camera {name!r}: {R.tolist()} is no rotation")
     x, y, z = (0.0, 0.0, 0.0) if t is None else t.ravel().tolist()
-    kept = (
-        distortion[:5]
-        if len(distortion) >= 5 and distortion[4] != 0.0
-        else [*distortion, 0.0, 0.0, 0.0, 0.0][:4]
-    )
+    kept = distortion[:5] if len(distortion) >= 5 and distortion[4] != 0.0 else [*distortion, 0.0, 0.0, 0.0, 0.0][:4]
     return RigCamera(
         name, *size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])), tuple(kept),
         tuple(map(tuple, R.tolist())), (x, y, z),

@@ -92,9 +92,7 @@ def _start_of_layout(views: RigViews) -> RigStart:
     lenses = np.array([_line_lens(views, k) for k in range(len(views.cameras))])
     frame, plane = _in_plane(views.layout)
     homographies = plane_homographies(views, lenses, plane)
-    focals = np.array(
-        [_focal(views, k, homographies[k]) for k in range(len(views.cameras))], dtype=np.float64
-    )
+    focals = np.array([_focal(views, k, homographies[k]) for k in range(len(views.cameras))], dtype=np.float64)
     c, s = homographies.shape[:2]
     poses = np.full((c, s, 4, 4), np.nan)
     for k in range(c):
@@ -269,10 +267,7 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
     linear, _ = intrinsics_linear(turning, np.ones(len(turning), dtype=bool), np.ones(len(turning)))
     focals = [] if linear is None else [float(np.sqrt(linear[0, 0] * linear[1, 1]))]
     focals = [f for f in focals if FOCAL_RANGE[0] <= f <= FOCAL_RANGE[1]] + list(NOMINAL_FOCALS)
-    return [
-        _metric_start(views, cameras, points, reference, scaled, nominal_intrinsics(f), lenses)
-        for f in focals
-    ]
+    return [_metric_start(views, cameras, points, reference, scaled, nominal_intrinsics(f), lenses) for f in focals]
 
 
 def _displacements(points: FloatArray, reference: int) -> FloatArray:

@@ -68,9 +68,7 @@ class RigCamera(msgspec.Struct, frozen=True):
     @property
     def matrix(self) -> FloatArray:
         """``K`` (3, 3)."""
-        return np.array(
-            [[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]]
-        )
+        return np.array([[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]])
 
     @property
     def motion(self) -> FloatArray:
@@ -244,9 +242,7 @@ def _require_determined(result: RigCalibration) -> None:
             ("pair_open", "the rotation from the first camera", turn, PAIR_DEVIATION, "°"),
         ):
             if not value <= limit:
-                raise refused(
-                    code, f"{what} of {camera.name!r} stays open: deviation", value, limit, unit, WAVE
-                )
+                raise refused(code, f"{what} of {camera.name!r} stays open: deviation", value, limit, unit, WAVE)
 
 
 # -- the result ---------------------------------------------------------------------------------------------
@@ -447,18 +443,14 @@ def _rows(
     depths = fit.poses[:, 2, 3]
     depth = share * float(np.median(depths))
     middle = fit.points.mean(axis=0)
-    ray = np.array(
-        [place[0] * camera.width / camera.focal[0], place[1] * camera.height / camera.focal[1], 1.0]
-    )
+    ray = np.array([place[0] * camera.width / camera.focal[0], place[1] * camera.height / camera.focal[1], 1.0])
     turn = Rotation.from_euler("xy", tilt, degrees=True).as_matrix() @ _facing(fit, k)
     scale = float(np.linalg.norm(motions[k][:3, 3]))
     shift = motions[k][:3, 3] * (1.0 if fit.length_known or not scale else _unit(fit, k) / scale)
     R = motions[k][:3, :3]
     centre = R.T @ (depth * ray - shift)
     pose_turn = R.T @ turn
-    offsets = np.append(
-        centre - pose_turn @ middle, Rotation.from_matrix(pose_turn @ fit.body_frame).as_euler("XYZ")
-    )
+    offsets = np.append(centre - pose_turn @ middle, Rotation.from_matrix(pose_turn @ fit.body_frame).as_euler("XYZ"))
     c, m = len(result.cameras), len(fit.points)
     cameras, markers = (grid.ravel() for grid in np.meshgrid(np.arange(c), np.arange(m), indexing="ij"))
     noise = fit.data.joint_noise

@@ -79,9 +79,7 @@ def usable_views(views: RigViews) -> RigViews:
     """
     c, s, m = views.sigmas.shape
     if views.pixels.shape != (c, s, m, 2) or len(views.cameras) != c or len(views.marker_ids) != m:
-        raise CalibrationError(
-            "bad_data", f"pixels {views.pixels.shape} and sigmas {views.sigmas.shape} do not fit"
-        )
+        raise CalibrationError("bad_data", f"pixels {views.pixels.shape} and sigmas {views.sigmas.shape} do not fit")
     if not (views.sigmas[views.seen] > 0.0).all():
         raise CalibrationError("bad_data", "sigmas must be positive where there is a pixel")
     rich = views.seen.sum(axis=2) >= LEAST_MARKERS
@@ -104,9 +102,7 @@ def _require_stops(views: RigViews) -> None:
             )  # fmt: skip
     reached = {0}
     for _ in views.cameras:
-        reached |= {
-            k for k in range(len(views.cameras)) if any((by_camera[k] & by_camera[j]).any() for j in reached)
-        }
+        reached |= {k for k in range(len(views.cameras)) if any((by_camera[k] & by_camera[j]).any() for j in reached)}
     apart = [camera.name for k, camera in enumerate(views.cameras) if k not in reached]
     if apart:
         raise refused(

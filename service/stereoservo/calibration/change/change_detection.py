@@ -110,9 +110,7 @@ def diagnose(
         if h < 1:
             return None
         kind, index = hypothesis_subject(h, cameras, markers, joints)
-        return IsolatedChange(
-            kind, index, int(sizes[h]), float(chi2[h]), float(amounts[h]), float(effects[h])
-        )
+        return IsolatedChange(kind, index, int(sizes[h]), float(chi2[h]), float(amounts[h]), float(effects[h]))
 
     return ChangeDiagnosis(
         KINDS[int(answer[0])],

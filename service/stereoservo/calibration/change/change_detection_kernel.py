@@ -200,9 +200,7 @@ def hypothesis_sizes(
         sizes[cameras + 2 + p] = min(2 * views, 3)
     for j in range(joints):
         sizes[cameras + 2 + markers + j] = 1 if of_arm >= 1 + SPARE else 0
-    sizes[cameras + 2 + markers + joints] = (
-        joints if 1 < joints <= MAX_SIZE and of_arm >= joints + SPARE else 0
-    )
+    sizes[cameras + 2 + markers + joints] = joints if 1 < joints <= MAX_SIZE and of_arm >= joints + SPARE else 0
     return total
 
 
@@ -267,9 +265,7 @@ def _predict(shown: Fields, pixels: FloatArray, observed: FloatArray) -> tuple[f
 
 
 @kernel
-def explain_innovations(
-    seen: Fields, thresholds: FloatArray, log_alpha: float, least_px: float, found: Fields
-) -> None:
+def explain_innovations(seen: Fields, thresholds: FloatArray, log_alpha: float, least_px: float, found: Fields) -> None:
     """Estimates of all hypotheses and the decision among them, into ``found``, the fields of `Explanations`; ``seen``:
     those of `Innovations`. ``thresholds``, ``log_alpha`` and ``least_px`` are those of a `hypothesis_test.Thresholds`.
     """
@@ -320,18 +316,10 @@ def explain_innovations(
     answer[0], answer[1] = _kind(first, cameras, markers, joints), first
     if is_unexplained(chi2[first], total - sizes[first], log_alpha, EXPLAINED * whole):
         answer[0] = UNEXPLAINED
-    if (
-        answer[0] == JOINT
-        and second >= 0
-        and sizes[second] > 1
-        and _kind(second, cameras, markers, joints) != MARKER
-    ):
+    if answer[0] == JOINT and second >= 0 and sizes[second] > 1 and _kind(second, cameras, markers, joints) != MARKER:
         # The motion of one joint is a displacement, too: what contains it and costs more is no rival.
         return
-    if (
-        second >= 0
-        and (chi2[second] - chi2[first]) / noise + (sizes[second] - sizes[first]) * penalty < UNCLEAR
-    ):
+    if second >= 0 and (chi2[second] - chi2[first]) / noise + (sizes[second] - sizes[first]) * penalty < UNCLEAR:
         answer[2] = second
 
 
@@ -353,9 +341,7 @@ class CameraPoints(NamedTuple):
 
 
 @kernel
-def _equations(
-    E: FloatArray, points: CameraPoints, count: int, equations: NormalSystem, rows: FloatArray
-) -> float:
+def _equations(E: FloatArray, points: CameraPoints, count: int, equations: NormalSystem, rows: FloatArray) -> float:
     """Equations of the first ``count`` points onto ``equations``; their chi-square.
 
     ``E`` (d, 3, 4) = P times the algebra; ``rows`` (2, d) scratch. Infinite where a point is not ahead.
@@ -567,12 +553,8 @@ def fit_point(sighted: SightedPoints, p: int, rounds: int, found: FloatArray) ->
             if z == 0.0:
                 chi2 = math.inf
                 continue
-            u = (
-                P[0, 0] * here[0, 0] + P[0, 1] * here[0, 1] + P[0, 2] * here[0, 2] + P[0, 3] * here[0, 3]
-            ) / z
-            v = (
-                P[1, 0] * here[0, 0] + P[1, 1] * here[0, 1] + P[1, 2] * here[0, 2] + P[1, 3] * here[0, 3]
-            ) / z
+            u = (P[0, 0] * here[0, 0] + P[0, 1] * here[0, 1] + P[0, 2] * here[0, 2] + P[0, 3] * here[0, 3]) / z
+            v = (P[1, 0] * here[0, 0] + P[1, 1] * here[0, 1] + P[1, 2] * here[0, 2] + P[1, 3] * here[0, 3]) / z
             k = 0
             for i in range(4):
                 if i != largest:

@@ -154,17 +154,13 @@ def linearised_problem(
         uncertainty = _stated_uncertainty(model, model.covariance, data, order)
     elif made_from is not None:
         past = known_measurements(model, made_from, order)
-        uncertainty = _curvature_uncertainty(
-            model, rig, replace(past, sigmas=past.sigmas * noise_factor), data
-        )
+        uncertainty = _curvature_uncertainty(model, rig, replace(past, sigmas=past.sigmas * noise_factor), data)
     else:
         uncertainty = np.zeros((2 * len(data.camera), 0))
     return LinearisedProblem(rig, data, bounded(uncertainty), order)
 
 
-def with_corrected_zeros(
-    problem: LinearisedProblem, model: CellModel, drift: FloatArray
-) -> LinearisedProblem:
+def with_corrected_zeros(problem: LinearisedProblem, model: CellModel, drift: FloatArray) -> LinearisedProblem:
     """The problem with the joints' readings corrected by ``drift`` (n,), in the rig's order."""
     data = replace(problem.data, offsets=problem.data.offsets + drift)
     if model.covariance is None:
@@ -202,9 +198,7 @@ def joint_uncertainty(model: CellModel, data: Measurements, order: tuple[int, ..
     return error_columns(acting_rig(model), data.with_joint_noise(noise))
 
 
-def covariance_charts(
-    model: CellModel, stated: ModelCovariance
-) -> tuple[RigModel, Charts, npt.NDArray[np.int64]]:
+def covariance_charts(model: CellModel, stated: ModelCovariance) -> tuple[RigModel, Charts, npt.NDArray[np.int64]]:
     """The model as a rig in its own frame, joints in `acting_order`, the charts of its covariance there, and which of
     the covariance's parameters (p,) each parameter of the charts is.
     """
@@ -226,9 +220,7 @@ def covariance_jacobian(
     return jacobian(rig, charts, np.zeros(charts.size), data), columns
 
 
-def _curvature_uncertainty(
-    model: CellModel, rig: RigModel, past: Measurements, data: Measurements
-) -> FloatArray:
+def _curvature_uncertainty(model: CellModel, rig: RigModel, past: Measurements, data: Measurements) -> FloatArray:
     """Like `_stated_uncertainty`, from the curvature of the calibration's own least squares at the model."""
     charts = full_charts(rig, model.stratum, lenses=lens_model_of(rig.lenses))
     triangle = triangle_of(rig, charts, past)[:-1, :-1]
@@ -251,9 +243,7 @@ def possible_changes(model: CellModel, problem: LinearisedProblem) -> list[Model
             found.append(ModelChange("cameras", "", 6, _camera(rig, tuple(range(len(model.cameras))), True)))
         found.append(ModelChange("body", "", 6, _body(rig)))
     seen = set(problem.data.marker.tolist())
-    found += [
-        ModelChange("marker", str(i), 3, _marker(k)) for k, i in enumerate(model.marker_ids) if k in seen
-    ]
+    found += [ModelChange("marker", str(i), 3, _marker(k)) for k, i in enumerate(model.marker_ids) if k in seen]
     found += [ModelChange("joint", model.joint_names[j], 1, _joint(k)) for k, j in enumerate(problem.order)]
     return found
 

@@ -102,14 +102,10 @@ def check_model_holds(
     A significant change below ``limit_px`` is reported as ``drifting``, above as ``recalibrate``. Raises
     CalibrationError (``bad_data``, ``too_few_stops``).
     """
-    return make_check_report(
-        examine_model(model, check, made_from=made_from), limit_px=limit_px, created=created
-    )
+    return make_check_report(examine_model(model, check, made_from=made_from), limit_px=limit_px, created=created)
 
 
-def examine_model(
-    model: CellModel, check: TrialData, *, made_from: TrialData | None = None
-) -> ModelExamination:
+def examine_model(model: CellModel, check: TrialData, *, made_from: TrialData | None = None) -> ModelExamination:
     """Examination of a model with the pixels of a check motion.
 
     ``made_from``: the trial data of its calibration, for the uncertainty of a model that carries no covariance.
@@ -252,14 +248,10 @@ def _add_best_cause(
     count = 2 * len(problem.data.camera)
     penalty = math.log(count)
     sizes = np.array([cause.size for cause in others], dtype=np.int64)
-    gains = np.array(
-        [first_order_gain(problem, cause, found.left) - cause.size * penalty for cause in others]
-    )
+    gains = np.array([first_order_gain(problem, cause, found.left) - cause.size * penalty for cause in others])
     candidates = np.zeros(len(others), dtype=np.bool_)
     select_candidates(gains, sizes, candidates)
-    estimates = {
-        int(h): estimate_changes(problem, (*found.changes, others[h])) for h in np.flatnonzero(candidates)
-    }
+    estimates = {int(h): estimate_changes(problem, (*found.changes, others[h])) for h in np.flatnonzero(candidates)}
     chi2 = np.array([estimates[h].chi2 if h in estimates else np.inf for h in range(len(others))])
     noise = noise_level(chi2, sizes, candidates, count - found.x.size)
     tested = Tested(chi2, sizes, np.zeros(len(others)), candidates)
@@ -327,8 +319,7 @@ def make_check_report(
     away = np.abs(offsets) > 0.2 * np.abs(offsets).max(axis=0)
     return CheckReport(
         status=status,
-        message=_message(status, named, sigmas, chi2, count, problem, limit_px)
-        + (ELSEWHERE if elsewhere else ""),
+        message=_message(status, named, sigmas, chi2, count, problem, limit_px) + (ELSEWHERE if elsewhere else ""),
         model_epoch=model.epoch,
         stops=len(np.unique(problem.data.stop)),
         measurements=count,
@@ -359,9 +350,7 @@ def _model_variance(problem: LinearisedProblem) -> FloatArray:
 def _drift(problem: LinearisedProblem, cause: ModelChange) -> Drift:
     alone = estimate_changes(problem, (cause,))
     upper = alone.information[np.triu_indices(cause.size)]
-    return Drift(
-        cause.kind, cause.subject, _short(alone.x), _short(upper), float(f"{alone.effects_px[0]:.6g}")
-    )
+    return Drift(cause.kind, cause.subject, _short(alone.x), _short(upper), float(f"{alone.effects_px[0]:.6g}"))
 
 
 def _short(values: FloatArray) -> tuple[float, ...]:
@@ -433,9 +422,7 @@ def _unexplained(
         for k, marker in enumerate(model.marker_ids)
         if (problem.data.marker == k).any()
     }
-    by_stop = {
-        int(s): float(np.sqrt(squares[problem.data.stop == s].mean())) for s in np.unique(problem.data.stop)
-    }
+    by_stop = {int(s): float(np.sqrt(squares[problem.data.stop == s].mean())) for s in np.unique(problem.data.stop)}
     worst = max(by_marker, key=lambda marker: by_marker[marker])
     stop = max(by_stop, key=lambda s: by_stop[s])
     c = int(np.argmax(by_camera))
@@ -496,9 +483,7 @@ def reset_zeros(
     _must_be_zeros(report)
     model, found = examined.model, examined.explanation
     # Again at the true joint positions: far zeros change what the model's own uncertainty does to the pixels.
-    problem = with_corrected_zeros(
-        examined.problem, model, changed_state(examined.problem, found.changes, found.x)[1]
-    )
+    problem = with_corrected_zeros(examined.problem, model, changed_state(examined.problem, found.changes, found.x)[1])
     rest = estimate_changes(problem, found.changes)
     drift = found.x + rest.x
     at = [model.joint_names.index(cause.subject) for cause in found.changes]
@@ -617,8 +602,7 @@ def _with_zeros(
         return [k for k, moved in enumerate(at) if order.index(moved) < order.index(j)]
 
     generators = tuple(
-        widened(basis, [(k, model.generators[at[k]]) for k in before(j)])
-        for j, basis in enumerate(stated.generators)
+        widened(basis, [(k, model.generators[at[k]]) for k in before(j)]) for j, basis in enumerate(stated.generators)
     )
     cameras = tuple(widened(basis, []) for basis in stated.cameras)
     lenses = tuple(widened(basis, []) for basis in stated.lenses)
@@ -666,9 +650,7 @@ def find_trend(history: Sequence[CheckReport]) -> DriftTrend | None:
     if len(same) < MIN_CHECKS:
         return None
     first = datetime.fromisoformat(same[0].created)
-    days = np.array(
-        [(datetime.fromisoformat(check.created) - first).total_seconds() / DAY_S for check in same]
-    )
+    days = np.array([(datetime.fromisoformat(check.created) - first).total_seconds() / DAY_S for check in same])
     if np.ptp(days) <= 0.0:
         return None
     price = np.log(float(sum(check.measurements for check in same)))

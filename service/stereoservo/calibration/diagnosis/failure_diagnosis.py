@@ -59,13 +59,9 @@ PLAIN = frozenset(
 """Codes that name their cause themselves."""
 STEPS_IMITATE = frozenset({"joint_without_effect", "lens_implausible"})
 """Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that bends after it."""
-MISFITS = frozenset(
-    {"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"}
-)
+MISFITS = frozenset({"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"})
 """Codes of data that contradict themselves: the misfit may show why."""
-LASTING = frozenset(
-    {"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"}
-)
+LASTING = frozenset({"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"})
 """Codes of what has changed for good during the trials."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 """Shares of outliers with which a fit serves to explain them."""
@@ -160,9 +156,7 @@ def _step_error(trials: TrialData, result: CalibrationFit | None = None) -> Cali
     return moved_together(step.stop)
 
 
-def _outlier_error(
-    trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions
-) -> CalibrationError:
+def _outlier_error(trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions) -> CalibrationError:
     """Error with what the outliers of a lenient fit have in common, or with a list of possible causes."""
     lenient = replace(options, max_outliers=LENIENT_OUTLIERS, max_trial_outliers=LENIENT_TRIAL_OUTLIERS)
     try:
@@ -213,9 +207,7 @@ def _contradiction_error(trials: TrialData, error: CalibrationError) -> Calibrat
     )
 
 
-def review_notes(
-    trials: TrialData, result: CalibrationFit, refit: Refit, options: FitOptions
-) -> tuple[str, ...]:
+def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, options: FitOptions) -> tuple[str, ...]:
     """Notes on a fit that succeeded: causes of its outliers, prismatic joints whose scales disagree.
 
     Raises CalibrationError where the model is of a cell that is no more (a camera or marker moved), where two ids are
@@ -264,15 +256,9 @@ def untested(trials: TrialData) -> tuple[str, ...]:
     alone, from one configuration.
     """
     n = len(trials.joint_names)
-    apart = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(
-        trials.positions, axis=0
-    )
+    apart = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(trials.positions, axis=0)
     together = int(((trials.trials < 0) & (apart.sum(axis=1) > 1)).sum())
-    bases = [
-        np.median(trials.positions[trials.trials == j], axis=0)
-        for j in range(n)
-        if (trials.trials == j).any()
-    ]
+    bases = [np.median(trials.positions[trials.trials == j], axis=0) for j in range(n) if (trials.trials == j).any()]
     moved = bool(bases) and float(np.ptp(np.array(bases), axis=0).max(initial=0.0)) > MOVED
     if n < 2 or together >= LEAST_TOGETHER or moved:
         return ()

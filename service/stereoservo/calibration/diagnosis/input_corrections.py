@@ -219,8 +219,7 @@ def _excludes_plane(trials: TrialData) -> bool:
         residuals_px = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - after, axis=1) / sigmas[last, both]
         moduli = np.abs(np.linalg.eigvals(H / np.cbrt(np.linalg.det(H))))
         signs.append(
-            float(np.median(residuals_px)) > 10.0
-            or float(np.ptp(moduli)) > PLANAR_MODULI * float(moduli.max())
+            float(np.median(residuals_px)) > 10.0 or float(np.ptp(moduli)) > PLANAR_MODULI * float(moduli.max())
         )
     return bool(signs) and float(np.mean(signs)) >= 0.5
 
@@ -281,8 +280,7 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
         stated = trials.joint_kinds[joint]
         other: Kind = "prismatic" if stated == "revolute" else "revolute"
         as_stated, as_other = (
-            best_single_joint(kind, cameras, observations, displacement, thorough=True)[1]
-            for kind in (stated, other)
+            best_single_joint(kind, cameras, observations, displacement, thorough=True)[1] for kind in (stated, other)
         )
         residuals_by_kind[joint] = as_stated, as_other, other
     # The other kind must reach what the other joints do; a joint that fits neither kind has another fault.

@@ -95,9 +95,7 @@ def with_scales_removed(trials: TrialData, factors: FloatArray) -> TrialData:
     return msgspec.structs.replace(trials, positions=centre + (trials.positions - centre) / factors)
 
 
-def _best_factor(
-    cameras: FloatArray, observations: VirtualObservations, reported: FloatArray
-) -> tuple[float, float]:
+def _best_factor(cameras: FloatArray, observations: VirtualObservations, reported: FloatArray) -> tuple[float, float]:
     """Scale factor of one joint's ``reported`` angles (k,), 1 where no other gains enough, and the median residual
     [sigmas] with it; NaN where the joint fits with none.
     """
@@ -105,9 +103,7 @@ def _best_factor(
     rigs: dict[float, tuple[RigModel, float]] = {}
     for factor in {1.0, *(rough * step for step in COARSE)}:
         # As reported, the joint must have had every chance before another factor is believed.
-        rig, typical = best_single_joint(
-            "revolute", cameras, observations, reported / factor, thorough=factor == 1.0
-        )
+        rig, typical = best_single_joint("revolute", cameras, observations, reported / factor, thorough=factor == 1.0)
         if rig is not None and np.isfinite(typical):
             rigs[factor] = rig, typical
     if not rigs:
@@ -246,9 +242,7 @@ class ScalesError(Exception):
         self.factors, self.components = factors, components
 
 
-def explains(
-    trials: TrialData, solution: Solution, inliers: BoolArray, components: VarianceComponents | None
-) -> bool:
+def explains(trials: TrialData, solution: Solution, inliers: BoolArray, components: VarianceComponents | None) -> bool:
     """Whether a bundle with joint noise leaves nothing but noise, of readings that are not plainly wrong."""
     if _moved_in_name_only(trials, solution):
         return False
@@ -282,9 +276,7 @@ def one_thing_happened(trials: TrialData, solution: Solution) -> bool:
             return True
     reported = solution.data.corrected(None)
     left = np.full_like(trials.pixels, np.nan)
-    left[reported.camera, reported.stop, reported.marker] = reported.pixels - predicted(
-        solution.rig, reported
-    )
+    left[reported.camera, reported.stop, reported.marker] = reported.pixels - predicted(solution.rig, reported)
     return find_step(msgspec.structs.replace(trials, pixels=left), ONE_STEP) is not None
 
 
@@ -348,8 +340,7 @@ def scales_error(trials: TrialData, factors: FloatArray, components: VarianceCom
         for j in np.flatnonzero(factors != 1.0)
     }
     listed = ", ".join(
-        f"{name!r} reports {one['factor']:.5g} ± {one['deviation']:.1g} times its motion"
-        for name, one in found.items()
+        f"{name!r} reports {one['factor']:.5g} ± {one['deviation']:.1g} times its motion" for name, one in found.items()
     )
     return CalibrationError(
         "wrong_scale",

@@ -185,9 +185,7 @@ def find_step(trials: TrialData, share: float = 0.0) -> TrackStep | None:
     gains, sizes, shares = _step_gains(trials)
     c, m = gains.shape[:2]
     found: list[tuple[float, TrackStep]] = []
-    candidates: list[tuple[tuple[int, ...], tuple[int, ...]]] = [
-        ((camera,), tuple(range(m))) for camera in range(c)
-    ]
+    candidates: list[tuple[tuple[int, ...], tuple[int, ...]]] = [((camera,), tuple(range(m))) for camera in range(c)]
     candidates += [(tuple(range(c)), (marker,)) for marker in range(m)]
     candidates.append((tuple(range(c)), tuple(range(m))))
     for cameras, markers in candidates:

@@ -322,9 +322,7 @@ def _exchanged_stops(found: PredictedTrials) -> npt.NDArray[np.int64]:
     return np.flatnonzero((both > 0) & (hits >= MOST * both) & (hits >= 2))
 
 
-def _exchanged_ids(
-    found: PredictedTrials, rest: BoolArray
-) -> list[tuple[int, int, int, npt.NDArray[np.int64]]]:
+def _exchanged_ids(found: PredictedTrials, rest: BoolArray) -> list[tuple[int, int, int, npt.NDArray[np.int64]]]:
     """Cameras and pairs of markers that lie at each other's prediction, with the stops (k,)."""
     pairs: dict[tuple[int, int, int], list[int]] = {}
     for camera, stop, a in np.argwhere(rest):
@@ -375,9 +373,7 @@ def _share(outliers: BoolArray, seen: BoolArray, axis: tuple[int, ...]) -> Float
 def _stops(stops: npt.NDArray[np.int64]) -> str:
     """Stop numbers as text."""
     listed = ", ".join(str(int(stop)) for stop in stops[:12])
-    return f"stop{'s' if len(stops) > 1 else ''} {listed}" + (
-        f" and {len(stops) - 12} more" if len(stops) > 12 else ""
-    )
+    return f"stop{'s' if len(stops) > 1 else ''} {listed}" + (f" and {len(stops) - 12} more" if len(stops) > 12 else "")
 
 
 SUSPICIOUS_OUTLIERS = 0.01
@@ -416,11 +412,7 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
     solution = solution_of(mended, result)
     joints = estimate_components(reduced_rows(solution, readings(solution.data.offsets)), scales=False)
     # What moves all markers of a stop alike is no noise of pixels.
-    if (
-        joints is not None
-        and joints.significant
-        and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2
-    ):
+    if joints is not None and joints.significant and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2:
         return _inexact_joints(trials, joints)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
     factors = np.maximum(scatter[:, kept], 1.0) * factor
@@ -522,7 +514,5 @@ def scale_error(
     return CalibrationError(
         "wrong_scale",
         f"joint {listed}. Revolute joints must report radians: correct the drive's scale",
-        joints={
-            name: {"factor": scale.factor, "deviation": scale.deviation} for name, scale in found.items()
-        },
+        joints={name: {"factor": scale.factor, "deviation": scale.deviation} for name, scale in found.items()},
     )

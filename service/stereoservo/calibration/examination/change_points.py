@@ -92,9 +92,7 @@ def moved_camera(views: RecordedViews) -> int | None:
     others = [step for c, step in enumerate(steps) if c != camera and step is not None and step.gain >= CLEAR]
     if mine is None or mine.gain < CLEAR:
         return None
-    together = any(
-        step.span[0] <= mine.span[1] + NEAR and mine.span[0] <= step.span[1] + NEAR for step in others
-    )
+    together = any(step.span[0] <= mine.span[1] + NEAR and mine.span[0] <= step.span[1] + NEAR for step in others)
     return None if together or any(mine.gain < ALONE_BY * step.gain for step in others) else camera
 
 
@@ -182,9 +180,7 @@ def _forms(views: RecordedViews) -> tuple[FloatArray, BoolArray]:
     away = np.abs(apart) > ALONE
     turns = np.array([kind == "revolute" for kind in views.joint_kinds])
     apart = np.where(away, apart, 0.0)
-    forms = np.stack(
-        [np.where(turns, np.sin(apart), apart), np.where(turns, np.cos(apart) - 1.0, 0.0)], axis=2
-    )
+    forms = np.stack([np.where(turns, np.sin(apart), apart), np.where(turns, np.cos(apart) - 1.0, 0.0)], axis=2)
     return forms.reshape(len(apart), -1), np.asarray(away.sum(axis=1) <= 1)
 
 
@@ -361,15 +357,10 @@ def best_change(
     scores = [_score(left, sizes, k, noise, count) for k in range(len(found))]
     noise *= _correlation(problem, views, found[int(np.argmin(scores))])
     effects = np.array([one.effect_px for one in found])
-    best, second = two_best(
-        chi2, Tested(left, sizes, effects, every), noise, math.log(count), limits.ratios, LEAST_PX
-    )
+    best, second = two_best(chi2, Tested(left, sizes, effects, every), noise, math.log(count), limits.ratios, LEAST_PX)
     if best < 0:
         return None
-    if (
-        second >= 0
-        and _score(left, sizes, second, noise, count) - _score(left, sizes, best, noise, count) < UNCLEAR
-    ):
+    if second >= 0 and _score(left, sizes, second, noise, count) - _score(left, sizes, best, noise, count) < UNCLEAR:
         return replace(found[best], runner_up=found[second].hypothesis)
     return found[best]
 
@@ -455,9 +446,7 @@ def _first_order(
     return best
 
 
-def _gains(
-    moment: FloatArray, information: FloatArray, shared: FloatArray, *, across: FloatArray
-) -> FloatArray:
+def _gains(moment: FloatArray, information: FloatArray, shared: FloatArray, *, across: FloatArray) -> FloatArray:
     """Reduction (b,) of chi-square by a change of the frames that ``moment`` (b, q), ``information`` (b, q, q) and
     ``shared`` (b, q, p) are sums of, beside the model's uncertainty, which ``across`` (p,) is the residuals' share in.
     """

@@ -128,9 +128,7 @@ def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onse
     """The recording with a camera's pixels from a frame on as they would be had it not moved, by a model."""
     problem = examined_frames(reference.model, views, reference.noise_factor)
     name = views.cameras[camera].name
-    one = next(
-        h for h in hypotheses(reference.model, views, problem) if (h.kind, h.subject) == ("camera", name)
-    )
+    one = next(h for h in hypotheses(reference.model, views, problem) if (h.kind, h.subject) == ("camera", name))
     rows = (problem.data.camera == camera) & (problem.data.stop >= onset)
     part = problem.select(rows)
     estimate = estimate_changes(part, (one.change,))
@@ -140,9 +138,7 @@ def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onse
     return replace(views, pixels=pixels)
 
 
-def _better(
-    views: RecordedViews, reference: ReferenceModel
-) -> tuple[RecordedViews, ReferenceModel, _Step] | None:
+def _better(views: RecordedViews, reference: ReferenceModel) -> tuple[RecordedViews, ReferenceModel, _Step] | None:
     """Recording and model without the change that explains most, None where the model is no better without."""
     model, problem = _freed(views, reference)
     # What is learnt at rest does not depend on stamps.
@@ -444,9 +440,7 @@ def _without(problem: ExaminedFrames, change: ChangePoint) -> ExaminedFrames:
     here = part.residuals_at(start_state(part))
     values, vectors = np.linalg.eigh(change.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    slopes[np.repeat(change.rows, 2)] = (
-        change_jacobian(part, (change.hypothesis.change,), change.x, here) @ root
-    )
+    slopes[np.repeat(change.rows, 2)] = change_jacobian(part, (change.hypothesis.change,), change.x, here) @ root
     return problem.explained(change.rows, change.effect, slopes)
 
 
@@ -530,9 +524,7 @@ def _tells_apart(one: Hypothesis, other: Hypothesis) -> str:
     if "marker" in kinds:
         return "the other markers of the body in more of the frames"
     if "joint" in kinds and "body" not in kinds and "camera" not in kinds:
-        return (
-            "a marker that stands still before the cameras, and motion of that joint over more of its range"
-        )
+        return "a marker that stands still before the cameras, and motion of that joint over more of its range"
     if "camera" in kinds or "cameras" in kinds:
         return "a marker that stands still before the cameras"
     return "motion of the joints concerned over more of their ranges, with the others elsewhere"

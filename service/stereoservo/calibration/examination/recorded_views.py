@@ -386,9 +386,7 @@ class ExaminedFrames(LinearisedProblem):
         twice = np.repeat(keep, 2)
         slopes = self.joint_slopes[twice] if self.joint_slopes.size else self.joint_slopes
         root = self.root[twice]
-        return replace(
-            self, data=self.data.select(keep), root=root, uncertainty=bounded(root), joint_slopes=slopes
-        )
+        return replace(self, data=self.data.select(keep), root=root, uncertainty=bounded(root), joint_slopes=slopes)
 
     def explained(self, rows: BoolArray, effect: FloatArray, slopes: FloatArray) -> ExaminedFrames:
         """The problem where an ``effect`` (r, 2) [px] is removed from the pixels of ``rows`` (k,), along whose
@@ -467,9 +465,7 @@ def _late(views: RecordedViews, problem: ExaminedFrames, subject: str, frames: B
     return Hypothesis(kind="stamps", subject=subject, change=ModelChange("joint", subject, 1, apply))
 
 
-def corrected_views(
-    views: RecordedViews, one: Hypothesis, frames: BoolArray, x: float
-) -> RecordedViews | None:
+def corrected_views(views: RecordedViews, one: Hypothesis, frames: BoolArray, x: float) -> RecordedViews | None:
     """The recording as it would be without a change ``x`` of a joint's zero, or of stamps, in ``frames`` (f,); None
     where it is a change of another kind.
     """

@@ -113,9 +113,7 @@ def _fitted(forms: FloatArray, pixels: FloatArray) -> tuple[FloatArray, int]:
     answer = np.zeros(3 * r - 1)
     for _ in range(WEIGHED):
         F, none = forms / depths[:, None], np.zeros_like(forms)
-        design = np.vstack(
-            [np.hstack([F, none, -x[:, :1] * F[:, :-1]]), np.hstack([none, F, -x[:, 1:] * F[:, :-1]])]
-        )
+        design = np.vstack([np.hstack([F, none, -x[:, :1] * F[:, :-1]]), np.hstack([none, F, -x[:, 1:] * F[:, :-1]])])
         answer = np.linalg.lstsq(design, (x / depths[:, None]).T.ravel(), rcond=1e-10)[0]
         found = 1.0 + forms[:, :-1] @ answer[2 * r :]
         if not (np.abs(found) > 1e-6).all():
@@ -238,8 +236,7 @@ def frame_noise(views: RecordedViews) -> float:
         for order in ORDERS:
             apart = np.diff(pixels, n=order, axis=0)
             by_order[order] += [
-                _noise(apart[begin : begin + NOISE_BLOCK], order)
-                for begin in range(0, len(apart), NOISE_BLOCK)
+                _noise(apart[begin : begin + NOISE_BLOCK], order) for begin in range(0, len(apart), NOISE_BLOCK)
             ]
     known = [[one for one in found if math.isfinite(one)] for found in by_order.values()]
     return max(1.0, min((float(np.quantile(found, LOW)) for found in known if found), default=1.0))

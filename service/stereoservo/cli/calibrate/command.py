@@ -36,9 +36,7 @@ from stereoservo.messages.wire import CalibrationResult, EventMessage
 TRIALS_SHARE = 0.9
 SHOWN_CHECKS = 8
 
-CheckOption = Annotated[
-    bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")
-]
+CheckOption = Annotated[bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")]
 ResetZerosOption = Annotated[
     bool,
     typer.Option(
@@ -83,9 +81,7 @@ LinesOption = Annotated[
 LinesSigmaOption = Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")]
 EnableOption = Annotated[
     bool,
-    typer.Option(
-        "--enable", help="Switch the drives on first; else a cell whose drives are off is left alone."
-    ),
+    typer.Option("--enable", help="Switch the drives on first; else a cell whose drives are off is left alone."),
 ]
 OutputOption = Annotated[
     Path | None,
@@ -168,9 +164,7 @@ def calibrate(
     if rig:
         from stereoservo.cli.calibrate.rig import RigOptions, calibrate_cameras  # OpenCV and more
 
-        report, text = calibrate_cameras(
-            RigOptions(cell, images, board, pitch, layout, length, seconds, output)
-        )
+        report, text = calibrate_cameras(RigOptions(cell, images, board, pitch, layout, length, seconds, output))
         emit(report, text, json)
         return
     if board or pitch is not None or layout is not None or length:
@@ -187,9 +181,7 @@ def calibrate(
     if (reset_zeros or unattended) and not check:
         raise CommandError("argument", "--reset-zeros and --unattended go with --check")
     if (trials is not None or images is not None) and check:
-        raise CommandError(
-            "argument", "--check moves the arm, --trials and --images do not: give one of them"
-        )
+        raise CommandError("argument", "--check moves the arm, --trials and --images do not: give one of them")
     if trials is not None and images is not None:
         raise CommandError("argument", "--trials and --images: one of them")
     if images is not None:
@@ -207,9 +199,7 @@ def calibrate(
         emit(result, f"{_table(result)}\n{source_of_stored(result)}", json)
         return
     if lines is not None or output is not None:
-        raise CommandError(
-            "argument", "--lines and --output go with --trials FILE.npz, --output with --images too"
-        )
+        raise CommandError("argument", "--lines and --output go with --trials FILE.npz, --output with --images too")
     _calibrate_live(cell, check, reset_zeros, unattended, enable, endpoint, operator, json)
 
 
@@ -243,9 +233,7 @@ def _calibrate_live(
                 if unattended and report.status == "recalibrate":
                     raise typer.Exit(EXIT_FAILED)
                 return
-            result = _with_bar(
-                client, "trial motions", lambda progress: client.calibrate(progress, report=True)
-            )
+            result = _with_bar(client, "trial motions", lambda progress: client.calibrate(progress, report=True))
         except KeyboardInterrupt:
             client.stop()
             raise
@@ -371,15 +359,10 @@ def _print_check(report: CheckReport, cell: str, endpoint: str | None, json: boo
     for what, values in (("joint", report.per_joint), ("camera", report.per_camera)):
         lines += [f"  {what:6} {name:16} {value:.2f} sigmas" for name, value in values.items()]
     worst = sorted(report.per_marker.items(), key=lambda item: -item[1])[:3]
-    lines.append(
-        "  markers, worst first: " + ", ".join(f"{name} {value:.2f}" for name, value in worst) + " sigmas"
-    )
+    lines.append("  markers, worst first: " + ", ".join(f"{name} {value:.2f}" for name, value in worst) + " sigmas")
     if len(history) > 1:
         lines.append("  checks so far:")
-        lines += [
-            f"    {one.created}  epoch {one.model_epoch}  {one.sigmas:6.2f} sigmas  {one.status}"
-            for one in past
-        ]
+        lines += [f"    {one.created}  epoch {one.model_epoch}  {one.sigmas:6.2f} sigmas  {one.status}" for one in past]
     emit(tree, "\n".join(lines), json)
 
 

@@ -184,9 +184,7 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
             if image is None:
                 raise CommandError("images", f"{path} is no picture that OpenCV reads")
             if size is not None and size != image.shape:
-                raise CommandError(
-                    "images", f"{path} is {image.shape[1]}x{image.shape[0]}, others {size[1]}x{size[0]}"
-                )
+                raise CommandError("images", f"{path} is {image.shape[1]}x{image.shape[0]}, others {size[1]}x{size[0]}")
             size = image.shape
             found[key] = detector.detect(Frame(name, len(found), 0, 0, image), None)
         assert size is not None
@@ -203,9 +201,7 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
     return _stacked(cameras, keys, seen)
 
 
-def _stacked(
-    cameras: list[TrialCamera], keys: list[str], seen: dict[str, dict[str, CameraObservation]]
-) -> RigViews:
+def _stacked(cameras: list[TrialCamera], keys: list[str], seen: dict[str, dict[str, CameraObservation]]) -> RigViews:
     ids = tuple(sorted({int(i) for found in seen.values() for o in found.values() for i in o.ids}))
     column = {marker: k for k, marker in enumerate(ids)}
     pixels = np.full((len(cameras), len(keys), len(ids), 2), np.nan)
@@ -224,9 +220,7 @@ def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -
     """The board's detector, or that of the cell file's camera of this name."""
     context = DriverContext(MonotonicClock(), "rig", Path(), Path(), camera=camera)
     if board is not None:
-        made: Detector = plugins.load(plugins.DETECTORS, "chessboard")(
-            {"columns": board[0], "rows": board[1]}, context
-        )
+        made: Detector = plugins.load(plugins.DETECTORS, "chessboard")({"columns": board[0], "rows": board[1]}, context)
         return made
     if not options.cell:
         raise CommandError(
@@ -251,9 +245,7 @@ def _recorded(options: RigOptions) -> RigViews:
     """Views of a recording of ``record --images``, where the body was held still."""
     assert options.images is not None
     if not options.cell:
-        raise CommandError(
-            "argument", f"{options.images} is a recording: its cell file is needed, for the detectors"
-        )
+        raise CommandError("argument", f"{options.images} is a recording: its cell file is needed, for the detectors")
     path = Path(options.cell)
     cell = load_cell_file(path)
     cameras: list[TrialCamera] = []
@@ -349,9 +341,7 @@ def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
         ]
         if "tx" in d:
             first = result.cameras[0].name
-            angle = np.degrees(
-                np.arccos(np.clip((np.trace(np.array(camera.rotation)) - 1.0) / 2.0, -1.0, 1.0))
-            )
+            angle = np.degrees(np.arccos(np.clip((np.trace(np.array(camera.rotation)) - 1.0) / 2.0, -1.0, 1.0)))
             turn = np.degrees(max(d["rx"], d["ry"], d["rz"]))
             unit = " m" if result.unit == "m" else " baselines"
             place = ", ".join(
@@ -364,8 +354,7 @@ def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
     if result.unit != "m":
         lines.append("  lengths are in baselines: state one (--length ID,ID=METRES) for metres")
     worst = ", ".join(
-        f"{view.name or '(unnamed)'} {view.rms_px:.3f} px"
-        + (f", {view.left_out} left out" if view.left_out else "")
+        f"{view.name or '(unnamed)'} {view.rms_px:.3f} px" + (f", {view.left_out} left out" if view.left_out else "")
         for view in result.views[:SHOWN_VIEWS]
     )
     lines.append(f"  worst places: {worst}")

@@ -67,9 +67,7 @@ def source_of_stored(result: StoredFit) -> str:
     return "\n".join(lines)
 
 
-def fit_stored_trials(
-    cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None
-) -> StoredFit:
+def fit_stored_trials(cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None) -> StoredFit:
     """Fit stored trial data in this process; the model is stored beside the cell's others unless ``output`` is
     given.
 
@@ -103,9 +101,7 @@ def fit_stored_trials(
     except CalibrationError as error:
         failure = assess_failure(error.code, error.message)
         page_path = report_fit(data, path, output, None, failure)
-        raise CommandError(
-            error.code, f"{failure.text} A report is in {page_path}", report=str(page_path)
-        ) from error
+        raise CommandError(error.code, f"{failure.text} A report is in {page_path}", report=str(page_path)) from error
     seconds = time.monotonic() - started
     try:
         page: Path | None = report_fit(data, path, output, result, assessment, known)
@@ -163,9 +159,7 @@ def _must_not_run(name: str) -> None:
 
 def _must_fit(file: CellFile, data: Any, path: Path) -> None:
     cameras = [camera.name for camera in file.camera]
-    joints = {limit.joint for limit in file.safety.limit} or set(
-        data.joint_names
-    )  # not stated of a simulated arm
+    joints = {limit.joint for limit in file.safety.limit} or set(data.joint_names)  # not stated of a simulated arm
     if [camera.name for camera in data.cameras] != cameras or set(data.joint_names) != joints:
         raise CommandError(
             "other_cell",
@@ -195,18 +189,14 @@ def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], Lin
         raise CommandError("lines", f"{path}: is not UTF-8 text: {error}") from error
     reader = csv.DictReader(text.splitlines())
     if reader.fieldnames is None or set(reader.fieldnames) != {"camera", "line", "u", "v"}:
-        raise CommandError(
-            "lines", f"{path}: the first row is {reader.fieldnames}; camera,line,u,v is needed"
-        )
+        raise CommandError("lines", f"{path}: the first row is {reader.fieldnames}; camera,line,u,v is needed")
     for number, row in enumerate(reader, start=2):
         try:
             pixel = float(row["u"]), float(row["v"])
         except (TypeError, ValueError) as error:
             raise CommandError("lines", f"{path}: row {number}: u and v are numbers [px]") from error
         if None in row:
-            raise CommandError(
-                "lines", f"{path}: row {number}: has more than the four values camera,line,u,v"
-            )
+            raise CommandError("lines", f"{path}: row {number}: has more than the four values camera,line,u,v")
         if row["camera"] not in sizes:
             raise CommandError(
                 "lines", f"{path}: row {number}: no camera {row['camera']!r}; cameras: {', '.join(sizes)}"
@@ -344,8 +334,7 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
         )
     motion = read_motion(flight_recording_of(images))
     cameras = [
-        recorded_camera(cell, cell_path, section.name, video_of(images, section.name))
-        for section in cell.camera
+        recorded_camera(cell, cell_path, section.name, video_of(images, section.name)) for section in cell.camera
     ]
     settings = _settings(cell, cell_path, motion, cameras)
     if settings.trials is None:
@@ -378,9 +367,7 @@ def _observations(
     return camera.observations(note, is_usable)
 
 
-def _settings(
-    cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]
-) -> CoreSettings:
+def _settings(cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]) -> CoreSettings:
     """The core's settings for the current cell file, the recorded joints, and the detectors on the recorded cameras."""
     recorded = motion.settings
     ranges = cell.safety.limit or _recorded_limits(recorded)  # of a simulated arm they may be left out
@@ -422,9 +409,7 @@ def _settings(
 def _recorded_limits(recorded: CoreSettings) -> tuple[JointLimit, ...]:
     limits = recorded.limits
     rows = np.stack([limits.position_min, limits.position_max, limits.velocity_max, limits.acceleration_max])
-    return tuple(
-        JointLimit(name, *row) for name, row in zip(recorded.joint_names, rows.T.tolist(), strict=True)
-    )
+    return tuple(JointLimit(name, *row) for name, row in zip(recorded.joint_names, rows.T.tolist(), strict=True))
 
 
 SAME_POSITION = 4.0
@@ -485,9 +470,7 @@ class RecordedTrialCollector:
             joints = self.motion.joints_at(observation.t_shutter_ns)
             if observation.t_shutter_ns > stop.rest.end_ns or joints is None:
                 continue
-            if add_observation(
-                stop.sums, self.settings, observation, self.trial.frames, stop.rest.settled_ns
-            ):
+            if add_observation(stop.sums, self.settings, observation, self.trial.frames, stop.rest.settled_ns):
                 stop.joint_sum += joints
                 stop.frames += 1
                 self.used += 1
@@ -495,9 +478,7 @@ class RecordedTrialCollector:
     def events(self) -> list[Event]:
         """The stops as events of the core's trial motions. Raises CalibrationError (``too_few_stops``)."""
         self.left_out = {}
-        seen = [
-            (stop, stop.joint_sum / stop.frames) for stop in self._stops if stop.frames and self._good(stop)
-        ]
+        seen = [(stop, stop.joint_sum / stop.frames) for stop in self._stops if stop.frames and self._good(stop)]
         if not seen:
             raise CalibrationError(
                 "too_few_stops",
@@ -524,9 +505,7 @@ class RecordedTrialCollector:
                 if alone.size > 1:
                     together, trial = together + 1, -1
                 samples = averages(stop.sums, self.settings)
-                event = Event(
-                    len(events) + 1, stop.rest.end_ns, "calibration_sample", id="images", joints=joints
-                )
+                event = Event(len(events) + 1, stop.rest.end_ns, "calibration_sample", id="images", joints=joints)
                 events.append(msgspec.structs.replace(event, samples=samples, trial=trial))
         return events
 

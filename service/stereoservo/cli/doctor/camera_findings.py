@@ -155,9 +155,7 @@ def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
     counts = np.array([o.ids.size for o in record.seen])
     known = len(record.description.marker_ids)
     steady = float((counts >= min_markers).mean())
-    summary = (
-        f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
-    )
+    summary = f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
     if counts.max() == 0 and record.flipped:
         return ExaminationFinding(
             name, False, f"none is seen, but {record.flipped} in the mirror image",
@@ -201,9 +199,7 @@ def marker_scatter(record: CameraRecord) -> float | None:
     for observation in record.seen:
         for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
             seen.setdefault(marker, []).append(pixel)
-    deviations = [
-        np.var(np.array(pixels), axis=0, ddof=1).mean() for pixels in seen.values() if len(pixels) > 5
-    ]
+    deviations = [np.var(np.array(pixels), axis=0, ddof=1).mean() for pixels in seen.values() if len(pixels) > 5]
     return float(np.sqrt(np.median(deviations))) if deviations else None
 
 
@@ -225,9 +221,7 @@ def contrast_and_blur(image: ImageArray, pixel: FloatArray) -> tuple[float, floa
     return float(bright - dark), float(np.sqrt(max(blur**2 - 1 / 3, 0.0))), float((grey >= SATURATED).mean())
 
 
-def _picture_quality(
-    name: str, image: ImageArray, observation: CameraObservation
-) -> Iterator[ExaminationFinding]:
+def _picture_quality(name: str, image: ImageArray, observation: CameraObservation) -> Iterator[ExaminationFinding]:
     found = [contrast_and_blur(image, pixel) for pixel in observation.pixels]
     measured = np.array([values for values in found if values is not None])
     if not len(measured):
@@ -272,14 +266,10 @@ def mean_observations(record: CameraRecord) -> tuple[npt.NDArray[np.int64], Floa
     pixels: dict[int, list[FloatArray]] = {}
     variances: dict[int, list[float]] = {}
     for observation in record.seen:
-        for marker, pixel, C in zip(
-            observation.ids.tolist(), observation.pixels, observation.covariances, strict=True
-        ):
+        for marker, pixel, C in zip(observation.ids.tolist(), observation.pixels, observation.covariances, strict=True):
             pixels.setdefault(marker, []).append(pixel)
             variances.setdefault(marker, []).append(0.5 * float(np.trace(C)))
-    kept = sorted(
-        marker for marker, observations in pixels.items() if 2 * len(observations) >= len(record.seen)
-    )
+    kept = sorted(marker for marker, observations in pixels.items() if 2 * len(observations) >= len(record.seen))
     return (
         np.array(kept, dtype=np.int64),
         np.array([np.mean(pixels[marker], axis=0) for marker in kept]).reshape(-1, 2),

@@ -127,9 +127,7 @@ def examine_cameras(
     directories = plan.directories
     pid = holder(directories.daemon_lock)
     if pid is not None:
-        yield ExaminationFinding(
-            "cameras", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`"
-        )
+        yield ExaminationFinding("cameras", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`")
         return
     with ExitStack() as locks:
         try:
@@ -210,9 +208,7 @@ def watch_cameras(plan: RunPlan, seconds: float) -> list[CameraRecord]:
 def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
     """The image in colour with the detected markers: circles, ids, standard deviations a hundredfold."""
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    for marker, (u, v), C in zip(
-        observation.ids.tolist(), observation.pixels, observation.covariances, strict=True
-    ):
+    for marker, (u, v), C in zip(observation.ids.tolist(), observation.pixels, observation.covariances, strict=True):
         centre = (round(u * 16), round(v * 16))
         sigma = float(np.sqrt(0.5 * np.trace(C)))
         cv2.circle(picture, centre, 16 * 9, GREEN, 1, cv2.LINE_AA, 4)
@@ -238,9 +234,7 @@ def _save_pictures(records: list[CameraRecord], directory: Path) -> Iterator[Exa
                 raise OSError(f"{path}: the picture could not be encoded as PNG")
             path.write_bytes(data.tobytes())
         except OSError as error:
-            yield ExaminationFinding(
-                "pictures", None, f"not saved: {error}", "--pictures DIR that can be written"
-            )
+            yield ExaminationFinding("pictures", None, f"not saved: {error}", "--pictures DIR that can be written")
             return
         saved.append(str(path))
     if saved:
@@ -270,9 +264,7 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
     seen = [record for record in records if len(record.seen) >= 2]
     if len(seen) < 2:
         return
-    moving = {
-        record.name: scatter for record in seen if (scatter := marker_scatter(record) or 0.0) > AT_REST_PX
-    }
+    moving = {record.name: scatter for record in seen if (scatter := marker_scatter(record) or 0.0) > AT_REST_PX}
     if moving:
         told = ", ".join(f"by {scatter:.1f} px in {name}" for name, scatter in moving.items())
         yield ExaminationFinding(
@@ -292,9 +284,7 @@ def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
     """Markers seen by all cameras, and their raw pixels (c, k, 2)."""
     means = [mean_observations(record) for record in records]
     ids = sorted(set.intersection(*(set(found.tolist()) for found, _, _ in means)))
-    pixels = [
-        np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in means
-    ]
+    pixels = [np.array([pixels[found.tolist().index(i)] for i in ids]).reshape(-1, 2) for found, pixels, _ in means]
     return ids, np.array(pixels)
 
 
@@ -305,9 +295,7 @@ def reprojection_rms(cameras: Sequence[CameraModel], pixels: FloatArray) -> floa
     Ps = np.array([camera.matrix for camera in cameras])
     ideal = np.array([undistort(camera.lens, p) for camera, p in zip(cameras, pixels, strict=True)])
     points = triangulate(Ps, ideal)
-    raw = np.array(
-        [distort(camera.lens, m) for camera, m in zip(cameras, project_many(Ps, points), strict=True)]
-    )
+    raw = np.array([distort(camera.lens, m) for camera, m in zip(cameras, project_many(Ps, points), strict=True)])
     squares = (raw - pixels) ** 2
     free = squares[np.isfinite(squares)].size - 3 * int(np.isfinite(points[:, 0]).sum())
     return float(np.sqrt(np.nansum(squares) / free)) if free > 0 else float("nan")

@@ -37,22 +37,16 @@ def doctor(
     ],
     jog: Annotated[
         bool,
-        typer.Option(
-            "--jog", help="Also turn each joint by one degree and back, once allowed: checks its units."
-        ),
+        typer.Option("--jog", help="Also turn each joint by one degree and back, once allowed: checks its units."),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Allow what --jog asks for.")] = False,
     seconds: Annotated[
         float,
-        typer.Option(
-            "--seconds", help="How long the cameras are watched; 0: not at all.", min=0.0, max=600.0
-        ),
+        typer.Option("--seconds", help="How long the cameras are watched; 0: not at all.", min=0.0, max=600.0),
     ] = 2.0,
     pictures: Annotated[
         Path | None,
-        typer.Option(
-            "--pictures", help="Where what each camera sees is saved (default: the cell's state directory)."
-        ),
+        typer.Option("--pictures", help="Where what each camera sees is saved (default: the cell's state directory)."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -77,9 +71,7 @@ def doctor(
     emit({"checks": findings}, "", json)
 
 
-def examine_cell(
-    path: Path, may_move: MayMove, seconds: float, pictures: Path | None
-) -> Iterator[ExaminationFinding]:
+def examine_cell(path: Path, may_move: MayMove, seconds: float, pictures: Path | None) -> Iterator[ExaminationFinding]:
     """Findings on a cell, each as soon as it is known: its file, this computer, drives, cameras.
 
     ``seconds``: how long the cameras are watched; 0: not at all. Raises CellFileError, PluginError, DriverError where
@@ -124,8 +116,7 @@ def line_of(finding: ExaminationFinding) -> str:
 
 def _drivers(plan: RunPlan) -> str:
     cameras = ", ".join(
-        f"{c.name} {c.width}x{c.height} at {c.rate_hz:g} Hz, {len(c.marker_ids)} markers"
-        for c in plan.cameras
+        f"{c.name} {c.width}x{c.height} at {c.rate_hz:g} Hz, {len(c.marker_ids)} markers" for c in plan.cameras
     )
     return f"{plan.joints.driver}: {len(plan.joints.joints)} joints; {cameras}"
 
@@ -134,9 +125,7 @@ def _daemon(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     pid = holder(directories.daemon_lock)
     if pid is None:
         return ExaminationFinding("daemon", True, "none runs for this cell")
-    return ExaminationFinding(
-        "daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`"
-    )
+    return ExaminationFinding("daemon", None, f"process {pid} runs this cell already; end it with `kill {pid}`")
 
 
 def _rates(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:

@@ -57,13 +57,9 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFind
     directories = plan.directories
     pid = holder(directories.daemon_lock)
     if pid is not None:
-        yield ExaminationFinding(
-            "drives", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`"
-        )
+        yield ExaminationFinding("drives", None, f"not examined: the daemon (process {pid}) has them", f"`kill {pid}`")
         return
-    hardware = hardware_lock_path(
-        directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options
-    )
+    hardware = hardware_lock_path(directories.runtime.parent, plan.cell.joints.driver, plan.cell.joints.options)
     with ExitStack() as locks:
         try:
             locks.enter_context(FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}"))

@@ -71,9 +71,7 @@ def intrinsics(width: int, height: int, focal: float) -> FloatArray:
     return np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
 
 
-def poses(
-    pattern: FloatArray, pixels: FloatArray, K: FloatArray
-) -> list[tuple[float, FloatArray, FloatArray]]:
+def poses(pattern: FloatArray, pixels: FloatArray, K: FloatArray) -> list[tuple[float, FloatArray, FloatArray]]:
     """Poses of a plane pattern (k, 3) from its pixels (k, 2), best first: rms [px], rotation vector (3,), translation
     (3,); two that a distant plane cannot tell apart, or none.
     """
@@ -178,9 +176,7 @@ def turn_between(before: Sequence[CameraRecord], after: Sequence[CameraRecord]) 
     if not weights:
         return None
     _, camera, shift = min(shown, key=lambda one: one[0])
-    return Turn(
-        float(np.average(angles, weights=weights)), 1.0 / math.sqrt(sum(weights)), camera, np.asarray(shift)
-    )
+    return Turn(float(np.average(angles, weights=weights)), 1.0 / math.sqrt(sum(weights)), camera, np.asarray(shift))
 
 
 def judge_turn(joint: str, travel: float, turn: Turn | None) -> ExaminationFinding:
@@ -240,9 +236,7 @@ def examine_sides(records: Sequence[CameraRecord]) -> ExaminationFinding | None:
         return None
     name = f"sides {left.name}-{right.name}"
     if min(offsets) < 0.0 < max(offsets):
-        return ExaminationFinding(
-            name, None, "which camera stands on which side is not told by these pictures"
-        )
+        return ExaminationFinding(name, None, "which camera stands on which side is not told by these pictures")
     if min(offsets) > 0.0:
         return ExaminationFinding(name, True, f"{right.name!r} stands to the right of {left.name!r}")
     return ExaminationFinding(

@@ -56,15 +56,11 @@ def setup(
     ],
     answers: Annotated[
         Path | None,
-        typer.Option(
-            "--answers", metavar="FILE", help='Answers (KEY = "TEXT" in TOML) instead of a person\'s.'
-        ),
+        typer.Option("--answers", metavar="FILE", help='Answers (KEY = "TEXT" in TOML) instead of a person\'s.'),
     ] = None,
     option: Annotated[
         list[str] | None,
-        typer.Option(
-            "--option", metavar="KEY=VALUE", help="An option of the joint driver, as `init` takes it."
-        ),
+        typer.Option("--option", metavar="KEY=VALUE", help="An option of the joint driver, as `init` takes it."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -111,9 +107,7 @@ def _steps(file: Path, dialogue: Dialogue, extra: dict[str, Any]) -> dict[str, A
     fresh = "Each joint is going to move alone, as far as the plate stays in the pictures. Is the arm clear: calibrate?"
     calibrate = dialogue.confirm("calibrate", fresh if model is None else again, False)
     if model is None and not calibrate:
-        raise CommandError(
-            "not_calibrated", "without a model there is no goal; the same command goes on from here"
-        )
+        raise CommandError("not_calibrated", "without a model there is no goal; the same command goes on from here")
     with running(file, directories, dialogue) as client:
         if arm_is_off(client):
             with dialogue.doing("switching the drives on"):
@@ -148,9 +142,7 @@ def _commissioned(
     found: list[ExaminationFinding] = []
     _all(commission(plan, dialogue, sound, names), dialogue, found, sound)
     fault = in_fault(found)
-    if fault is not None and dialogue.confirm(
-        "reset", "Is the cause of that fault gone: reset the drives?", False
-    ):
+    if fault is not None and dialogue.confirm("reset", "Is the cause of that fault gone: reset the drives?", False):
         with dialogue.doing("resetting the drives"):
             reset_drives(plan)
         found, sound = [], [not _failed(findings)]
@@ -162,9 +154,7 @@ def _commissioned(
     if moved == set(names):
         note.write_text(mark, encoding="utf-8")
     elif any(finding.name.endswith(" jog") for finding in findings):
-        raise CommandError(
-            "not_commissioned", "not every joint was moved; the same command goes on from here"
-        )
+        raise CommandError("not_commissioned", "not every joint was moved; the same command goes on from here")
     elif not dialogue.confirm(
         "unexamined",
         f"Driver {plan.joints.driver!r} moves no joint for setup. Was each tried by itself?",
@@ -173,9 +163,7 @@ def _commissioned(
         raise CommandError("not_commissioned", "`stereoservo driver-check --cell FILE --hardware` tries them")
 
 
-def _examined(
-    file: Path, dialogue: Dialogue, findings: list[ExaminationFinding]
-) -> tuple[RunPlan, CellDirectories]:
+def _examined(file: Path, dialogue: Dialogue, findings: list[ExaminationFinding]) -> tuple[RunPlan, CellDirectories]:
     """The plan of the cell, with the findings on file and computer told."""
     examination = examine_file(file)
     with dialogue.doing("loading drivers and detectors"):
@@ -228,9 +216,7 @@ def _stop_where_failed(findings: list[ExaminationFinding], dialogue: Dialogue, f
     failed = _failed(findings)
     if not failed:
         return
-    dialogue.heading(
-        f"{len(failed)} found wrong; mend {file} or the hardware, then run the same command again"
-    )
+    dialogue.heading(f"{len(failed)} found wrong; mend {file} or the hardware, then run the same command again")
     for finding in failed:
         dialogue.say(line_of(finding))
     raise CommandError(
@@ -345,9 +331,7 @@ def commission(
                 "Ctrl-C stops it. Look at the arm: which joint moves, and which way?"
             )
             asked.append(
-                dialogue.confirm(
-                    "move", "Is the arm clear all around, and a hand on the emergency stop?", False
-                )
+                dialogue.confirm("move", "Is the arm clear all around, and a hand on the emergency stop?", False)
             )
         if not asked[0]:
             return 0.0
@@ -388,14 +372,10 @@ def seen_by_pictures(
     kind = next(spec.kind for spec in plan.joints.joints if spec.name == joint)
     if kind == "revolute":
         return judge_turn(joint, travel, turn_between(before, after))
-    return ExaminationFinding(
-        f"{joint} pictures", None, "a slide turns nothing: its travel is not judged by pictures"
-    )
+    return ExaminationFinding(f"{joint} pictures", None, "a slide turns nothing: its travel is not judged by pictures")
 
 
-def asked_of_a_person(
-    dialogue: Dialogue, jogged: tuple[str, float], names: Sequence[str]
-) -> ExaminationFinding:
+def asked_of_a_person(dialogue: Dialogue, jogged: tuple[str, float], names: Sequence[str]) -> ExaminationFinding:
     """Finding on a jog by what a person saw."""
     joint, travel = jogged
     wanted = f"{joint}{'+' if travel > 0 else '-'}"
@@ -511,15 +491,11 @@ def calibrated(client: Client, dialogue: Dialogue) -> dict[str, Any]:
 def first_goal(client: Client, directories: CellDirectories, dialogue: Dialogue) -> dict[str, Any]:
     """Teach a goal where the arm stands, send the arm away and back to it by the pictures. Raises ClientError."""
     known = load_taught(directories.taught)
-    name = dialogue.ask(
-        "goal", "A name for the goal that the cameras see now", next(iter(known), "first"), _goal_name
-    )
+    name = dialogue.ask("goal", "A name for the goal that the cameras see now", next(iter(known), "first"), _goal_name)
     if name not in known:
         with dialogue.doing("averaging what the cameras see"):
             dialogue.say(f"   {client.teach(name).message}")
-    if not dialogue.confirm(
-        "go", "Send the arm a little way off, and back to that goal by its pictures?", True
-    ):
+    if not dialogue.confirm("go", "Send the arm a little way off, and back to that goal by its pictures?", True):
         return {"name": name, "outcome": "not sent"}
     with dialogue.doing("the arm moves off by its joints"):
         client.goal(away(client)).reached(GOAL_S)

@@ -81,9 +81,7 @@ def _cameras(dialogue: Dialogue) -> list[CameraSection]:
         found = finder.find_cameras()
     for k, camera in enumerate(found):
         modes = ", ".join(f"{w}x{h} at {rate:g} Hz" for w, h, rate in camera.modes[:3])
-        dialogue.say(
-            f"   {k}: {camera.name}, {Address(str(camera.options['source']))}; {modes or 'modes unknown'}"
-        )
+        dialogue.say(f"   {k}: {camera.name}, {Address(str(camera.options['source']))}; {modes or 'modes unknown'}")
     if not found:
         dialogue.say(
             "   no camera is at this computer's ports; network cameras have an address (http://, rtsp://, genicam://)"
@@ -215,9 +213,7 @@ def _joints(dialogue: Dialogue, scan: BusScan) -> list[JointChoice]:
         lambda text: velocity_units(text, n),
     )
     joints = [
-        JointChoice(
-            f"j{k + 1}", drive, "prismatic" if slide else "revolute", counts[k], gears[k], units[k], 0, 0, 1
-        )
+        JointChoice(f"j{k + 1}", drive, "prismatic" if slide else "revolute", counts[k], gears[k], units[k], 0, 0, 1)
         for k, (drive, slide) in enumerate(order)
     ]
     ranges = dialogue.ask(

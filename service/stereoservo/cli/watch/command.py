@@ -38,9 +38,7 @@ def watch(
         bool, typer.Option("--foxglove", help="Serve it to Foxglove on this host, markers included.")
     ] = False,
     port: Annotated[int, typer.Option(help="Port of --foxglove.", min=0, max=65535)] = 8765,
-    rerun: Annotated[
-        bool, typer.Option("--rerun", help="Show it in the Rerun viewer, markers included.")
-    ] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Show it in the Rerun viewer, markers included.")] = False,
     save: Annotated[
         Path | None, typer.Option(metavar="FILE.rrd", help="With --rerun: write a file, open no viewer.")
     ] = None,
@@ -99,9 +97,7 @@ def _line(message: StateMessage | EventMessage | FeaturesMessage) -> str:
         return f"      {message.camera} frame {message.seq}: {len(message.ids)} markers"
     parts = [message.lifecycle, message.source, progress_words(message)]
     parts.append(" ".join(f"{q:+.3f}" for q in message.joints.values()) or "joints unknown")
-    return (
-        "      " + ", ".join(filter(None, parts)) + "".join(f"; {_why(reason)}" for reason in message.reasons)
-    )
+    return "      " + ", ".join(filter(None, parts)) + "".join(f"; {_why(reason)}" for reason in message.reasons)
 
 
 def _why(reason: Reason) -> str:

@@ -168,9 +168,7 @@ BLOCKED = 1e-3
 
 
 @kernel
-def _one_rotation(
-    freedoms: Freedoms, parts: Components, screw: FloatArray, V: FloatArray
-) -> tuple[float, int]:
+def _one_rotation(freedoms: Freedoms, parts: Components, screw: FloatArray, V: FloatArray) -> tuple[float, int]:
     """Angle and status of hinge and planar turn as one rotation (8.50 to 8.52); writes its screw and
     generator ``V``.
     """
@@ -393,9 +391,7 @@ class Stepped(NamedTuple):
 
 
 @kernel
-def _normalised_step_into(
-    arm: PresentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped
-) -> None:
+def _normalised_step_into(arm: PresentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped) -> None:
     """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
     the task error are in the frame of the arguments.
 
@@ -489,9 +485,7 @@ def _kept_in_view(
                     generators[1, i, k] = V[i, k]
     else:
         turned = amount[1] if status[1] == MOVES else 0.0
-        angle, share, turn, clear = way_in_sight(
-            face, generators[1], displacement, camera_centres, side, turned
-        )
+        angle, share, turn, clear = way_in_sight(face, generators[1], displacement, camera_centres, side, turned)
     if angle < 0.0:
         scale_primitive(screws[1], generators[1], -1.0)
     if single or status[1] == MOVES:

@@ -79,12 +79,7 @@ def points_step(operators: FloatArray, task: PointTask, gains: Gains) -> tuple[F
             for i in range(4):
                 error += g[i] * (target_points[p, i] - points[p, i])
             for j in range(n):
-                row[j] = (
-                    g[0] * velocity[j, 0]
-                    + g[1] * velocity[j, 1]
-                    + g[2] * velocity[j, 2]
-                    + g[3] * velocity[j, 3]
-                )
+                row[j] = g[0] * velocity[j, 0] + g[1] * velocity[j, 1] + g[2] * velocity[j, 2] + g[3] * velocity[j, 3]
             add_equation(row, error, w * w, N, b)
     conditioning = damped_solve(N, b, damping, x)
     if choice == MEAN:

@@ -185,9 +185,7 @@ def image_step(operators: FloatArray, view: View, body: Body, gains: Gains) -> t
 
 
 @kernel
-def _image_step_into(
-    operators: FloatArray, view: View, body: Body, gains: Gains, velocity: FloatArray
-) -> float:
+def _image_step_into(operators: FloatArray, view: View, body: Body, gains: Gains, velocity: FloatArray) -> float:
     """Write `image_step` to ``velocity`` (n,); returns the conditioning."""
     x, conditioning = image_step(operators, view, body, gains)
     velocity[:] = x
@@ -195,9 +193,7 @@ def _image_step_into(
 
 
 @kernel
-def _image_step(
-    operators: FloatArray, view: Fields, body: Fields, gains: Fields, velocity: FloatArray
-) -> float:
+def _image_step(operators: FloatArray, view: Fields, body: Fields, gains: Fields, velocity: FloatArray) -> float:
     """`_image_step_into` for Python, with the fields of a `View`, a `Body` and of `Gains`."""
     return _image_step_into(operators, View(*view), Body(*body), Gains(*gains), velocity)
 
@@ -213,9 +209,7 @@ def image_kernel(room: Record) -> None:
         work.no_rates[: 2 * c * m].reshape((c, m, 2)), work.usable[: c * m].reshape((c, m)),
         work.wanted[: c * m].reshape((c, m)),
     )  # fmt: skip
-    body = Body(
-        work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.target_known[:m]
-    )
+    body = Body(work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.target_known[:m])
     operators = work.operators[: 16 * n].reshape((n, 4, 4))
     gains = Gains(gain_held(work.gain, work.dt_s), work.jacobian_choice, DAMPING)
     work.conditioning = _image_step_into(operators, view, body, gains, work.velocity[:n])
@@ -261,9 +255,7 @@ def held_gain(options: Options) -> float:
     return float(gain_held(options.gain, options.dt_s))
 
 
-def image_velocity_step(
-    scene: Scene, task: Task, options: Options, jacobian: int, rates: FloatArray
-) -> LawStep:
+def image_velocity_step(scene: Scene, task: Task, options: Options, jacobian: int, rates: FloatArray) -> LawStep:
     """The kernel's step for a choice of the Jacobian and a feed-forward (c, m, 2) [px/s]."""
     view = (
         scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted
@@ -287,9 +279,7 @@ def image_reasons(step: LawStep) -> tuple[Reason, ...]:
     """Reasons of a step of a law in the images."""
     if step.conditioning >= ILL_CONDITIONED:
         return ()
-    hint = (
-        f"the arm is near a singularity, or the markers do not fix its pose: jog away, or use {DEFAULT_LAW}"
-    )
+    hint = f"the arm is near a singularity, or the markers do not fix its pose: jog away, or use {DEFAULT_LAW}"
     return (Reason("JACOBIAN_ILL_CONDITIONED", "slow", "", step.conditioning, ILL_CONDITIONED, "", hint),)
 
 

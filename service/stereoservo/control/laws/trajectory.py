@@ -95,9 +95,7 @@ def trajectory_step(
 
 
 @kernel
-def _refine(
-    arm: PresentArm, view: View, points: FloatArray, plan: Pull, held_step: HeldStep, x: FloatArray
-) -> None:
+def _refine(arm: PresentArm, view: View, points: FloatArray, plan: Pull, held_step: HeldStep, x: FloatArray) -> None:
     """Refine a held velocity ``x`` (n,), so that the images move as intended to all orders; the gain is that of a
     velocity that is held.
     """

@@ -144,9 +144,7 @@ def _known(goal_id: str, context: StepContext) -> bool:
 def new_id(goal_id: str, context: StepContext) -> None:
     """Raises RefusalError for an id that another goal has: each goal ends with an event of its own."""
     if _known(goal_id, context):
-        raise RefusalError(
-            "ID_IN_USE", f"a goal {goal_id} is active or queued; give an id of its own", subject=goal_id
-        )
+        raise RefusalError("ID_IN_USE", f"a goal {goal_id} is active or queued; give an id of its own", subject=goal_id)
 
 
 def _enqueue(goal: Goal, request: int, context: StepContext) -> Accepted | None:
@@ -385,9 +383,7 @@ def _answer(request: Request, context: StepContext) -> None:
         return
     if done is not None:
         message, plan = (done, None) if isinstance(done, str) else done
-        context.emit(
-            "reply", request=request.request, accepted=True, message=message, id=id_of(command), plan=plan
-        )
+        context.emit("reply", request=request.request, accepted=True, message=message, id=id_of(command), plan=plan)
 
 
 def _reply_refused(request: Request, refusal: RefusalError, context: StepContext) -> None:
@@ -454,9 +450,7 @@ def _calibrate(command: Calibrate, request: Request, context: StepContext) -> st
     if context.settings.trials is None:
         raise RefusalError("NO_TRIALS", "the cell file has no [calibration] section")
     if command.reset_zeros and not command.check:
-        raise RefusalError(
-            "RESET_WITHOUT_CHECK", "joint zeros are reset by a check: give check as well as reset_zeros"
-        )
+        raise RefusalError("RESET_WITHOUT_CHECK", "joint zeros are reset by a check: give check as well as reset_zeros")
     if MOTION_SOURCES[type(state.source)].measures and goal_of(state.source) == command.id:
         return "already accepted"  # a client's retry
     new_id(command.id, context)
@@ -484,9 +478,7 @@ def _enable(command: Enable, request: Request, context: StepContext) -> str:
     if state.lifecycle == Lifecycle.FAULT:
         raise RefusalError(
             "IN_FAULT",
-            "the cell is in fault: "
-            + "; ".join(r.hint for r in state.fault)
-            + ". Clear the cause, then reset",
+            "the cell is in fault: " + "; ".join(r.hint for r in state.fault) + ". Clear the cause, then reset",
         )
     if state.lifecycle == Lifecycle.UNCONFIGURED:
         raise RefusalError("NOT_CONFIGURED", "the joint driver is not configured yet")
@@ -506,15 +498,11 @@ def _jog(command: Jog, request: Request, context: StepContext) -> str:
         raise RefusalError("BUSY", f"{waits}: cancel it before jogging", subject=active)
     if state.planning is not None and not state.planning.goal.check:
         planned = state.planning.goal.id
-        raise RefusalError(
-            "BUSY", f"goal {planned} is being planned: cancel it before jogging", subject=planned
-        )
+        raise RefusalError("BUSY", f"goal {planned} is being planned: cancel it before jogging", subject=planned)
     velocity = np.zeros_like(context.q)
     for name, speed in command.velocities.items():
         if not math.isfinite(speed):
-            raise RefusalError(
-                "NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name
-            )
+            raise RefusalError("NON_FINITE", f"joint {name}: velocity {speed} is not a finite number", subject=name)
         velocity[joint_index(name, context.settings)] = speed
     state.source = Jogging(velocity, context.now_ns + int(command.lease_s * 1e9))
     return f"jogging for {command.lease_s} s"

@@ -109,15 +109,11 @@ def place_now(context: StepContext) -> BodyState:
     assert arrays is not None
     assert prediction is not None
     points = markers_at(arrays, context.q + context.state.block.correction)
-    seen = (
-        np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
-    )
+    seen = np.zeros((len(context.settings.cameras), len(points))) if context.weights is None else context.weights
     if arrays.groups is not None:
         faces = select_faces(arrays.groups, points, arrays.camera_centres, seen)
     else:  # recorded before models stated them: found for each goal, from the pose at its start
-        faces = find_faces(
-            points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators
-        )
+        faces = find_faces(points, arrays.matrices, FLAT_PX, arrays.camera_centres, seen, prediction.operators)
     # A goal may be resolved over several steps, but the workspace is overwritten in each: copy.
     return BodyState(context.settings, arrays, points, prediction.operators.copy(), faces)
 
@@ -369,9 +365,7 @@ class ReachedPose:
     marker: int
 
 
-def reached_pose(
-    arrays: ModelArrays, joints: FloatArray, set_points: FloatArray, wanted: FloatArray
-) -> ReachedPose:
+def reached_pose(arrays: ModelArrays, joints: FloatArray, set_points: FloatArray, wanted: FloatArray) -> ReachedPose:
     """Least squares of set-points (c, m, 2) that are ``wanted`` (c, m) in the arm's own joints, from ``joints`` (n,).
 
     Degrees of freedom that the set-points do not determine are not moved.
@@ -517,10 +511,5 @@ def determinant4(A: FloatArray) -> float:
     top = [a[i] * b[j] - a[j] * b[i] for i, j in combinations(range(4), 2)]
     low = [c[i] * d[j] - c[j] * d[i] for i, j in combinations(range(4), 2)]
     return float(
-        top[0] * low[5]
-        - top[1] * low[4]
-        + top[2] * low[3]
-        + top[3] * low[2]
-        - top[4] * low[1]
-        + top[5] * low[0]
+        top[0] * low[5] - top[1] * low[4] + top[2] * low[3] + top[3] * low[2] - top[4] * low[1] + top[5] * low[0]
     )

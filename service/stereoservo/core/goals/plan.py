@@ -121,9 +121,7 @@ def _plan_request(
             velocity_max=limits.velocity_max * (PLANNED_SPEED * limits.speed_scale),
             acceleration_max=limits.acceleration_max * PLANNED_ACCELERATION,
             keep_outs=keep_outs,
-            sizes=np.array(
-                [(settings.cameras[c].width, settings.cameras[c].height) for c in used], dtype=np.float64
-            ),
+            sizes=np.array([(settings.cameras[c].width, settings.cameras[c].height) for c in used], dtype=np.float64),
             lenses=np.ascontiguousarray(arrays.lenses[used]),
             view_margin_px=VIEW_MARGIN_PX,
         ),
@@ -205,11 +203,7 @@ def _require_components(job: PlanJob, context: StepContext) -> None:
     source, arrays = job.source, context.arrays
     assert source is not None
     assert arrays is not None
-    if (
-        context.derived.laws[source.law].path != "straight"
-        or context.weights is None
-        or context.pixels is None
-    ):
+    if context.derived.laws[source.law].path != "straight" or context.weights is None or context.pixels is None:
         return
     found = goal_error(source, context, arrays, context.weights, context.pixels)
     _, task = choose(source, context, *scene_and_task(source, context, arrays, found))
@@ -254,9 +248,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
         seconds=seconds,
         approaches=tuple(_approach(approach, job, context) for approach in plan.approaches),
         shares=tuple(float(plan.shares[k]) for k in at),
-        joints={
-            name: tuple(float(plan.joints[k, j]) for k in at) for j, name in enumerate(settings.joint_names)
-        },
+        joints={name: tuple(float(plan.joints[k, j]) for k in at) for j, name in enumerate(settings.joint_names)},
         pixels={
             camera.name: pixels
             for camera, used, pixels in zip(
@@ -282,9 +274,7 @@ def _exponential_s(job: PlanJob, context: StepContext) -> float:
 
 
 @kernel
-def _largest_error(
-    matrices: FloatArray, points: FloatArray, set_points: FloatArray, weights: FloatArray
-) -> float:
+def _largest_error(matrices: FloatArray, points: FloatArray, set_points: FloatArray, weights: FloatArray) -> float:
     """Largest distance [px] of ``points`` (m, 4) from ``set_points`` (c, m, 2), times ``weights`` (c, m)."""
     pixels, _ = project_points(matrices, points)
     errors = np.empty(weights.shape)
@@ -365,9 +355,7 @@ def prepare(
     if isinstance(target, JointTarget):
         return joint_goal(goal, target, context)
     if isinstance(target, TaughtTarget):
-        raise RefusalError(
-            "TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name
-        )
+        raise RefusalError("TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name)
     epoch = trusted_model(context)
     if context.state.reanchoring is not None:
         refuse_while_moved(context.state)

@@ -50,9 +50,7 @@ def reported_pixels(arrays: ModelArrays, displacements: FloatArray, points: Floa
 
 
 @kernel
-def _raw_paths(
-    matrices: FloatArray, lenses: FloatArray, displacements: FloatArray, points: FloatArray
-) -> FloatArray:
+def _raw_paths(matrices: FloatArray, lenses: FloatArray, displacements: FloatArray, points: FloatArray) -> FloatArray:
     """Raw pixels (k, c, m, 2) of ``points`` (m, 4) after ``displacements`` (k, 4, 4); NaN beyond a lens's fold."""
     found = np.empty((displacements.shape[0], matrices.shape[0], points.shape[0], 2))
     for k in range(displacements.shape[0]):

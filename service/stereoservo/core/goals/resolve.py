@@ -116,9 +116,7 @@ def _features(aim: GoalResolution, target: FeatureTarget, place: BodyState) -> N
 def _triangulated(aim: GoalResolution, place: BodyState) -> None:
     """Triangulate the markers at the goal from set-points. Raises RefusalError if too few are shown."""
     arrays = place.arrays
-    aim.targets, aim.known = _intersected(
-        arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity
-    )
+    aim.targets, aim.known = _intersected(arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity)
     shown = int((aim.wanted.sum(axis=0) > 0).sum())
     needed = fewest_markers(len(place.operators))
     if shown < needed:
@@ -235,10 +233,7 @@ def marker_index(marker: int, arrays: ModelArrays) -> int:
 def marker_indices(markers: Iterable[int], arrays: ModelArrays) -> list[int]:
     """`marker_index` of each of the ``markers``. Raises RefusalError."""
     found = list(map(arrays.index.get, markers))
-    return [
-        marker_index(marker, arrays) if row is None else row
-        for marker, row in zip(markers, found, strict=True)
-    ]
+    return [marker_index(marker, arrays) if row is None else row for marker, row in zip(markers, found, strict=True)]
 
 
 def _numbers(rows: Iterable[Iterable[float]], width: int) -> FloatArray:
@@ -368,9 +363,7 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
     """``E`` (4, 4) from the coordinates of five markers' basis to the model's frame (2.20, corrected)."""
     indices = [marker_index(marker, place.arrays) for marker in ids]
     if len(set(indices)) < 5:
-        raise RefusalError(
-            "DEGENERATE_BASIS", f"basis {list(ids)} names a marker twice; five different are needed"
-        )
+        raise RefusalError("DEGENERATE_BASIS", f"basis {list(ids)} names a marker twice; five different are needed")
     M = np.ascontiguousarray(place.points[indices[:4]].T)
     middle = place.points[indices].sum(axis=0) / 5.0
     extent = float(np.sqrt(((place.points[indices] - middle) ** 2).sum(axis=-1).max()))
@@ -542,9 +535,7 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
 
 
 @kernel
-def _largest_triangle(
-    candidates: IntArray, set_points: FloatArray, wanted: FloatArray
-) -> tuple[IntArray, float]:
+def _largest_triangle(candidates: IntArray, set_points: FloatArray, wanted: FloatArray) -> tuple[IntArray, float]:
     """Three of the ``candidates`` (k,) with the largest area, and twice that [px²]: the smallest over the cameras that
     see all three.
     """

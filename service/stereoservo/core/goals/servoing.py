@@ -73,9 +73,7 @@ def run_fields(goal: Goal, context: StepContext, used: FloatArray) -> dict[str, 
     """Fields of a `LawRun` before its first step: the goal's values, or else the cell's."""
     settings = context.settings
     gain = goal.gain or settings.gain
-    near, far, slope = (
-        (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
-    )
+    near, far, slope = (gain.near, gain.far, gain.slope) if isinstance(gain, AdaptiveGain) else (gain, gain, 1.0)
     return {
         "goal": goal,
         "points": goal.points or settings.points,
@@ -146,14 +144,10 @@ def _centre(
     if centre is None:
         weights = aim.known.astype(np.float64) / max(float(aim.known.sum()), 1.0)
     elif bool(centre.markers) == (centre.point is not None):
-        raise RefusalError(
-            "CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none"
-        )
+        raise RefusalError("CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none")
     elif centre.point is not None:
         if centre.model_epoch is None:
-            raise RefusalError(
-                "FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is"
-            )
+            raise RefusalError("FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is")
         of_this_model(centre.model_epoch, epoch)
         now = normalize_scale(np.array(centre.point), arrays, "the centre")[None]
         H = chain_at(arrays, aim.joints)[0]

@@ -172,9 +172,7 @@ def step(context: StepContext) -> None:
     if isinstance(state.source, PoseMeasurement):
         state.reanchoring = None  # calibration and check do not use the previous model
         return
-    resting = bool(
-        (np.abs(state.block.command) < AT_REST).all() and (np.abs(state.block.velocities) < RESTING).all()
-    )
+    resting = bool((np.abs(state.block.command) < AT_REST).all() and (np.abs(state.block.velocities) < RESTING).all())
     if run.phase in ("collect", "wait", "failed") and _moved_again(run, context):
         return
     if run.phase == "brake":
@@ -188,12 +186,7 @@ def step(context: StepContext) -> None:
         else:
             _enter(run, "brake", context)
     elif run.phase == "wait":
-        if (
-            state.pending_model is not None
-            and state.pending_reanchored
-            and resting
-            and state.planning is None
-        ):
+        if state.pending_model is not None and state.pending_reanchored and resting and state.planning is None:
             _carry_over(run, context)
         elif (context.now_ns - run.phase_ns) * 1e-9 > ANSWER_S:
             why = "no model came: the computer is overloaded (`uptime`), or the gateway hangs; see the daemon's log"
@@ -353,9 +346,7 @@ def _unproven(run: Relocalization, context: StepContext) -> bool:
     if not run.doubt:
         return False
     run.tried_seen = _seen_now(run, context)
-    hint = (
-        f"{run.doubt}. It is looked at again when more is seen, when the arm rests elsewhere, and on resume"
-    )
+    hint = f"{run.doubt}. It is looked at again when more is seen, when the arm rests elsewhere, and on resume"
     _give_up(run, context, _doubtful(run, hint))
     return True
 
@@ -396,9 +387,7 @@ def _seen_now(run: Relocalization, context: StepContext) -> int:
     """
     cameras = range(len(context.settings.cameras)) if run.doubt else _moved(run, context)
     return sum(
-        int(context.state.watching.sightings[c].seen.sum())
-        for c in cameras
-        if _after(c, run.phase_ns, context.state)
+        int(context.state.watching.sightings[c].seen.sum()) for c in cameras if _after(c, run.phase_ns, context.state)
     )
 
 
@@ -433,18 +422,14 @@ def _carry_over(run: Relocalization, context: StepContext) -> None:
     old, model = state.model, state.pending_model
     assert old is not None
     assert model is not None
-    moved = tuple(
-        c for c, camera in enumerate(context.settings.cameras) if camera.name in state.pending_reanchored
-    )
+    moved = tuple(c for c, camera in enumerate(context.settings.cameras) if camera.name in state.pending_reanchored)
     new: ModelArrays = model_arrays(model, context.settings)
     epochs = (old.epoch, model.epoch)
     carry_all(new, moved, epochs, context)
     _enter(run, "take", context)
 
 
-def carry_all(
-    new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int], context: StepContext
-) -> None:
+def carry_all(new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int], context: StepContext) -> None:
     """Reproject the running and the queued goals into the pixels of the cameras ``moved``, by their matrices in
     ``new``.
 
@@ -547,9 +532,7 @@ def carry_run(source: LawRun, place: BodyState, new: ModelArrays, moved: tuple[i
     return None
 
 
-def _intersected(
-    set_points: FloatArray, wanted: FloatArray, arrays: ModelArrays
-) -> tuple[FloatArray, BoolArray]:
+def _intersected(set_points: FloatArray, wanted: FloatArray, arrays: ModelArrays) -> tuple[FloatArray, BoolArray]:
     """Points (m, 4) of height 1 that two or more cameras show, and which are known (m,)."""
     found, ok = triangulate(arrays.matrices, set_points, wanted, 5)
     known = np.asarray(ok, dtype=bool) & (wanted.sum(axis=0) >= 2)
@@ -565,11 +548,7 @@ def _say_anew(
     for c in moved:
         side = np.sign(depths[c][known]).sum()
         for i in range(points.shape[0]):
-            inside = (
-                known[i]
-                and depths[c, i] * side > 0.0
-                and _raw_in_view(settings, new, c, pixels[c, i]) is not None
-            )
+            inside = known[i] and depths[c, i] * side > 0.0 and _raw_in_view(settings, new, c, pixels[c, i]) is not None
             wanted[c, i] = wanted[c, i] if inside else 0.0
             set_points[c, i] = pixels[c, i] if wanted[c, i] > 0.0 else 0.0
 

@@ -33,9 +33,7 @@ EFFORT_FLOOR = 0.01
 """Fraction of the largest effort of any joint with the same unit: least threshold, also for joints without load."""
 
 
-def collision_thresholds(
-    settings: CoreSettings, loads: JointLoads | None
-) -> tuple[FloatArray, FloatArray] | None:
+def collision_thresholds(settings: CoreSettings, loads: JointLoads | None) -> tuple[FloatArray, FloatArray] | None:
     """Thresholds (n,) of efforts' departures and of following errors, infinite where unknown; None: no monitoring."""
     contact = settings.contact
     if contact is None or not contact.enabled:
@@ -47,9 +45,7 @@ def collision_thresholds(
     )
 
 
-def learnt_collision_thresholds(
-    settings: CoreSettings, loads: JointLoads | None
-) -> tuple[FloatArray, FloatArray]:
+def learnt_collision_thresholds(settings: CoreSettings, loads: JointLoads | None) -> tuple[FloatArray, FloatArray]:
     """Thresholds (n,), (n,) from the trial motions; infinite for joints without data."""
     n = len(settings.joint_names)
     efforts, following = np.full(n, np.inf), np.full(n, np.inf)
@@ -71,11 +67,7 @@ def learnt_collision_thresholds(
 def learnt_loads(trials_id: str, state: CoreState) -> JointLoads | None:
     """The loads observed in the trial motions; None if the drives report none."""
     loads, block = state.loads, state.block
-    if (
-        loads is None
-        or loads.id != trials_id
-        or not (block.numbers.tells_efforts or block.numbers.tells_following)
-    ):
+    if loads is None or loads.id != trials_id or not (block.numbers.tells_efforts or block.numbers.tells_following):
         return None
     return JointLoads(
         velocities=loads.velocities.copy(),
@@ -110,9 +102,7 @@ def learn_loads(
     n = speed.size
     loads, block = state.loads, state.block
     if loads is None or loads.id != trials_id:
-        loads = state.loads = JointLoadStatistics(
-            trials_id, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n)
-        )
+        loads = state.loads = JointLoadStatistics(trials_id, np.zeros(n), np.zeros((n, n)), np.zeros(n), np.zeros(n))
     loads.velocities = np.maximum(loads.velocities, speed)
     loads.largest_efforts = np.maximum(loads.largest_efforts, np.abs(efforts))
     mover = int(speed.argmax())
@@ -141,9 +131,7 @@ def worst_contact(
     if effort:
         value, limit = float(efforts[joint]), float(effort_limits[joint])
         unit = settings.contact.effort_units[joint]
-        hint = (
-            f"joint {name} pushes with {value:.4g} {unit} more than a moment before, {limit:.4g} is allowed: "
-        )
+        hint = f"joint {name} pushes with {value:.4g} {unit} more than a moment before, {limit:.4g} is allowed: "
         return Reason("CONTACT_EFFORT", "hold", name, value, limit, unit, f"{hint}{way}effort")
     value, limit = float(following[joint]), float(following_limits[joint])
     unit = settings.joint_unit(joint)

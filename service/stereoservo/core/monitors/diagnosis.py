@@ -63,9 +63,7 @@ def diagnosis_reason(verdict: ModelDiagnosis) -> Reason | None:
     if verdict.kind == "marker_slipped":
         return Reason("MARKER_SLIPPED", "info", subject, verdict.moved_px, None, "px", verdict.text)
     if verdict.kind == "joint_zero":
-        return Reason(
-            "JOINT_ZERO_DRIFTED", "info", subject, value, verdict.deviation, verdict.unit, verdict.text
-        )
+        return Reason("JOINT_ZERO_DRIFTED", "info", subject, value, verdict.deviation, verdict.unit, verdict.text)
     if verdict.kind == "unclear":
         return Reason("IMAGES_UNEXPLAINED", "info", subject, verdict.moved_px, None, "px", verdict.text)
     return None

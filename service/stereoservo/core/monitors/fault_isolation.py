@@ -121,8 +121,7 @@ class Bench:
         squares = ((self.innovation * believed[..., None]) ** 2).sum(axis=-1)
         counts = 2.0 * (believed > 0.0).sum(axis=1)
         together = all(
-            float(total) <= improbable(float(count))
-            for total, count in zip(squares.sum(axis=1), counts, strict=True)
+            float(total) <= improbable(float(count)) for total, count in zip(squares.sum(axis=1), counts, strict=True)
         )
         return together and float(squares.max()) <= gate_threshold(self.settings.gate_sigma)
 
@@ -183,9 +182,7 @@ def _confirms_the_arm(bench: Bench, row: int) -> bool:
     return seen >= FEWEST_ON_ARM and bench.diagnose(row).kind == "nothing"
 
 
-def _static_evidence(
-    bench: Bench, camera: int
-) -> tuple[Literal["moved", "stand", "few", "unexplained"], int]:
+def _static_evidence(bench: Bench, camera: int) -> tuple[Literal["moved", "stand", "few", "unexplained"], int]:
     """What the static points in a camera's image prove about the camera, and how many it sees."""
     if camera not in bench.known:
         return "few", 0
@@ -238,11 +235,7 @@ def _each_by_itself(bench: Bench) -> ModelDiagnosis | None:
 def _unclear(found: ChangeDiagnosis, other: IsolatedChange | None) -> ModelDiagnosis:
     size = 0.0 if found.cause is None else found.cause.effect_px
     chi2 = found.chi2 / max(found.measurements, 1)
-    why = (
-        "two causes explain the images equally well"
-        if other is not None
-        else "no single cause explains the images"
-    )
+    why = "two causes explain the images equally well" if other is not None else "no single cause explains the images"
     return ModelDiagnosis(
         "unclear", size=chi2, unit="of the expected variance", moved_px=size,
         text=f"{why} (chi-square {chi2:.3g} times what noise gives): check the cell with calibrate --check",
@@ -253,14 +246,10 @@ def _told(bench: Bench, cause: IsolatedChange, words: str) -> ModelDiagnosis:
     arrays, settings, known, px = bench.arrays, bench.settings, bench.known, cause.effect_px
     by = f"by {px:.3g} px rms"
     if cause.kind in ("camera", "cameras"):
-        names = tuple(
-            settings.cameras[c].name for c in (known if cause.kind == "cameras" else [known[cause.index]])
-        )
+        names = tuple(settings.cameras[c].name for c in (known if cause.kind == "cameras" else [known[cause.index]]))
         degrees = math.degrees(cause.amount) if math.isfinite(cause.amount) else 0.0
         turned = f", turned by {degrees:.3g} degrees" if math.isfinite(cause.amount) else ""
-        kind: VerdictKind = (
-            "cameras_moved_together" if cause.kind == "cameras" and len(names) > 1 else "camera_moved"
-        )
+        kind: VerdictKind = "cameras_moved_together" if cause.kind == "cameras" and len(names) > 1 else "camera_moved"
         text = f"{named(names)}{words} {by}{turned}"
         return _proven(ModelDiagnosis(kind, names, degrees, 0.0, "degrees", px, text), bench)
     if cause.kind == "marker":

@@ -32,13 +32,9 @@ FRICTION = {"revolute": 0.01, "prismatic": 0.001}  # [rad/s, m/s] below which a 
 
 
 @lru_cache(maxsize=8)
-def of_kinds(
-    kinds: tuple[str, ...], resolution: tuple[float, ...]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def of_kinds(kinds: tuple[str, ...], resolution: tuple[float, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """``PLAY``, ``ANSWERS`` and ``FRICTION`` (n,) of joints of these kinds and encoder steps; read-only."""
-    play, answers, friction = (
-        np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION)
-    )
+    play, answers, friction = (np.array([value[kind] for kind in kinds]) for value in (PLAY, ANSWERS, FRICTION))
     if resolution:
         answers = np.maximum(answers, 1.5 * np.array(resolution))  # one encoder step to and fro is no motion
     for value in (play, answers, friction):
@@ -147,9 +143,7 @@ def delays_of(block: Record) -> DriveDelays:
 
 
 @kernel
-def measure_delays(
-    command: FloatArray, q: FloatArray, answers: FloatArray, dt_s: float, delays: DriveDelays
-) -> None:
+def measure_delays(command: FloatArray, q: FloatArray, answers: FloatArray, dt_s: float, delays: DriveDelays) -> None:
     """Update the ``delays`` by ``dt_s`` [s] at the velocities ``command`` (n,).
 
     ``answers`` (n,): least change of the readings ``q`` (n,).
@@ -176,9 +170,7 @@ def measure_delays(
             onset[PASSED_S, j] += dt_s
         elif abs(was_sent) >= travel:
             onset[PASSED_S, j] = 0.0
-        late = onset[PASSED_S, j] > LONGEST_DELAY_S or (
-            onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S
-        )
+        late = onset[PASSED_S, j] > LONGEST_DELAY_S or (onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S)
         if abs(made) >= travel or late:
             onset[PHASE, j], onset[TOWARDS, j] = WAITS, was_sent
             if not late and onset[PASSED_S, j] >= 0.0 and made * was_sent > 0.0:

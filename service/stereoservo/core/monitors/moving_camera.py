@@ -131,9 +131,7 @@ def see(
         return sights
     hidden = msgspec.structs.replace(sights, seen=np.zeros_like(sights.seen))
     if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
-        return (
-            hidden if mobile.moving else sights
-        )  # readings of a faulty drive must not be used to judge cameras
+        return hidden if mobile.moving else sights  # readings of a faulty drive must not be used to judge cameras
     points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
     basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
     assert basis is not None
@@ -172,9 +170,7 @@ def _known(
     return points, observed, weights
 
 
-def _follow(
-    mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameResiduals, found: Adjusted
-) -> None:
+def _follow(mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameResiduals, found: Adjusted) -> None:
     """Update the camera's pose by an explained frame, and decide whether it has moved since the frames before."""
     then = moved_matrix(P, mobile.reference)
     way = np.empty((4, 4))
@@ -358,12 +354,7 @@ def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
     state, settings = context.state, context.settings
     waited_s = (context.now_ns - mobile.found_ns) * 1e-9
     resting = bool((np.abs(state.block.command) < AT_REST).all())
-    if (
-        waited_s < HAND_OVER_S
-        or mobile.seen < FEWEST
-        or not settings.reanchor
-        or state.reanchoring is not None
-    ):
+    if waited_s < HAND_OVER_S or mobile.seen < FEWEST or not settings.reanchor or state.reanchoring is not None:
         return
     if resting and isinstance(state.source, Holding) and not state.queue and state.planning is None:
         name = settings.cameras[c].name

@@ -49,9 +49,7 @@ def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSetting
     trials = trial_settings(settings)
     n = q.size
     # One more than the positions of the spread joint: the last one is that joint at its base.
-    unseen = np.full(
-        (len(trials.spread_offsets) + 1, len(settings.cameras), len(settings.marker_ids), 2), np.nan
-    )
+    unseen = np.full((len(trials.spread_offsets) + 1, len(settings.cameras), len(settings.marker_ids), 2), np.nan)
     return CalibrationMotion(
         id=goal_id, lease_s=None, lease_until_ns=0, joint=-1, side=1, k=0, count=0, step=0.0, reach=np.zeros(2),
         turn=-1, seen_turns=0, base_pixels=unseen, last=unseen.copy(), last_at=0.0, before=unseen.copy(),
@@ -361,9 +359,7 @@ def _further(trials: CalibrationMotion, context: StepContext, settings: TrialSet
     return False
 
 
-def _promising(
-    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float
-) -> bool:
+def _promising(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float) -> bool:
     """Whether a planned joint continues to ``offset``: the markers remain visible according to the plan or to the last
     two stops.
 
@@ -426,25 +422,19 @@ def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSet
                 trials.target, trials.seen_turns, trials.turn = settings.base + offsets, 0, -1
                 enter(trials, "move", context)
                 return True
-        context.emit(
-            "warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints left out {why}"
-        )
+        context.emit("warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints left out {why}")
     return False
 
 
 def _left_out(trials: CalibrationMotion, context: StepContext, why: str) -> SourceOutput:
     """Skip a stop of all joints, and return to the base."""
-    context.emit(
-        "warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints {why}; left out"
-    )
+    context.emit("warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints {why}; left out")
     trials.target = trial_settings(context.settings).base.copy()
     enter(trials, "return", context)
     return _rest(context)
 
 
-def _back_off(
-    trials: CalibrationMotion, context: StepContext, settings: TrialSettings, where: str
-) -> SourceOutput:
+def _back_off(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, where: str) -> SourceOutput:
     """Reverse the last step; this side ends there, or continues with smaller steps if it has only started."""
     name = context.settings.joint_names[trials.joint]
     context.emit(
@@ -607,9 +597,7 @@ def _inside(pixels: FloatArray, width: int, height: int) -> npt.NDArray[np.bool_
     return np.asarray(inside.all(axis=-1))
 
 
-def extrapolated(
-    last: FloatArray, last_at: float, before: FloatArray, before_at: float, at: float
-) -> FloatArray:
+def extrapolated(last: FloatArray, last_at: float, before: FloatArray, before_at: float, at: float) -> FloatArray:
     """Pixels (p, c, m, 2) at offset ``at`` on the straight line through those of two stops."""
     found: FloatArray = last + (last - before) * ((at - last_at) / (last_at - before_at))
     return found

@@ -60,9 +60,7 @@ def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
     return np.array([*stops, trial.base])
 
 
-def start_check(
-    goal_id: str, context: StepContext, model: CellModel, reset_zeros: bool = False
-) -> CheckMotion:
+def start_check(goal_id: str, context: StepContext, model: CellModel, reset_zeros: bool = False) -> CheckMotion:
     """The check motion before its first move, to the base. ``reset_zeros`` is reported when it has finished."""
     targets = check_targets(context.settings, model)
     fields = first_visit(targets[0], context.q, context.now_ns, context.settings)
@@ -105,9 +103,7 @@ def check_step(checking: CheckMotion, context: StepContext) -> SourceOutput:
     if reason is not None:
         return _abort(checking, context, reason)
     if checking.index > 0 and markers_lost(checking, context, trial) and checking.index < last:
-        context.emit(
-            "warning", id=checking.id, message=f"check: stop {checking.index} loses the markers; left out"
-        )
+        context.emit("warning", id=checking.id, message=f"check: stop {checking.index} loses the markers; left out")
         return _next(checking, context)
     return continue_move(checking, context, trial)
 

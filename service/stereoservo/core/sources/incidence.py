@@ -54,9 +54,7 @@ SECOND_AT_REST = 5e-3
 """Joint velocity [rad/s or m/s] below which a second task has converged."""
 
 
-def start_incidence(
-    goal: Goal, target: IncidenceTarget, context: StepContext, place: BodyState
-) -> IncidenceGoal:
+def start_incidence(goal: Goal, target: IncidenceTarget, context: StepContext, place: BodyState) -> IncidenceGoal:
     """The state of the incidence law before its first step. Raises RefusalError naming the reason if the goal is
     unusable.
     """
@@ -143,9 +141,7 @@ def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> li
     return own
 
 
-def _fixed(
-    feature: Feature, dimension: int, name: str, place: BodyState, model_epoch: int | None
-) -> FloatArray:
+def _fixed(feature: Feature, dimension: int, name: str, place: BodyState, model_epoch: int | None) -> FloatArray:
     """The fixed feature (3, 4): a point of height 1, then its directions of height 0."""
     _one_way(feature, name, "fixed")
     if feature.markers:
@@ -159,9 +155,7 @@ def _fixed(
         )
     if feature.points:
         if model_epoch is None:
-            raise RefusalError(
-                "FRAME_UNKNOWN", f"{name}: points need the goal's model_epoch, in whose frame they are"
-            )
+            raise RefusalError("FRAME_UNKNOWN", f"{name}: points need the goal's model_epoch, in whose frame they are")
         points = np.array(feature.points, dtype=np.float64)
     else:
         points = _triangulated(feature, name, place)
@@ -214,9 +208,7 @@ def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> 
     if step.share < MAKEABLE:
         _has_freedoms(source, scene, place)
     bad = tuple(
-        reason
-        for reason in incidence_reasons(step, _task(source), source.names)
-        if reason.code != "INCIDENCE_UNSEEN"
+        reason for reason in incidence_reasons(step, _task(source), source.names) if reason.code != "INCIDENCE_UNSEEN"
     )
     if bad:
         first = bad[0]
@@ -230,9 +222,7 @@ def _has_freedoms(source: IncidenceGoal, scene: Scene, place: BodyState) -> None
     """Raises RefusalError for an incidence that needs a degree of freedom which the arm lacks in every posture."""
     camera = f"camera {place.settings.cameras[0].name}"
     try:
-        lacking = incidence_freedoms(
-            scene, _task(source), place.arrays.plane_at_infinity, camera=camera, anywhere=True
-        )
+        lacking = incidence_freedoms(scene, _task(source), place.arrays.plane_at_infinity, camera=camera, anywhere=True)
     except GeometryError:
         return  # arm and cameras determine no right angles, so the motion has no name: the law itself will report it
     for name, freedom in zip(source.names, lacking, strict=True):
@@ -285,13 +275,9 @@ def _task(source: IncidenceGoal) -> IncidenceTask:
 
 def _second(source: IncidenceGoal, context: StepContext, scene: Scene, gain: float) -> SecondTask:
     if bool((source.joints_wanted > 0.0).any()):
-        return joint_task(
-            context.q, source.joints, source.joints_wanted, context.settings.limits.velocity_max, gain
-        )
+        return joint_task(context.q, source.joints, source.joints_wanted, context.settings.limits.velocity_max, gain)
     if bool((source.wanted > 0.0).any()):
-        return image_task(
-            scene.operators, scene.matrices, scene.points, source.set_points, source.wanted, gain
-        )
+        return image_task(scene.operators, scene.matrices, scene.points, source.set_points, source.wanted, gain)
     return no_second_task(len(context.q))
 
 

@@ -149,9 +149,7 @@ def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
 # -- every step -----------------------------------------------------------------------------------------------
 
 
-def approach_velocity(
-    q: FloatArray, target: FloatArray, settings: CoreSettings, speed_scale: float
-) -> FloatArray:
+def approach_velocity(q: FloatArray, target: FloatArray, settings: CoreSettings, speed_scale: float) -> FloatArray:
     """Joint velocity (n,) on the straight joint-space line to ``target``, slow enough to brake on it.
 
     A joint with a coarse encoder does not move once it has arrived: it would hunt between two counts.
@@ -193,9 +191,7 @@ def farthest(q: FloatArray, target: FloatArray, settings: CoreSettings) -> int:
 def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
     """One step of a joint move; it ends when the arm has arrived and rests, or at its time limit."""
     ahead = joints_ahead(context)
-    still = arrived(context.q, move.target, context.settings) and arrived(
-        ahead, move.target, context.settings
-    )
+    still = arrived(context.q, move.target, context.settings) and arrived(ahead, move.target, context.settings)
     move.settled = move.settled + 1 if still else 0
     worst = farthest(context.q, move.target, context.settings)
     if move.settled >= ARRIVED_STEPS:

@@ -60,12 +60,7 @@ SELF_MOTION_RATE = 0.5
 
 def by_kernel(source: ServoGoal, law: Law) -> bool:
     """Whether the kernel of a ``law`` alone drives to a goal: the goal is static and uses predicted points."""
-    return (
-        law.kernel is not None
-        and source.stream is None
-        and source.followed is None
-        and source.points == "predicted"
-    )
+    return law.kernel is not None and source.stream is None and source.followed is None and source.points == "predicted"
 
 
 def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
@@ -183,9 +178,7 @@ def found_by_kernel(source: ServoGoal, context: StepContext) -> SourceOutput:
     )
 
 
-def damp(
-    source: LawRun, context: StepContext, velocity: FloatArray, expected: FloatArray | float = 0.0
-) -> FloatArray:
+def damp(source: LawRun, context: StepContext, velocity: FloatArray, expected: FloatArray | float = 0.0) -> FloatArray:
     """``velocity`` (n,) with the goal's damping. ``expected`` (n,): the part of the velocity that is not caused by an
     error; it is not damped.
     """
@@ -289,9 +282,7 @@ class Aim(NamedTuple):
 
 
 @kernel
-def _measure(
-    weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArray
-) -> tuple[bool, float, int]:
+def _measure(weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArray) -> tuple[bool, float, int]:
     """Returns whether an error was measured, the largest distance [px] over markers and cameras, and how many markers
     are seen; writes the weights of the usable cameras to ``usable`` (c, m).
     """
@@ -320,9 +311,7 @@ def follow_goal(block: Record, room: Record) -> bool:
     """
     memory, work = block[0], room[0]
     n, c, m = work.joints, work.cameras, work.markers
-    aim = Aim(
-        work.used[:c], work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2))
-    )
+    aim = Aim(work.used[:c], work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2)))
     measured, error_px, work.seen = _measure(
         work.weights[: c * m].reshape((c, m)), work.pixels[: 2 * c * m].reshape((c, m, 2)), aim,
         work.usable[: c * m].reshape((c, m)),
@@ -334,9 +323,7 @@ def follow_goal(block: Record, room: Record) -> bool:
     centre_into(arm, joints, points, Centre(work.centre_weights[:m], work.centre_body), work.centre)
     known_px = error_px if measured else math.nan
     terms = RunTerms(work.tolerance_px, work.hold_frames, work.time_limit_s)
-    work.run_found = account_run(
-        block, measured, known_px, work.seen >= work.markers_needed, work.dt_s, terms
-    )
+    work.run_found = account_run(block, measured, known_px, work.seen >= work.markers_needed, work.dt_s, terms)
     work.gain = adaptive_gain(work.gain_near, work.gain_far, work.gain_slope, known_px)
     work.followed = 1
     return bool(work.run_found == GOES_ON and work.seen >= work.markers_needed)
@@ -361,9 +348,7 @@ def away_from_limits(context: StepContext) -> FloatArray:
     assert context.prediction is not None
     limits = context.settings.limits
     rows = np.ascontiguousarray(context.prediction.jacobian).reshape(-1, len(context.q))
-    return self_motion_from_limits(
-        rows, context.q, limits.position_min, limits.position_max, SELF_MOTION_RATE
-    )
+    return self_motion_from_limits(rows, context.q, limits.position_min, limits.position_max, SELF_MOTION_RATE)
 
 
 def run_ended(
@@ -410,9 +395,7 @@ def _ended(
             "TOO_FEW_MARKERS", "hold", "", float(seen), float(needed), "markers",
             "bring the goal's markers back into view",
         )  # fmt: skip
-        return SourceOutput(
-            np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,)
-        )
+        return SourceOutput(np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,))
     if run == SETTLED and may_end:
         frames = context.state.block.numbers.run.last_frames
         if source.apart_frames != frames:
@@ -532,9 +515,7 @@ def velocity_of(step: LawStep, joints: int) -> FloatArray:
     return np.array(step.velocity, dtype=np.float64)
 
 
-def _law_failed(
-    source: ServoGoal, context: StepContext, error_px: float | None, error: Exception
-) -> SourceOutput:
+def _law_failed(source: ServoGoal, context: StepContext, error_px: float | None, error: Exception) -> SourceOutput:
     reason = Reason(
         "LAW_FAILED", "hold", source.law, None, None, "",
         f"its step raised {type(error).__name__}: {error}; take another law, and tell the author of this one",
@@ -551,9 +532,7 @@ def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -
     if error_px is None:
         hint = "no error was measured"
     elif held and error_px <= source.tolerance_px:
-        hint = (
-            f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
-        )
+        hint = f"the error is {error_px:.3f} px (tolerance {source.tolerance_px} px), but the cameras disagree"
     else:
         hint = f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)"
     reason = Reason("TIME_LIMIT", "hold", "", run.moved_s, source.time_limit_s, "s", hint)
@@ -632,9 +611,7 @@ def run_progress(source: LawRun, context: StepContext) -> Progress:
     """The same for any law, from the exponential decay of its error."""
     record = context.state.block.record
     slow = 1.0 + source.damping
-    known, done, left_s = decay_of_error(
-        record, source.tolerance_px, source.gain_near / slow, source.gain_far / slow
-    )
+    known, done, left_s = decay_of_error(record, source.tolerance_px, source.gain_near / slow, source.gain_far / slow)
     return (done, left_s) if known else (None, None)
 
 

@@ -199,9 +199,7 @@ def markers_lost(visit: PoseMeasurement, context: StepContext, trial: TrialSetti
     return False
 
 
-def collect_samples(
-    visit: PoseMeasurement, context: StepContext, trial: TrialSettings
-) -> tuple[Sample, ...] | None:
+def collect_samples(visit: PoseMeasurement, context: StepContext, trial: TrialSettings) -> tuple[Sample, ...] | None:
     """Settle, then average frames; returns the samples once there are enough or the waiting time is over, else None."""
     if visit.phase == "settle":
         if (context.now_ns - visit.phase_ns) * 1e-9 >= trial.settle_s:
@@ -212,9 +210,7 @@ def collect_samples(
         at_shutter = joints_at(context.state.history, observation.t_shutter_ns + offset_ns)
         if at_shutter is None:
             continue
-        if add_observation(
-            visit.sums, context.settings, observation, trial.frames, visit.phase_ns - offset_ns
-        ):
+        if add_observation(visit.sums, context.settings, observation, trial.frames, visit.phase_ns - offset_ns):
             visit.joint_sum += at_shutter
             visit.joint_frames += 1
     silent = min(estimate.last_seq for estimate in context.state.cameras) < 0
@@ -235,9 +231,7 @@ def mean_joints(visit: PoseMeasurement) -> FloatArray:
     return mean
 
 
-def too_few_seen(
-    samples: tuple[Sample, ...], trial: TrialSettings, static: tuple[int, ...] = ()
-) -> Sample | None:
+def too_few_seen(samples: tuple[Sample, ...], trial: TrialSettings, static: tuple[int, ...] = ()) -> Sample | None:
     """The camera that saw too few markers, or too few frames, at a stop; ``static`` points do not count."""
     for sample in sorted(samples, key=lambda sample: _of_body(sample.ids, static)):
         if _of_body(sample.ids, static) < trial.min_markers or sample.frames < max(1, trial.frames // 2):
@@ -266,9 +260,7 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...
     )  # fmt: skip
 
 
-def blocked(
-    target: FloatArray, moving: list[int], context: StepContext, back: FloatArray | None = None
-) -> str:
+def blocked(target: FloatArray, moving: list[int], context: StepContext, back: FloatArray | None = None) -> str:
     """Why a stop must not be tried: a joint limit of the ``moving`` joints, a keep-out; empty if it may.
 
     The programme does not rely on the safety stage: a keep-out blocks the stop if it intersects the box spanned by the

@@ -86,9 +86,7 @@ class RunTerms(NamedTuple):
 
 
 @kernel
-def account_run(
-    block: Record, measured: bool, error_px: float, enough: bool, dt_s: float, terms: RunTerms
-) -> int:
+def account_run(block: Record, measured: bool, error_px: float, enough: bool, dt_s: float, terms: RunTerms) -> int:
     """Update the run by a step of ``dt_s`` with this error. Returns `OUT_OF_TIME`; `SETTLED` if ``enough`` markers are
     seen and the error has stayed inside its tolerance for the required number of frames of every camera on average;
     otherwise `GOES_ON`.
@@ -132,9 +130,7 @@ def follow_error(block: Record, tolerance_px: float, dt_s: float) -> None:
 
 
 @kernel
-def decay_of_error(
-    block: Record, tolerance_px: float, gain_near: float, gain_far: float
-) -> tuple[bool, float, float]:
+def decay_of_error(block: Record, tolerance_px: float, gain_near: float, gain_far: float) -> tuple[bool, float, float]:
     """Whether there is an error, the completed fraction [0, 1] of its decay, and the remaining seconds at the smaller
     of the gains.
     """
@@ -185,9 +181,7 @@ class Traits(NamedTuple):
     local_law: str = ""
 
 
-def examine_progress(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
-) -> list[Reason]:
+def examine_progress(source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits) -> list[Reason]:
     """The progress reasons in addition to those already given (``told``) in this step, the most serious first."""
     found = [*_near_limits(context), *_near_singular(source, context), *_few_markers(source, context, traits)]
     tail = _tail(source, context, traits)
@@ -266,9 +260,7 @@ def _tail(source: LawRun, context: StepContext, traits: Traits) -> Reason | None
     return Reason("LOW_GAIN", "info", "", left_s, TAIL_S, "s", hint)
 
 
-def _stall_reason(
-    source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits
-) -> Reason | None:
+def _stall_reason(source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits) -> Reason | None:
     run = context.state.block.numbers.run
     error, since_s = error_of_run(context.state.block), run.moved_s - run.least_s
     if error is None or error <= source.tolerance_px or since_s < STUCK_S:
@@ -291,9 +283,7 @@ def _stall_reason(
     else:
         why = "nothing holds it up that is known: has the goal's body another shape, or has a camera or marker moved?"
     hint = f"the error is {error:.3f} px, no smaller for {since_s:.0f} s; {why}"
-    return Reason(
-        "STUCK", "slow", "" if cause is None else cause.subject, error, source.tolerance_px, "px", hint
-    )
+    return Reason("STUCK", "slow", "" if cause is None else cause.subject, error, source.tolerance_px, "px", hint)
 
 
 def _noise_px(source: LawRun, context: StepContext) -> float:
@@ -359,9 +349,7 @@ def take_frames(block: Record) -> None:
                 continue
             for a in range(2):
                 memory.settled_innovation[2 * sight + a] += memory.frame_innovation[2 * row + a]
-            memory.settled_variance[sight] += 0.5 * (
-                memory.frame_spread[4 * row] + memory.frame_spread[4 * row + 3]
-            )
+            memory.settled_variance[sight] += 0.5 * (memory.frame_spread[4 * row] + memory.frame_spread[4 * row + 3])
             memory.settled_count[sight] += 1.0
 
 
@@ -520,9 +508,7 @@ def added_covariance(C: FloatArray, slopes: FloatArray, covariance: FloatArray) 
 
 
 @kernel
-def explained(
-    d: FloatArray, C: FloatArray, columns: FloatArray, first: int, last: int, x: FloatArray
-) -> float:
+def explained(d: FloatArray, C: FloatArray, columns: FloatArray, first: int, last: int, x: FloatArray) -> float:
     """Least-squares ``x`` of ``d = A x`` (r,) with the Cholesky factor ``C`` (r, r) of the covariance, where ``A`` (r,
     k) has the ``columns`` in the rows from ``first`` to ``last``; returns the reduction of chi-square.
     """
@@ -647,9 +633,7 @@ def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None
     judged = source.used if wanted is None else source.used * (wanted > 0.0).any(axis=1)
     limit_px = SHARE * source.tolerance_px
     may_wait = float(state.block.settled_count.max()) < MOST_FRAMES
-    found, cameras = decide(
-        gains, effects, int(begins[-1]), len(context.q), limit_px, judged, may_wait=may_wait
-    )
+    found, cameras = decide(gains, effects, int(begins[-1]), len(context.q), limit_px, judged, may_wait=may_wait)
     if found == AGREED:
         return None
     names = tuple(context.settings.cameras[c].name for c in cameras)
@@ -723,9 +707,7 @@ def _affine_motions(
     return motions
 
 
-def _reason(
-    names: tuple[str, ...], effect_px: float, limit_px: float, tolerance_px: float, found: int
-) -> Reason:
+def _reason(names: tuple[str, ...], effect_px: float, limit_px: float, tolerance_px: float, found: int) -> Reason:
     if found == DOUBTFUL:
         return Reason(
             "CAMERAS_COMPARED", "slow", ", ".join(names), effect_px, limit_px, "px",

@@ -163,9 +163,7 @@ def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool
     moving = (context.now_ns - stream.updated_ns) * 1e-9 <= QUIET_S
     pixels, rates, tracked = predict(stream.track, context.now_ns * 1e-9 - offset_s)
     given = source.wanted * tracked
-    source.set_points = (
-        np.where(given[..., None] > 0.0, pixels, source.set_points) if moving else stream.set_points
-    )
+    source.set_points = np.where(given[..., None] > 0.0, pixels, source.set_points) if moving else stream.set_points
     source.rates = rates if moving else np.zeros_like(rates)
     if source.pose_known:
         pose, _ = refined_pose(

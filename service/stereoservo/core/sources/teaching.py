@@ -22,9 +22,7 @@ def start_teaching(command: Teach, request: Request, context: StepContext) -> st
     """Start averaging. Raises RefusalError without a model, in motion, and while another goal is taught."""
     state = context.state
     if state.model is None:
-        raise no_model(
-            context, "the cell has no model yet: calibrate first, so that the goal can carry its epoch"
-        )
+        raise no_model(context, "the cell has no model yet: calibrate first, so that the goal can carry its epoch")
     if state.teaching is not None:
         raise RefusalError(
             "TEACHING", f"goal {state.teaching.name!r} is still being taught", subject=state.teaching.name

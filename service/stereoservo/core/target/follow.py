@@ -40,9 +40,7 @@ target.
 """
 
 
-def require_followable(
-    goal: Goal, follows_streams: bool, law: str, pose_known: bool, context: StepContext
-) -> None:
+def require_followable(goal: Goal, follows_streams: bool, law: str, pose_known: bool, context: StepContext) -> None:
     """Raises RefusalError if a goal cannot follow the markers that it names."""
     arrays = context.arrays
     assert arrays is not None
@@ -54,9 +52,7 @@ def require_followable(
             subject=law,
         )
     if not pose_known:
-        raise RefusalError(
-            "TOO_FEW_MARKERS", "a goal that follows a target shows three markers or more in two cameras"
-        )
+        raise RefusalError("TOO_FEW_MARKERS", "a goal that follows a target shows three markers or more in two cameras")
     if displacements_of(arrays) is None:
         raise RefusalError(
             "TARGET_NOT_TRACKABLE",
@@ -105,9 +101,7 @@ def _stated(
         c = camera_index(name, context.settings)
         for k, marker in enumerate(ids.tolist()):
             if marker in markers:
-                sights[c, k] = ideal_pixels(arrays.lenses[c], np.array([markers[marker]], dtype=np.float64))[
-                    0
-                ]
+                sights[c, k] = ideal_pixels(arrays.lenses[c], np.array([markers[marker]], dtype=np.float64))[0]
                 seen[c, k] = float(np.isfinite(sights[c, k]).all())
     points, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
     there = known > 0.0
@@ -144,9 +138,7 @@ def start_following(source: Follower, context: StepContext) -> None:
         else:
             state.target = target_body(ids, None, cameras, carried=False)
     if isinstance(source, IncidenceGoal):
-        source.followed = FollowedFeatures(
-            reference=reference, fixed=source.fixed.copy(), drift=np.zeros((4, 4))
-        )
+        source.followed = FollowedFeatures(reference=reference, fixed=source.fixed.copy(), drift=np.zeros((4, 4)))
         return
     source.followed = Followed(
         reference=reference, set_points=source.set_points.copy(), target_points=source.target_points.copy(),
@@ -190,9 +182,7 @@ def _tell(
     assert source.followed is not None
     source.followed.told = kind
     ids = ", ".join(str(marker) for marker in source.goal.follow_markers)
-    context.emit(
-        kind, id=source.goal.id, name=ids, message=message, error_px=error_of_run(context.state.block)
-    )
+    context.emit(kind, id=source.goal.id, name=ids, message=message, error_px=error_of_run(context.state.block))
 
 
 def _brought(source: Follower, context: StepContext) -> Reason | None:

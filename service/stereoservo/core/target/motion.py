@@ -140,9 +140,7 @@ def variance_of_carried(body: TargetBody | None) -> float:
     """Uncertainty of a carried target's markers in the images, due to its motion since it was last seen and tracked:
     variance [px²] of a coordinate; 0 if the body is not the target.
     """
-    return (
-        float(np.trace(body.covariance[:FREEDOMS, :FREEDOMS])) if body is not None and body.carried else 0.0
-    )
+    return float(np.trace(body.covariance[:FREEDOMS, :FREEDOMS])) if body is not None and body.carried else 0.0
 
 
 @kernel
@@ -335,9 +333,7 @@ def elapse(D: FloatArray, basis: FloatArray, drift: FloatArray, motion: Motion, 
 
 
 @kernel
-def compare(
-    basis: FloatArray, points: FloatArray, D: FloatArray, view: View
-) -> tuple[FloatArray, FloatArray]:
+def compare(basis: FloatArray, points: FloatArray, D: FloatArray, view: View) -> tuple[FloatArray, FloatArray]:
     """Residuals of a frame relative to a pose ``D``: observed minus predicted markers (k, 2) [px], zeros where they are
     not seen, and the Jacobian (k, 2, 6) by the basis.
     """
@@ -495,9 +491,7 @@ def find_pose(
 
 
 @kernel
-def jumped(
-    basis: FloatArray, points: FloatArray, D: FloatArray, view: View
-) -> tuple[FloatArray, float, float]:
+def jumped(basis: FloatArray, points: FloatArray, D: FloatArray, view: View) -> tuple[FloatArray, float, float]:
     """The pose (4, 4) that explains a frame best, starting at ``D``; the displacement of the markers [px] rms, and the
     residual [px] rms. Arguments as in `compare`.
     """

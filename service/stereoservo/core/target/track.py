@@ -131,9 +131,7 @@ def present_arrays(context: StepContext) -> ModelArrays | None:
 def pose_at(body: TargetBody, t_ns: int) -> tuple[FloatArray, FloatArray]:
     """Displacement (4, 4) and twist (6,) of the target at ``t_ns``."""
     ahead_s = min((t_ns - body.t_ns) * 1e-9, LONGEST_S)
-    found: tuple[FloatArray, FloatArray] = after(
-        body.displacement, body.basis, body.twist, body.rate, ahead_s
-    )
+    found: tuple[FloatArray, FloatArray] = after(body.displacement, body.basis, body.twist, body.rate, ahead_s)
     return found
 
 
@@ -390,13 +388,10 @@ def _jumps(
     return True
 
 
-def _apart_px(
-    body: TargetBody, one: FloatArray, other: FloatArray, matrix: FloatArray, carrier: FloatArray
-) -> float:
+def _apart_px(body: TargetBody, one: FloatArray, other: FloatArray, matrix: FloatArray, carrier: FloatArray) -> float:
     """Rms distance [px] of the images of its markers at two displacements (4, 4)."""
     here, there = (
-        project_points(matrix, transform_points(carrier, transform_points(D, body.points)))[0]
-        for D in (one, other)
+        project_points(matrix, transform_points(carrier, transform_points(D, body.points)))[0] for D in (one, other)
     )
     return float(np.sqrt(((here - there) ** 2).sum(axis=-1).mean()))
 

@@ -54,9 +54,7 @@ class Reporter:
                 with self._boundary:
                     self._outbox.release(received_decoder.decode(data).number)
         if self._lost and not self._outbox.full:
-            message = (
-                f"{self._lost} reports were dropped while the gateway was away; the daemon's log has them"
-            )
+            message = f"{self._lost} reports were dropped while the gateway was away; the daemon's log has them"
             self._lost = 0
             self._add("warning", message)
         if self._channel is None or not self._channel.is_open:
@@ -73,9 +71,7 @@ class ReportIntake:
 
     def __init__(self, path: Path) -> None:
         self._server = ChannelServer(path)
-        self._boundary = RecordBoundary(
-            "reports of vision processes and supervisor", partial(write_log, "gateway")
-        )
+        self._boundary = RecordBoundary("reports of vision processes and supervisor", partial(write_log, "gateway"))
         self._had: dict[str, tuple[int, int]] = {}
         """Of each origin its stream (a process that is started anew begins another) and the last number of it."""
 

@@ -49,14 +49,10 @@ class PacketChannel:
             connection.connect(str(path))
         except BlockingIOError as error:  # its queue is full: it would be waited for as long as it hangs
             connection.close()
-            raise ChannelError(
-                "unreachable", f"{path}: its process accepts no connection (it hangs?)"
-            ) from error
+            raise ChannelError("unreachable", f"{path}: its process accepts no connection (it hangs?)") from error
         except OSError as error:
             connection.close()
-            raise ChannelError(
-                "unreachable", f"{path}: nobody listens ({os.strerror(error.errno or 0)})"
-            ) from error
+            raise ChannelError("unreachable", f"{path}: nobody listens ({os.strerror(error.errno or 0)})") from error
         return cls(connection, str(path))
 
     def fileno(self) -> int:

@@ -375,9 +375,7 @@ def _seen(trials: TrialData) -> str:
         own = trials.trials == (j if j < len(trials.joint_names) else -1)
         counts = trials.visible[:, own].sum(axis=2) if own.any() else np.zeros((len(trials.cameras), 1))
         span = np.ptp(trials.positions[own, j]) if own.any() and j < len(trials.joint_names) else 0.0
-        rows.append(
-            (name, int(own.sum()), f"{span:.3f}", *(f"{row.min():.0f} to {row.max():.0f}" for row in counts))
-        )
+        rows.append((name, int(own.sum()), f"{span:.3f}", *(f"{row.min():.0f} to {row.max():.0f}" for row in counts)))
     head = ("trial", "stops", "moved [rad or m]", *(f"markers in {camera.name}" for camera in trials.cameras))
     return _table(head, rows)
 
@@ -428,9 +426,7 @@ def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) ->
     left.margins(y=0.25)  # room for the legend above the bars
     left.legend(fontsize="small", loc="upper right", ncols=2)
     cameras = [kept & (rest.data.camera == c) for c in range(len(model.cameras))]
-    right.bar(
-        [camera.name for camera in model.cameras], [float(np.sqrt(squares[m].mean())) for m in cameras], 0.5
-    )
+    right.bar([camera.name for camera in model.cameras], [float(np.sqrt(squares[m].mean())) for m in cameras], 0.5)
     stated = [camera.expected_px for camera in report.cameras]
     right.hlines(stated, at[: len(stated)] - 0.35, at[: len(stated)] + 0.35, color="k", label="floor")
     right.set(ylabel="[px]", title="by camera")

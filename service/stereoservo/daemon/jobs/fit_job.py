@@ -139,9 +139,7 @@ def main() -> int:
         print_line(error_line(error))
         return 1
     try:
-        page = report_fit(
-            trials, arguments.trials, arguments.model, result, assessment, arguments.known_length
-        )
+        page = report_fit(trials, arguments.trials, arguments.model, result, assessment, arguments.known_length)
         print_line({"report": str(page)})
     except OSError as error:
         print_line({"report_error": str(error)})

@@ -68,8 +68,7 @@ def set_points_from_images(cell_path: Path, images: Path, at_s: float, frames: i
     begin_ns = min(line.t_shutter_ns for file in there.values() for line in islice(image_lines(file), 1))
     from_ns = begin_ns + round(at_s * 1e9)
     return tuple(
-        _camera_set_points(cell, cell_path, name, file, begin_ns, from_ns, frames)
-        for name, file in there.items()
+        _camera_set_points(cell, cell_path, name, file, begin_ns, from_ns, frames) for name, file in there.items()
     )
 
 

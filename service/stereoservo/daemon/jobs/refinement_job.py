@@ -80,9 +80,7 @@ class RestPoses:
     def add_state(self, status: Status) -> bool:
         """A trusted state of the arm; returns whether a pose was added."""
         positions = status.positions
-        if status.command.any() or (
-            self._readings and float(np.abs(positions - self._readings[0]).max()) > STILL
-        ):
+        if status.command.any() or (self._readings and float(np.abs(positions - self._readings[0]).max()) > STILL):
             self.leave()
         if status.command.any():
             return False
@@ -133,9 +131,7 @@ class RestPoses:
 
 def main() -> int:
     """Entry of the process."""
-    parser = argparse.ArgumentParser(
-        prog="python -m stereoservo.daemon.jobs.refinement_job", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m stereoservo.daemon.jobs.refinement_job", description=__doc__)
     parser.add_argument("poses", type=Path)
     parser.add_argument("base", type=Path)
     parser.add_argument("used", type=Path)

@@ -53,9 +53,7 @@ class RelocalizationReport(msgspec.Struct, frozen=True):
 
 def main() -> int:
     """Entry of the process."""
-    parser = argparse.ArgumentParser(
-        prog="python -m stereoservo.daemon.jobs.relocalization_job", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python -m stereoservo.daemon.jobs.relocalization_job", description=__doc__)
     parser.add_argument("sights", type=Path)
     parser.add_argument("model", type=Path)
     parser.add_argument("new", type=Path)
@@ -99,9 +97,7 @@ class RelocalizationPoses:
         self.events = [*self.events, event][-MOST_POSES:]
 
 
-def relocalize_from_events(
-    events: list[Event], model: CellModel, epoch: int, created: str = ""
-) -> RelocalizedModel:
+def relocalize_from_events(events: list[Event], model: CellModel, epoch: int, created: str = "") -> RelocalizedModel:
     """Relocalized model of ``epoch``; the newest of ``events`` names the cameras that moved.
 
     Raises CalibrationError.

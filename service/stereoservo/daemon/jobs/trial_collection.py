@@ -69,9 +69,7 @@ class TrialCollector:
         for s, event in enumerate(self._stops):
             for sample in event.samples:
                 images += sample.frames
-                for marker, pixel, covariance in zip(
-                    sample.ids, sample.pixels, sample.covariances, strict=True
-                ):
+                for marker, pixel, covariance in zip(sample.ids, sample.pixels, sample.covariances, strict=True):
                     where = row[sample.camera], s, column[int(marker)]
                     pixels[where] = pixel
                     systematic = settings.cameras[where[0]].systematic_px ** 2
@@ -85,9 +83,7 @@ class TrialCollector:
         )
         still = static_markers(pixels, sigmas)
         self.standing = tuple(
-            marker
-            for marker, is_static, known in zip(markers, still, declared, strict=True)
-            if is_static and not known
+            marker for marker, is_static, known in zip(markers, still, declared, strict=True) if is_static and not known
         )
         still |= declared
         markers = tuple(marker for marker, out in zip(markers, still, strict=True) if not out)
@@ -95,8 +91,7 @@ class TrialCollector:
             joint_names=settings.joint_names,
             joint_kinds=settings.joint_kinds,
             cameras=tuple(
-                TrialCamera(camera.name, camera.width, camera.height, camera.mount)
-                for camera in settings.cameras
+                TrialCamera(camera.name, camera.width, camera.height, camera.mount) for camera in settings.cameras
             ),
             marker_ids=markers,
             positions=np.array([_joints(event) for event in self._stops]),
@@ -121,18 +116,14 @@ class TrialCollector:
         for row, (_, frame) in enumerate(frames):
             markers[row, : len(frame.ids)] = frame.ids
             pixels[row, : len(frame.ids)] = frame.pixels
-        start_ns = int(
-            records[0][1].joints_ns[0]
-        )  # of this boot's clock: seconds from there keep their digits
+        start_ns = int(records[0][1].joints_ns[0])  # of this boot's clock: seconds from there keep their digits
         return WayObservations(
             ways=np.array([k for k, _ in frames], dtype=np.int64),
             cameras=np.array([frame.camera for _, frame in frames], dtype=np.int64),
             times=np.array([1e-9 * (frame.t_ns - start_ns) for _, frame in frames]),
             markers=markers,
             pixels=pixels,
-            joint_ways=np.concatenate([np.full(len(record.joints_ns), k) for k, record in records]).astype(
-                np.int64
-            ),
+            joint_ways=np.concatenate([np.full(len(record.joints_ns), k) for k, record in records]).astype(np.int64),
             joint_times=np.concatenate([1e-9 * (record.joints_ns - start_ns) for _, record in records]),
             positions=np.concatenate([record.positions for _, record in records]),
         )
@@ -146,9 +137,7 @@ class TrialCollector:
         that touch, a dot that does not fit its face), which does not scatter. 1 where single frames were taken or the
         detector states no noise.
         """
-        samples = [
-            sample for event in self._stops for sample in event.samples if sample.camera == camera.name
-        ]
+        samples = [sample for event in self._stops for sample in event.samples if sample.camera == camera.name]
         if not samples:
             return 1.0
         frame_counts = np.concatenate([sample.sights for sample in samples])

@@ -44,9 +44,7 @@ def beside(first: Branches, second: Branches) -> Branches:
         parts = [part if len(part) == k else np.repeat(part, k, axis=0) for part in (left, right)]
         return np.concatenate(parts, axis=1)
 
-    return Branches(
-        wide(first.steps, second.steps), wide(first.excess, second.excess), wide(first.free, second.free)
-    )
+    return Branches(wide(first.steps, second.steps), wide(first.excess, second.excess), wide(first.free, second.free))
 
 
 def together(several: list[Branches]) -> Branches:

@@ -104,9 +104,7 @@ def _along_valleys(
         if not slow.any():
             break
         before = ends[slow]
-        ends[slow], left[slow] = descended(
-            chain, points, targets, before, iterations=VALLEY_STEPS, damping=UNDAMPED
-        )
+        ends[slow], left[slow] = descended(chain, points, targets, before, iterations=VALLEY_STEPS, damping=UNDAMPED)
         slow[slow] = (left[slow] > tolerance) & (np.abs(ends[slow] - before).max(axis=1) > CLOSE)
     return ends, left
 
@@ -114,9 +112,7 @@ def _along_valleys(
 class _Known:
     """Solutions found so far, and how many starts converged to each."""
 
-    def __init__(
-        self, chain: ProjectiveChain, points: FloatArray, targets: FloatArray, tolerance: float
-    ) -> None:
+    def __init__(self, chain: ProjectiveChain, points: FloatArray, targets: FloatArray, tolerance: float) -> None:
         self.chain, self.points, self.targets, self.tolerance = chain, points, targets, tolerance
         self.joints: list[FloatArray] = []
         self.residuals: list[float] = []
@@ -381,9 +377,7 @@ def equivalent_points(points: FloatArray, targets: FloatArray) -> tuple[FloatArr
     return np.ascontiguousarray(R), np.ascontiguousarray(Q.T @ targets)
 
 
-def linearised(
-    chain: ProjectiveChain, points: FloatArray, q: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def linearised(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """``points`` (m, 4) moved to ``q`` (n,), ``∂(H(q)M)/∂q`` (4m, n) (5.38), and the operators (n, 4, 4) there."""
     H, operators = chain_forward(
         chain.generators, chain.kind_codes, chain.zero, np.ascontiguousarray(q), chain.tip_first

@@ -167,9 +167,9 @@ def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tup
     that are ``independent``.
     """
     judge = _ConditionTest(chain_of(arm), arm if isinstance(arm, CellModel) else None)
-    {"parallel": judge.parallel, "common_point": judge.common_point, "independent": judge.independent}[
-        condition
-    ](*joints)
+    {"parallel": judge.parallel, "common_point": judge.common_point, "independent": judge.independent}[condition](
+        *joints
+    )
     return judge.evidence[condition, joints]
 
 

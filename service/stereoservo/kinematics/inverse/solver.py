@@ -136,9 +136,7 @@ def _problem(
     if limits is not None:
         limits = np.asarray(limits, dtype=np.float64)
         if limits.shape != (n, 2) or not (limits[:, 0] <= limits[:, 1]).all():
-            raise InverseKinematicsError(
-                "limits", f"limits {limits.tolist()}; {n} pairs are needed, the lower first"
-            )
+            raise InverseKinematicsError("limits", f"limits {limits.tolist()}; {n} pairs are needed, the lower first")
     if not 0.0 < tolerance < 1.0:
         raise InverseKinematicsError("shape", f"tolerance {tolerance}; between 0 and 1 is needed")
     if displacement is not None and points is None and targets is None:
@@ -248,9 +246,7 @@ def _representatives(problem: _Problem, ends: FloatArray) -> FloatArray:
 
 
 def _settled(problem: _Problem, q: FloatArray) -> FloatArray:
-    return nearest_by_self_motion(
-        problem.chain, problem.points, problem.targets, q, problem.seed, problem.tolerance
-    )
+    return nearest_by_self_motion(problem.chain, problem.points, problem.targets, q, problem.seed, problem.tolerance)
 
 
 def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray) -> InverseSolutions:
@@ -387,9 +383,7 @@ def scaled_displacement(generators: FloatArray, H: FloatArray) -> FloatArray:
     return H / scale
 
 
-def equal_scales(
-    generators: FloatArray, points: FloatArray, targets: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def equal_scales(generators: FloatArray, points: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
     """``points`` (m, 4) unchanged, and ``targets`` (m, 4) scaled to the same value on a plane that all joints leave
     invariant.
 
@@ -478,9 +472,7 @@ def _turned(algebra: FloatArray, rng: np.random.Generator) -> FloatArray:
     return exp_twist(X * (2.5 / np.sqrt(squared) if squared > 1e-9 else 1.0))
 
 
-def _fitted(
-    algebra: FloatArray, points: FloatArray, targets: FloatArray, H: FloatArray
-) -> tuple[FloatArray, float]:
+def _fitted(algebra: FloatArray, points: FloatArray, targets: FloatArray, H: FloatArray) -> tuple[FloatArray, float]:
     """Damped Gauss-Newton over the group from ``H`` (4, 4); returns the result and its residual."""
     moved = points @ H.T
     error = float(np.linalg.norm(moved - targets))

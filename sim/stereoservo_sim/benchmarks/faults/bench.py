@@ -166,9 +166,7 @@ def _events(emulator: EmulatorProcess, since_ns: int, *kinds: str) -> list[dict[
     return [e for e in list(emulator.events) if e.get("event") in kinds and e["t_ns"] >= since_ns]
 
 
-def _trial(
-    emulator: EmulatorProcess, options: CanOptions, speed: float, fault: str, order: str
-) -> dict[str, Any]:
+def _trial(emulator: EmulatorProcess, options: CanOptions, speed: float, fault: str, order: str) -> dict[str, Any]:
     """One trial. Raises StalledError."""
     with _Master(options, speed) as master:
         master.expect("moving", START_LIMIT_S)
@@ -209,9 +207,7 @@ def run_wall(repetitions: int, progress: Callable[[int, int], None]) -> dict[str
         cell.write_text(text.replace('plant = "pybullet"', 'plant = "ideal"'), encoding="utf-8")
         directories = {"STEREOSERVO_RUNTIME_DIR": folder, "STEREOSERVO_STATE_DIR": folder}
         channel = ("--channel", "socket://127.0.0.1:0", "--bit-time")
-        with EmulatorProcess(
-            cell, options=channel, environment=directories, log=Path(folder) / "log"
-        ) as emulator:
+        with EmulatorProcess(cell, options=channel, environment=directories, log=Path(folder) / "log") as emulator:
             options = msgspec.structs.replace(options, channel=emulator.wait_ready(), **STRICT)
             rows = []
             for k, (fault, order, cure, bound_ms) in enumerate(cases):
@@ -277,9 +273,7 @@ def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
         except TrialError as error:
             raise ExperimentError("fault_trial", f"{protocol}, {case.name}: {error}") from error
         progress("faults in bit time", k + 1, len(cases))
-    wall = run_wall(
-        max(repetitions // WALL_SHARE, 1), lambda done, total: progress("faults in real time", done, total)
-    )
+    wall = run_wall(max(repetitions // WALL_SHARE, 1), lambda done, total: progress("faults in real time", done, total))
     inputs = run_inputs(repetitions, seed, _tell_input)
     service = run_service(max(repetitions // WALL_SHARE, 1), _tell_row)
     return {
@@ -369,8 +363,7 @@ def _wall_cells(row: dict[str, Any]) -> dict[str, str]:
     return {
         "fault": row["fault"],
         "known": _summary(row["detected_ms"]),
-        "all at rest": _summary(row["rest_ms"])
-        + (f" ({row['never_at_rest']} never)" if row["never_at_rest"] else ""),
+        "all at rest": _summary(row["rest_ms"]) + (f" ({row['never_at_rest']} never)" if row["never_at_rest"] else ""),
         "bound in bit time": f"{row['bound_ms_in_bit_time']:g}",
         "latched": ", ".join(row["codes"]) or "-",
         "restarts": str(row["restarts"]),

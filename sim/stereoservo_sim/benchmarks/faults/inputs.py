@@ -132,9 +132,7 @@ class Inputs:
         self.clock_ns = self.stamps_ns
 
 
-def _polled(
-    poll: Callable[[], list[CameraObservation]], camera: Input
-) -> Callable[[], list[CameraObservation]]:
+def _polled(poll: Callable[[], list[CameraObservation]], camera: Input) -> Callable[[], list[CameraObservation]]:
     return lambda: [camera.passed(observation) for observation in poll()]
 
 
@@ -181,9 +179,7 @@ def _behind(past: Past, since: int, draw: Draw) -> Any:
 
 def _stuck(past: Past, since: int, draw: Draw) -> JointState:
     held = past[-1 - since]
-    return msgspec.structs.replace(
-        past[-1], positions=held.positions, velocities=np.zeros_like(held.velocities)
-    )
+    return msgspec.structs.replace(past[-1], positions=held.positions, velocities=np.zeros_like(held.velocities))
 
 
 def _far(past: Past, since: int, draw: Draw) -> JointState:
@@ -408,9 +404,7 @@ class _Trial:
             cell.run_for(0.3)
             goal = self._goal()
             if not (reply := cell.submit(RunGoal(goal))).accepted:
-                raise ExperimentError(
-                    "input_fault", f"{self.fault.name}: a goal was refused: {reply.message}"
-                )
+                raise ExperimentError("input_fault", f"{self.fault.name}: a goal was refused: {reply.message}")
             self._await_motion()
             cell.on_step = self._note
             start, t0_ns = self.truth.count, cell.clock.now_ns()
@@ -452,9 +446,7 @@ class _Trial:
         return base + np.sign(self.rng.standard_normal(len(base))) * 0.2
 
     def _draw(self) -> Draw:
-        return Draw(
-            int(self.rng.integers(1 << 16)), float(self.rng.random()), float(self.rng.choice((-1.0, 1.0)))
-        )
+        return Draw(int(self.rng.integers(1 << 16)), float(self.rng.random()), float(self.rng.choice((-1.0, 1.0))))
 
     def _note(self, _inputs: StepInputs, outputs: StepOutputs) -> None:
         self.reasons |= {reason.code for reason in outputs.status.reasons} - OF_MOTION

@@ -175,9 +175,7 @@ def starts_again(bench: ServiceBench) -> str:
 def unexpected(bench: ServiceBench) -> str:
     """Lines of the daemon's log that no disk is a reason for: a process that ended, a traceback; empty without."""
     words = ("Traceback", "starting again", "Error")
-    return "; ".join(
-        line for line in bench.daemon.output().splitlines() if any(word in line for word in words)
-    )
+    return "; ".join(line for line in bench.daemon.output().splitlines() if any(word in line for word in words))
 
 
 # -- trials ----------------------------------------------------------------------------------------------------
@@ -406,9 +404,7 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
         "fault": fault.name,
         "bound_ms": bound,
         "rest_ms": summary(rests) if rests else None,
-        "within": sum(
-            _is_within(trial["rest_ms"], bound, fault.may_go_on) and not trial["wrong"] for trial in trials
-        ),
+        "within": sum(_is_within(trial["rest_ms"], bound, fault.may_go_on) and not trial["wrong"] for trial in trials),
         "after": sorted({trial["after"] for trial in trials}),
         "status_right": sum(_status_is_right(trial, fault) for trial in trials),
         "status_says": sorted({*(trial["says"] for trial in trials), *silent}),
@@ -445,9 +441,7 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
     )
     try:
         if fault.client:
-            child = subprocess.Popen(
-                [sys.executable, "-c", fault.client, CELL], stdout=subprocess.PIPE, text=True
-            )
+            child = subprocess.Popen([sys.executable, "-c", fault.client, CELL], stdout=subprocess.PIPE, text=True)
         if not fault.jogs:
             bench.goals.append(_sent_goal(client, child, fault.speed_scale))
         with StallWatch() as watch:

@@ -465,11 +465,7 @@ class BusEmulator:
             self._news.append(event)
 
     def _stuck(self, due: int) -> str:
-        late = [
-            f"node {slot.node.node_id} is due at {slot.due_ns} ns"
-            for slot in self.slots
-            if slot.due_ns <= due
-        ]
+        late = [f"node {slot.node.node_id} is due at {slot.due_ns} ns" for slot in self.slots if slot.due_ns <= due]
         return "; ".join(late) or "frames answer frames"
 
 
@@ -652,9 +648,7 @@ def _late(emulator: BusEmulator, command: BusCommand) -> Answer:
 
 
 def _duplicate(emulator: BusEmulator, command: BusCommand) -> str:
-    doubles = [
-        slot for slot in emulator.slots if slot.plant_index is None and slot.node.node_id == command.node
-    ]
+    doubles = [slot for slot in emulator.slots if slot.plant_index is None and slot.node.node_id == command.node]
     if command.what == "off":
         emulator.remove(doubles)
         return f"node {command.node}: {len(doubles)} doubles removed"
@@ -678,9 +672,7 @@ def _remap(emulator: BusEmulator, command: BusCommand) -> str:
             raise FaultCommandError(f"node {command.node} answers no SDO: its protocol has no mapping")
         if answers[0].data[0] != 0x60:
             code = int.from_bytes(answers[0].data[4:], "little")
-            raise FaultCommandError(
-                f"node {command.node} refuses {index:#06x}:{subindex} (SDO abort {code:#010x})"
-            )
+            raise FaultCommandError(f"node {command.node} refuses {index:#06x}:{subindex} (SDO abort {code:#010x})")
     return f"node {command.node}: TPDO 1 carries the status word alone"
 
 

@@ -115,15 +115,9 @@ def make_bus_emulator(
     axes = [EmulatedAxis(joint.spec(), float(q)) for joint, q in zip(drives, plant.motors, strict=True)]
     files = [
         *([_eds(options, settings, cell_dir)] * len(names)),
-        *(
-            eds_path(msgspec.structs.replace(options, eds=gripper.eds), cell_dir)
-            for gripper in options.gripper
-        ),
+        *(eds_path(msgspec.structs.replace(options, eds=gripper.eds), cell_dir) for gripper in options.gripper),
     ]
-    nodes = [
-        _node(options, joint, axis, settings, eds)
-        for joint, axis, eds in zip(drives, axes, files, strict=True)
-    ]
+    nodes = [_node(options, joint, axis, settings, eds) for joint, axis, eds in zip(drives, axes, files, strict=True)]
     moved = AxisPlant(axes, plant, settings.machine, t_ns=t_ns, history=history, rated=rated)
     return BusEmulator(nodes, moved, bitrate=options.bitrate if settings.bit_time else None, t_ns=t_ns)
 
@@ -163,14 +157,9 @@ def _arm(options: CanOptions, settings: DrivesSettings, mount: Mount, cell_dir: 
     names = tuple(joint.name for joint in options.joint)
     kinds = tuple(joint.kind for joint in options.joint)
     if names != cell.robot.joint_names or kinds != tuple(joint.kind for joint in cell.robot.joints):
-        what = (
-            "emulate.drives.plant = 'pybullet'"
-            if not settings.urdf
-            else f"emulate.drives.urdf = {settings.urdf!r}"
-        )
+        what = "emulate.drives.plant = 'pybullet'" if not settings.urdf else f"emulate.drives.urdf = {settings.urdf!r}"
         has = ", ".join(
-            joint.name if joint.kind == "revolute" else f"{joint.name} ({joint.kind})"
-            for joint in cell.robot.joints
+            joint.name if joint.kind == "revolute" else f"{joint.name} ({joint.kind})" for joint in cell.robot.joints
         )
         raise EmulationError(
             f"{what} is the simulated arm with joints {has}; this cell has {', '.join(names)}: name them so, or take "
@@ -201,9 +190,7 @@ def _plant(
     """The plant, and the rated torques that its efforts are shares of."""
     names = tuple(joint.name for joint in options.joint)
     try:
-        mechanics = chosen_mechanics(
-            settings.mechanics, names, [joint.kind == "prismatic" for joint in options.joint]
-        )
+        mechanics = chosen_mechanics(settings.mechanics, names, [joint.kind == "prismatic" for joint in options.joint])
     except ValueError as error:
         raise EmulationError(f"emulate.drives.{error}") from error
     if settings.plant == "ideal":
@@ -215,10 +202,7 @@ def _plant(
     assert arm is not None  # of plant "pybullet"
     robot = arm.robot
     ratings: Mapping[str, Any] = settings.rated_torques
-    rated = [
-        float(ratings.get(joint.name) or joint.rated_torque or DEFAULT_RATED_TORQUE)
-        for joint in options.joint
-    ]
+    rated = [float(ratings.get(joint.name) or joint.rated_torque or DEFAULT_RATED_TORQUE) for joint in options.joint]
     try:
         links = PybulletPlant(robot, positions, STEP_NS * 1e-9)
     except PhysicsError as error:

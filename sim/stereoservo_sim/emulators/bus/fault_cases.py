@@ -269,9 +269,7 @@ ODRIVE_CASES = (
         bound_ms=40,
         afterwards=("limit 3 off",),
     ),
-    FaultCase(
-        name="drive in error at start", orders=("fault 3 0x20",), codes=("drive_fault",), stage="start"
-    ),
+    FaultCase(name="drive in error at start", orders=("fault 3 0x20",), codes=("drive_fault",), stage="start"),
     FaultCase(
         name="cause that stays: reset refused",
         orders=("sticky 3 0x2000",),

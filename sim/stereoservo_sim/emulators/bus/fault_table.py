@@ -47,10 +47,7 @@ def run_row(case: FaultCase, protocol: str, trials: int, seed: int, *, run_on_s:
     return sum_up(
         case,
         protocol,
-        [
-            run_trial(case, protocol, trial_rng(case, protocol, seed, k), run_on_s=run_on_s)
-            for k in range(trials)
-        ],
+        [run_trial(case, protocol, trial_rng(case, protocol, seed, k), run_on_s=run_on_s) for k in range(trials)],
     )
 
 

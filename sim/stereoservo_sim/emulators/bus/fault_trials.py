@@ -410,6 +410,4 @@ class VirtualHost(Subscriptions):
         """Handle an exception of the channel like the bus thread: latch, and end."""
         self.plugged = plugged
         if not plugged:
-            self.master.latch(
-                MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.emulator.t_ns)
-            )
+            self.master.latch(MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.emulator.t_ns))

@@ -95,9 +95,7 @@ class _Body:
         """Whether neither the joint nor its set-point moves."""
         axis, command = self.axis, self.command
         driven = command.powered and not command.brake_closed
-        if driven and (
-            command.target != 0.0 or axis.set_velocity != 0.0 or self.set_position != self.position
-        ):
+        if driven and (command.target != 0.0 or axis.set_velocity != 0.0 or self.set_position != self.position):
             return False
         return self.velocity == 0.0
 
@@ -306,9 +304,7 @@ class AxisPlant:
         if changed:
             self._awake_ns = self.t_ns + AWAKE_NS
         self._resting = (
-            self.t_ns >= self._awake_ns
-            and all(body.resting() for body in self._bodies)
-            and self.plant.rest(0.0)
+            self.t_ns >= self._awake_ns and all(body.resting() for body in self._bodies) and self.plant.rest(0.0)
         )
         if self._resting:
             for body in self._bodies:
@@ -330,9 +326,7 @@ class AxisPlant:
                 axis.set_position = axis.position
                 axis.effort = 0.0
                 continue
-            free = (
-                body.free_effort() if self._rated is None else float(self.plant.efforts[k]) / self._rated[k]
-            )
+            free = body.free_effort() if self._rated is None else float(self.plant.efforts[k]) / self._rated[k]
             effort = min(max(free + body.held_up(), -self.settings.effort_max), self.settings.effort_max)
             axis.effort += (effort - axis.effort) * h / (h + EFFORT_FILTER_S)
 

@@ -169,9 +169,7 @@ class CameraEmulator:
             return self.cameras
         found = tuple(camera for camera in self.cameras if camera.name == name)
         if not found:
-            raise FaultCommandError(
-                f"no camera {name!r}; cameras: {', '.join(c.name for c in self.cameras)}, {ALL}"
-            )
+            raise FaultCommandError(f"no camera {name!r}; cameras: {', '.join(c.name for c in self.cameras)}, {ALL}")
         return found
 
     def swap(self, first: EmulatedCamera, second: EmulatedCamera) -> None:
@@ -229,9 +227,7 @@ def _number_word(what: str, low: float, high: float, default: float | None = Non
             raise FaultCommandError(f"{what} {text!r}; {low:g} to {high:g} is valid")
         return {"number": value}
 
-    return (
-        Word(read, f"the {what} is missing") if default is None else Word(read, default={"number": default})
-    )
+    return Word(read, f"the {what} is missing") if default is None else Word(read, default={"number": default})
 
 
 def _size(word: str) -> dict[str, Any]:
@@ -271,9 +267,7 @@ def _bump_words(words: list[str]) -> dict[str, Any]:
         elif length is not None and abs(float(length[1])) * _LENGTHS[length[2]] <= 10.0:
             fields["length_m"] = float(length[1]) * _LENGTHS[length[2]]
         else:
-            raise FaultCommandError(
-                f"{word!r}; an angle up to 180deg and a length up to 10m are valid, e.g. 5deg 3cm"
-            )
+            raise FaultCommandError(f"{word!r}; an angle up to 180deg and a length up to 10m are valid, e.g. 5deg 3cm")
     if fields.get("number", 0.0) == 0.0 and fields.get("length_m", 0.0) == 0.0:
         raise FaultCommandError("the angle or the length is missing, e.g. 5deg 3cm")
     return fields

@@ -56,9 +56,7 @@ class CameraCondition:
         marks += [self.look] if self.look else []
         marks += [f"{self.size[0]}x{self.size[1]}"] if self.size else []
         marks += [f"exposure {self.gain:g}"] if self.gain != 1.0 else []
-        return ", ".join(
-            [*marks, f"latency {self.latency_ns * 1e-6:g} ms", f"jitter {self.jitter_ns * 1e-6:g} ms"]
-        )
+        return ", ".join([*marks, f"latency {self.latency_ns * 1e-6:g} ms", f"jitter {self.jitter_ns * 1e-6:g} ms"])
 
 
 class EmulatedView(PybulletCameraDriver):
@@ -156,9 +154,7 @@ class EmulatedCamera:
         assert isinstance(frame, Frame)
         data = self._developed(frame)
         rng = np.random.default_rng((self._seed, zlib.crc32(self.name.encode()), frame.seq, 1))
-        return StreamPicture(
-            frame.seq, frame.t_shutter_ns, self._sending_ns(frame, rng), self._spoilt(data, rng)
-        )
+        return StreamPicture(frame.seq, frame.t_shutter_ns, self._sending_ns(frame, rng), self._spoilt(data, rng))
 
     def _developed(self, frame: Frame) -> bytes:
         if not (self.condition.frozen and self._last):

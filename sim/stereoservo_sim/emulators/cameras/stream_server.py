@@ -58,9 +58,7 @@ class CameraServer:
     ``on_event`` gets every event, in that thread. Raises EmulationError where the port is taken.
     """
 
-    def __init__(
-        self, emulator: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32
-    ) -> None:
+    def __init__(self, emulator: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32) -> None:
         self.emulator = emulator
         self.on_event: Callable[[CameraEvent], None] | None = None
         self.pictures = 0
@@ -381,9 +379,7 @@ def parse_request(data: bytes) -> HttpRequest | None:
     if len(words) != 3 or not words[2].startswith("HTTP/"):
         raise BadRequestError("400 Bad Request", f"{line[:80]!r} is no request")
     if words[0] not in ("GET", "HEAD"):
-        raise BadRequestError(
-            "405 Method Not Allowed", f"{words[0][:20]} is not understood; GET and HEAD are"
-        )
+        raise BadRequestError("405 Method Not Allowed", f"{words[0][:20]} is not understood; GET and HEAD are")
     return HttpRequest(words[1].partition("?")[0], words[0] == "HEAD")
 
 
@@ -510,7 +506,5 @@ def serve_cameras(
     try:
         server.run(ended)
     finally:
-        printer.say(
-            "end", server.words(), pictures=server.pictures, withheld=server.withheld, late_ns=server.late_ns
-        )
+        printer.say("end", server.words(), pictures=server.pictures, withheld=server.withheld, late_ns=server.late_ns)
         printer.end()

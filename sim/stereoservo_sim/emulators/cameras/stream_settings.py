@@ -81,18 +81,14 @@ def cameras_of_cell(cell: CellFile) -> CamerasSettings:
     except msgspec.ValidationError as error:
         raise EmulationError(f"{where}: emulate.cameras: {invalid(CamerasSettings, given, error)}") from error
     if not settings.camera:
-        raise EmulationError(
-            f"{where}: emulate.cameras: no camera; at least one [[emulate.cameras.camera]] is needed"
-        )
+        raise EmulationError(f"{where}: emulate.cameras: no camera; at least one [[emulate.cameras.camera]] is needed")
     for key, values in (
         ("name", [camera.name for camera in settings.camera]),
         ("path", [camera.stream for camera in settings.camera]),
     ):
         twice = next((value for value in values if values.count(value) > 1), None)
         if twice is not None:
-            raise EmulationError(
-                f"{where}: emulate.cameras.camera: {key} {twice!r} is used twice; they must differ"
-            )
+            raise EmulationError(f"{where}: emulate.cameras.camera: {key} {twice!r} is used twice; they must differ")
     return settings
 
 

@@ -203,9 +203,7 @@ def _suitability(robot: Robot, q: FloatArray) -> float:
     heights = np.array([body[2], body[2] + 0.7 * pose[2, 2]]) - floor
     above = float(np.clip(heights / HEIGHT, 0.02, 1.0).prod())
     away = float(np.clip(np.linalg.norm(body[:2] - robot.mounted[:2, 3]) / HEIGHT, 0.2, 1.0))
-    return float(
-        np.log(max(values[-1] / values[0], 1e-9)) + np.log(max(room, 1e-3)) + np.log(above) + np.log(away)
-    )
+    return float(np.log(max(values[-1] / values[0], 1e-9)) + np.log(max(room, 1e-3)) + np.log(above) + np.log(away))
 
 
 def _room_before_cameras(cell: SimulatedCell) -> float:

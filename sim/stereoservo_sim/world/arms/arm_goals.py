@@ -74,9 +74,7 @@ def goes_straight(robot: Robot, q: FloatArray) -> bool:
     twists = np.concatenate([moves, turns], axis=1)
     rank = np.linalg.matrix_rank(twists, tol=1e-6)
     brackets = [
-        np.concatenate(
-            [np.cross(turns[a], moves[b]) - np.cross(turns[b], moves[a]), np.cross(turns[a], turns[b])]
-        )
+        np.concatenate([np.cross(turns[a], moves[b]) - np.cross(turns[b], moves[a]), np.cross(turns[a], turns[b])])
         for a, b in combinations(range(len(q)), 2)
     ]
     return bool(np.linalg.matrix_rank(np.array([*twists, *brackets]), tol=1e-6) == rank)

@@ -126,9 +126,7 @@ def _joint(element: Element, links: dict[str, Element], path: Path) -> UrdfJoint
         found = element.find(tag)
         end = "" if found is None else found.get("link", "")
         if end not in links:
-            raise UrdfError(
-                f"{path}: joint {name!r}: its {tag} {end!r} is no link; links: {', '.join(links)}"
-            )
+            raise UrdfError(f"{path}: joint {name!r}: its {tag} {end!r} is no link; links: {', '.join(links)}")
         ends.append(end)
     axis = element.find("axis")
     direction = np.array([1.0, 0.0, 0.0]) if axis is None else _vector(axis, "xyz", path)
@@ -158,9 +156,7 @@ def _number(
     except ValueError:
         found = float("nan")
     if not least <= found <= most:
-        raise UrdfError(
-            f"{path}: <{element.tag} {key}={text!r}>; a number from {least:g} to {most:g} is needed"
-        )
+        raise UrdfError(f"{path}: <{element.tag} {key}={text!r}>; a number from {least:g} to {most:g} is needed")
     return found
 
 
@@ -177,9 +173,7 @@ def _vector(element: Element, key: str, path: Path, default: str = "0 0 0") -> F
     except ValueError:
         found = np.zeros(0)
     if found.shape != (3,) or not np.abs(found).max() <= LARGEST:
-        raise UrdfError(
-            f"{path}: <{element.tag} {key}={text!r}>; three numbers are needed, up to {LARGEST:g}"
-        )
+        raise UrdfError(f"{path}: <{element.tag} {key}={text!r}>; three numbers are needed, up to {LARGEST:g}")
     return found
 
 
@@ -222,9 +216,7 @@ def _spec(joint: UrdfJoint, path: Path) -> JointSpec:
     elif joint.kind != "continuous":
         raise UrdfError(f"{path}: joint {joint.name!r} is {joint.kind} and has no <limit lower=… upper=…>")
     if not low < high:
-        raise UrdfError(
-            f"{path}: joint {joint.name!r}: limits {low:g} to {high:g}; the lower must be below the upper"
-        )
+        raise UrdfError(f"{path}: joint {joint.name!r}: limits {low:g} to {high:g}; the lower must be below the upper")
     return JointSpec(joint.name, kind, low, high, speed, ACCELERATION[kind])
 
 
@@ -346,9 +338,7 @@ def _vertices(data: bytes, obj: bool) -> FloatArray:
     if len(data) != 84 + 50 * count:  # text
         rows = [line.split()[1:4] for line in data.splitlines() if line.strip().startswith(b"vertex")]
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
-    facets = np.frombuffer(
-        data, dtype=np.dtype([("numbers", "<f4", 12), ("end", "<u2")]), offset=84, count=count
-    )
+    facets = np.frombuffer(data, dtype=np.dtype([("numbers", "<f4", 12), ("end", "<u2")]), offset=84, count=count)
     with np.errstate(invalid="ignore"):  # what is no number is refused with its name
         return facets["numbers"][:, 3:].reshape(-1, 3).astype(np.float64)
 
@@ -419,9 +409,7 @@ class UrdfJoint:
 class UrdfTree:
     """Links and joints of a URDF file, checked to be a tree, or several. Raises UrdfError."""
 
-    def __init__(
-        self, path: Path, name: str, links: dict[str, Element], joints: tuple[UrdfJoint, ...]
-    ) -> None:
+    def __init__(self, path: Path, name: str, links: dict[str, Element], joints: tuple[UrdfJoint, ...]) -> None:
         self.path, self.name, self.links, self.joints = path, name, links, joints
         self.above: dict[str, UrdfJoint] = {}
         self._below: dict[str, list[UrdfJoint]] = {}
@@ -548,9 +536,7 @@ def _onward(
     Linkages that are coupled to the arm's own joints are no branch. Raises UrdfError where several arms begin there.
     """
     own = {joint.name for joint in chain}
-    branches = [
-        joint for joint in moving if not all(one.mimics in own for one in tree.beyond(joint) if one.moves)
-    ]
+    branches = [joint for joint in moving if not all(one.mimics in own for one in tree.beyond(joint) if one.moves)]
     if len(branches) == 1:
         return branches
     before, deepest = sum(joint.driven for joint in chain), max(map(tree.depth, branches), default=0)
@@ -586,15 +572,9 @@ def _without_jaw(tree: UrdfTree, chain: list[UrdfJoint], left: _LeftOut) -> list
     last = next((k for k in reversed(range(len(chain))) if chain[k].driven), 0)
     jaw = chain[last] if chain else None
     coupled = [joint for joint in chain[last + 1 :] if joint.mimics]
-    if (
-        jaw is None
-        or sum(joint.driven for joint in chain) < 2
-        or any(one.mimics != jaw.name for one in coupled)
-    ):
+    if jaw is None or sum(joint.driven for joint in chain) < 2 or any(one.mimics != jaw.name for one in coupled):
         return chain
-    frame = next(
-        (one.child for one in tree.below(jaw.parent) if not one.moves and TOOL_FRAME.search(one.child)), None
-    )
+    frame = next((one.child for one in tree.below(jaw.parent) if not one.moves and TOOL_FRAME.search(one.child)), None)
     if JAW.search(jaw.name) and not TURNS.search(jaw.name):
         why = "by its name"
     elif JAW_LINK.search(jaw.child):

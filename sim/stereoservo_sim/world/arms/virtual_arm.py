@@ -27,15 +27,11 @@ def virtual_links(attitude: FloatArray) -> FloatArray:
     return np.array([TO_NEXT, TO_NEXT, turned @ TO_NEXT, TO_NEXT, TO_NEXT, np.eye(4)])
 
 
-def virtual_robot(
-    robot: Robot, tool: FloatArray, attitude: FloatArray, joints: tuple[JointSpec, ...]
-) -> Robot:
+def virtual_robot(robot: Robot, tool: FloatArray, attitude: FloatArray, joints: tuple[JointSpec, ...]) -> Robot:
     """The virtual joints of ``tool`` (4, 4) on the flange of ``robot``, as an arm; ``attitude`` (3, 3): A."""
     links = virtual_links(attitude)
     links[-1] = inverse_pose(tool)
-    return Robot(
-        f"{robot.name} by twists", robot.mounted @ TO_NEXT, links, joints, np.zeros(6), np.zeros((6, 3)), ()
-    )
+    return Robot(f"{robot.name} by twists", robot.mounted @ TO_NEXT, links, joints, np.zeros(6), np.zeros((6, 3)), ())
 
 
 def virtual_cell(

@@ -29,9 +29,7 @@ def test_a_sync_is_answered_at_once_where_frames_take_no_time(scripted):
     emulator = scripted.emulator(2)
     emulator.inject(SYNC, 5 * MS)
     emulator.run_until(5 * MS)
-    assert [(t, f.id) for t, f in emulator.delivered()] == [(0, 0x701), (0, 0x702)] + [
-        (5 * MS, i) for i in BOTH
-    ]
+    assert [(t, f.id) for t, f in emulator.delivered()] == [(0, 0x701), (0, 0x702)] + [(5 * MS, i) for i in BOTH]
 
 
 def test_frames_end_when_their_bits_are_sent(scripted):
@@ -42,9 +40,7 @@ def test_frames_end_when_their_bits_are_sent(scripted):
     emulator.inject(SYNC, 5 * MS)
     emulator.run_until(9 * MS)
     heard = emulator.delivered()
-    assert [frame.id for _, frame in heard] == [0x180 + k for k in range(1, 7)] + [
-        0x280 + k for k in range(1, 7)
-    ]
+    assert [frame.id for _, frame in heard] == [0x180 + k for k in range(1, 7)] + [0x280 + k for k in range(1, 7)]
     ends = 5 * MS + 1000 * np.cumsum([frame_bits(frame) for frame in (SYNC, *(frame for _, frame in heard))])
     assert [t for t, _ in heard] == ends[1:].tolist()
 
@@ -143,9 +139,7 @@ def test_cables(scripted):
     assert answers(emulator, 2 * MS) == []
     assert SYNC not in [frame for _, frame in emulator.nodes[0].heard]
     emulator.run_until(30 * MS)
-    assert CanFrame(0x702, b"\x05") in [
-        frame for _, frame in emulator.nodes[0].heard
-    ]  # the drives hear each other
+    assert CanFrame(0x702, b"\x05") in [frame for _, frame in emulator.nodes[0].heard]  # the drives hear each other
     emulator.order("cable in", 31 * MS)
     emulator.order("cable 2 out", 31 * MS)
     assert answers(emulator, 32 * MS) == [0x181, 0x281]

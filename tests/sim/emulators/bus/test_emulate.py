@@ -110,9 +110,7 @@ def test_what_fails_at_the_start_is_told(cell_file):
     taken = socket.create_server(("127.0.0.1", 0))
     with (
         taken,
-        EmulatorProcess(
-            cell_file, options=("--channel", f"socket://127.0.0.1:{taken.getsockname()[1]}")
-        ) as drives,
+        EmulatorProcess(cell_file, options=("--channel", f"socket://127.0.0.1:{taken.getsockname()[1]}")) as drives,
     ):
         with pytest.raises(EmulatorError, match="cannot listen on") as refused:
             drives.wait_ready()
@@ -140,9 +138,7 @@ def test_command_lines_that_cannot_be(capsys, cell_file, kept_signals):
     assert "drives are emulated for 'canopen'" in refused(capsys, "drives", "demo")
     assert "nodes: 1, 2, 3" in refused(capsys, "drives", str(cell_file), *FREE, "--order", "silence 9")
     assert "usage: late" in refused(capsys, "drives", str(cell_file), *FREE, "--order", "late 2 x")
-    assert "on this host only" in refused(
-        capsys, "drives", str(cell_file), "--channel", "socket://10.0.0.1:5400"
-    )
+    assert "on this host only" in refused(capsys, "drives", str(cell_file), "--channel", "socket://10.0.0.1:5400")
     text = cell_file.read_text()
     cell_file.write_text(text.replace('protocol = "cia402"', 'protocol = "cia403"'))
     assert "cia403" in refused(capsys, "drives", str(cell_file), *FREE)

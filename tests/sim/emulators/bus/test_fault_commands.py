@@ -45,9 +45,7 @@ GOOD = {
     "help": Command("help"),
     "  SILENCE 4 @ 2.5s ": Command("silence", node=4, at_ns=2_500_000_000),
     "drop-sync@0": Command("drop-sync", at_ns=0),
-    "late 2 6ms for 2s @ 1s": Command(
-        "late", node=2, duration_ns=6_000_000, for_ns=2_000_000_000, at_ns=1_000_000_000
-    ),
+    "late 2 6ms for 2s @ 1s": Command("late", node=2, duration_ns=6_000_000, for_ns=2_000_000_000, at_ns=1_000_000_000),
     "cable 3 out for 50ms": Command("cable", node=3, what="out", for_ns=50_000_000),
 }
 

@@ -13,9 +13,7 @@ from stereoservo_sim.emulators.bus.fault_table import run_row, sum_up, trial_rng
 from stereoservo_sim.emulators.bus.fault_trials import FaultRig, Trial, run_trial, trial_speed
 
 ALL = [
-    pytest.param(protocol, case, id=f"{protocol}: {case.name}")
-    for protocol, cases in CASES.items()
-    for case in cases
+    pytest.param(protocol, case, id=f"{protocol}: {case.name}") for protocol, cases in CASES.items() for case in cases
 ]
 RUN_ON_S = 0.15
 

@@ -56,9 +56,7 @@ def test_drives_move_the_arm_of_a_urdf(plant: str, mechanics: str, tmp_path: Pat
 def test_joints_that_are_not_the_urdfs_are_named() -> None:
     cell = scara_on_a_bus(urdf="gantry.urdf")
     options, settings = drives_of_cell(cell)
-    with pytest.raises(
-        EmulationError, match=r"gantry\.urdf' is the simulated arm with joints x \(prismatic\), z"
-    ):
+    with pytest.raises(EmulationError, match=r"gantry\.urdf' is the simulated arm with joints x \(prismatic\), z"):
         make_bus_emulator(options, settings, t_ns=0)
 
 
@@ -74,7 +72,5 @@ def test_joints_that_differ_are_told_with_what_the_file_leaves_out(tmp_path: Pat
     joints = cell.joints.options["joint"]
     joints.append({**joints[-1], "name": "grip", "node_id": len(joints) + 1})
     options, drives = drives_of_cell(cell, tmp_path)
-    with pytest.raises(
-        EmulationError, match=r"this cell has .*grip.*flange = 'jaw' makes it a joint of the arm"
-    ):
+    with pytest.raises(EmulationError, match=r"this cell has .*grip.*flange = 'jaw' makes it a joint of the arm"):
         make_bus_emulator(options, drives, t_ns=0, cell_dir=tmp_path)

@@ -136,9 +136,7 @@ def test_efforts_of_a_massless_plant_are_inertia_friction_and_gravity(powered):
     assert np.isclose(axis.effort, s.gravity)
     axis.target = 0.5
     run(plant, 160, 100)
-    assert np.isclose(
-        axis.effort, s.inertia * 4.0 + s.friction + s.gravity * np.cos(axis.position), rtol=1e-2
-    )
+    assert np.isclose(axis.effort, s.inertia * 4.0 + s.friction + s.gravity * np.cos(axis.position), rtol=1e-2)
     run(plant, 700, 160)
     assert np.isclose(axis.effort, s.friction + s.gravity * np.cos(axis.position), rtol=1e-2)
 

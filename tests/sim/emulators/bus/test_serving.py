@@ -38,9 +38,7 @@ def serve(scripted):
         now = time.monotonic_ns()
         axes = [scripted.axis(k) for k in range(2)]
         nodes = [scripted.node(k + 1, axis, beat_ns=10**12) for k, axis in enumerate(axes)]
-        emulator = BusEmulator(
-            nodes, AxisPlant(axes, IdealPlant(np.zeros(2)), t_ns=now), bitrate=bitrate, t_ns=now
-        )
+        emulator = BusEmulator(nodes, AxisPlant(axes, IdealPlant(np.zeros(2)), t_ns=now), bitrate=bitrate, t_ns=now)
         server = BusServer(emulator, endpoint).__enter__()
         servers.append(server)
         return server
@@ -220,9 +218,7 @@ def test_a_defect_of_a_node_ends_the_server_and_is_raised(scripted):
     now = time.monotonic_ns()
     axis = scripted.axis()
     node = scripted.node(1, axis)
-    emulator = BusEmulator(
-        [node], AxisPlant([axis], IdealPlant(np.zeros(1)), t_ns=now), bitrate=None, t_ns=now
-    )
+    emulator = BusEmulator([node], AxisPlant([axis], IdealPlant(np.zeros(1)), t_ns=now), bitrate=None, t_ns=now)
 
     def broken(t_ns):
         raise ZeroDivisionError("a defect")
@@ -265,9 +261,7 @@ def options(interface, channel):
 
 
 def test_the_cells_own_channel():
-    assert (
-        served_channel(options("stereoservo_slcan", "socket://127.0.0.1:5400")) == "socket://127.0.0.1:5400"
-    )
+    assert served_channel(options("stereoservo_slcan", "socket://127.0.0.1:5400")) == "socket://127.0.0.1:5400"
     assert served_channel(options("socketcan", "vcan0")) == "socketcan:vcan0"
     with pytest.raises(EndpointError, match="--channel pty"):
         served_channel(options("stereoservo_slcan", "/dev/ttyACM0"))

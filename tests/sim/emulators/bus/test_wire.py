@@ -11,14 +11,10 @@ from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_sim.emulators.bus.bus_emulator import MASTER, QUEUE_LIMIT, Wire, arbitration_key
 from stereoservo_sim.emulators.nodes.node import NEVER_NS
 
-standard = st.builds(
-    CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8), st.just(False), st.just(False), st.just(0)
-)
+standard = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8), st.just(False), st.just(False), st.just(0))
 frames = st.one_of(
     standard,
-    st.builds(
-        CanFrame, st.integers(0, 0x7FF), st.just(b""), st.just(True), st.just(False), st.integers(0, 8)
-    ),
+    st.builds(CanFrame, st.integers(0, 0x7FF), st.just(b""), st.just(True), st.just(False), st.integers(0, 8)),
     st.builds(CanFrame, st.integers(0, 2**29 - 1), st.binary(max_size=8), st.just(False), st.just(True)),
     st.builds(CanFrame, st.integers(0, 2**29 - 1), st.just(b""), st.just(True), st.just(True)),
 )

@@ -80,9 +80,7 @@ def test_only_the_sources_differ_in_the_copy(tmp_path):
 def test_the_truth_of_video_cameras_is_what_is_emulated_at_their_address(tmp_path):
     cell = changed(tmp_path, "skew_ms = 15.0", "skew_ms = 15.0\nk1 = -0.1")
     assert [camera.k1 for camera in true_cell(cell).rig.cameras] == [0.0, -0.1]
-    with pytest.raises(
-        ValueError, match=r"shows '/middle\.mjpg', which is not emulated; streams: /left\.mjpg"
-    ):
+    with pytest.raises(ValueError, match=r"shows '/middle\.mjpg', which is not emulated; streams: /left\.mjpg"):
         true_cell(changed(tmp_path, "5480/left.mjpg", "5480/middle.mjpg"))
 
 

@@ -25,9 +25,7 @@ class Bench:
             "max_acceleration": 4.0, "quick_stop_deceleration": 10.0, "position_min": -3.0, "position_max": 3.0,
         } | (joint or {})  # fmt: skip
         self.joint = CanJoint(**options)
-        self.axis = EmulatedAxis(
-            JointSpec("a", "revolute", -3.0, 3.0, 1.0, 4.0), position, set_position=position
-        )
+        self.axis = EmulatedAxis(JointSpec("a", "revolute", -3.0, 3.0, 1.0, 4.0), position, set_position=position)
         self.node = Cia402Node(node_id, self.axis, self.joint, eds=EDS, settings=NodeSettings(**settings))
         self.id = node_id
         self.t = 0
@@ -49,9 +47,7 @@ class Bench:
             gap = axis.target - axis.set_velocity
             ramp = min(abs(gap) / axis.acceleration, h)
             reached = (
-                axis.target
-                if ramp < h
-                else axis.set_velocity + (axis.acceleration * ramp) * (1 if gap > 0 else -1)
+                axis.target if ramp < h else axis.set_velocity + (axis.acceleration * ramp) * (1 if gap > 0 else -1)
             )
             axis.set_position += 0.5 * (axis.set_velocity + reached) * ramp + reached * (h - ramp)
             axis.set_velocity = reached

@@ -9,9 +9,7 @@ K = 4096 * 100 / (2 * math.pi)
 
 
 def test_units_direction_offset_and_gear(make_bench):
-    bench = make_bench(
-        joint={"direction": -1, "offset_rad": 0.25, "velocity_units_per_rev_s": 60.0}, position=0.5
-    )
+    bench = make_bench(joint={"direction": -1, "offset_rad": 0.25, "velocity_units_per_rev_s": 60.0}, position=0.5)
     assert bench.read(0x6064, signed=True) == round(-K * 0.75)
     bench.enable(x6083=1000, x6084=1000)
     bench.velocity(-30)  # rpm of the motor, against the joint's direction
@@ -217,9 +215,7 @@ def test_fault_reaction_0_coasts(bench):
     assert not bench.axis.powered
 
 
-@pytest.mark.parametrize(
-    ("index", "word", "state"), [(0x605B, 6, "ready to switch on"), (0x605C, 7, "switched on")]
-)
+@pytest.mark.parametrize(("index", "word", "state"), [(0x605B, 6, "ready to switch on"), (0x605C, 7, "switched on")])
 def test_shutdown_and_disable_operation(bench, index, word, state):
     moving(bench, **{f"x{index:X}": 1})
     bench.word(word)

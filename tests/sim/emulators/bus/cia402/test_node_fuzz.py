@@ -31,9 +31,7 @@ writes = st.builds(
     st.sampled_from([1, 2, 4]),
     st.one_of(st.integers(0, 20), st.integers(0, 2**32 - 1)),
 )
-commands = st.builds(
-    lambda c: CanFrame(id=0, data=bytes([c, 3])), st.sampled_from([1, 1, 1, 2, 0x80, 0x81, 0x82])
-)
+commands = st.builds(lambda c: CanFrame(id=0, data=bytes([c, 3])), st.sampled_from([1, 1, 1, 2, 0x80, 0x81, 0x82]))
 syncs = st.just(CanFrame(id=0x80))
 waits = st.integers(-10, 200)
 handshakes = st.sampled_from([
@@ -41,9 +39,7 @@ handshakes = st.sampled_from([
     (0x10F, 15), (6, 7, 0, 15), (6, 7, 2, 15), (6, 0, 15), (6, 2, 7, 15),
 ])  # fmt: skip
 trips = st.sampled_from(["0x3210", "reboot", "limit", "invert"])
-mixed = st.one_of(
-    anything, words, handshakes, handshakes, handshakes, writes, commands, syncs, waits, waits, trips
-)
+mixed = st.one_of(anything, words, handshakes, handshakes, handshakes, writes, commands, syncs, waits, waits, trips)
 steps = st.lists(mixed, min_size=5, max_size=60)
 
 
