@@ -67,9 +67,14 @@ class ChessboardDetector:
         pixels = find_corners(gray_image(frame, self.camera), self.options.columns, self.options.rows)
         count = 0 if pixels is None else len(pixels)
         return CameraObservation(
-            self.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, np.arange(count),
-            np.zeros((0, 2)) if pixels is None else pixels, np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1)),
-        )  # fmt: skip
+            self.camera,
+            frame.seq,
+            frame.t_shutter_ns,
+            frame.t_received_ns,
+            np.arange(count),
+            np.zeros((0, 2)) if pixels is None else pixels,
+            np.tile(SIGMA_PX**2 * np.eye(2), (count, 1, 1)),
+        )
 
 
 def find_corners(image: ImageArray, columns: int, rows: int) -> FloatArray | None:

@@ -126,7 +126,7 @@ class EpisodeJointDriver:
             home=tuple(positions[0].tolist()),
             lacks=("efforts", "following_errors"),
             simulated=True,
-        )  # fmt: skip
+        )
 
     def configure(self) -> None:
         """Begin to tell positions. Raises DriverError."""

@@ -160,9 +160,13 @@ class SimulatedArm:
         self._seq += 1
         positions = self.encode(bank.plant.readings)
         return JointState(
-            seq=self._seq, t_ns=self._stamp(bank), positions=positions, velocities=bank.plant.reading_rates.copy(),
-            efforts=bank.plant.efforts.copy(), following_errors=bank.set_positions - positions,
-        )  # fmt: skip
+            seq=self._seq,
+            t_ns=self._stamp(bank),
+            positions=positions,
+            velocities=bank.plant.reading_rates.copy(),
+            efforts=bank.plant.efforts.copy(),
+            following_errors=bank.set_positions - positions,
+        )
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
         """Command velocities (n,). Raises DriverError: not active, wrong shape, not finite."""
@@ -237,9 +241,14 @@ class SimulatedArm:
         output = PositionOutput(LEAD_S * fastest, largest, fastest, period_ns * 1e-9)
         self._output = output
         return PositionBank(
-            self._joints, plant, now_ns=now_ns, step_ns=self.step_ns, timeout_ns=timeout_ns, period_ns=period_ns,
+            self._joints,
+            plant,
+            now_ns=now_ns,
+            step_ns=self.step_ns,
+            timeout_ns=timeout_ns,
+            period_ns=period_ns,
             order=lambda velocities: output.step(velocities, self.encode(plant.readings), low, high),
-        )  # fmt: skip
+        )
 
     def _advance(self) -> DriveBank:
         assert self._bank is not None  # configured: the lifecycle was checked

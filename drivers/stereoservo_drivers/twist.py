@@ -122,10 +122,13 @@ class SimulatedController:
     def write(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Follow a twist until the time-out, scaled down to the controller's speeds."""
         here = self._posture(self._inner.read_state().positions)
-        scale = min(1.0, *(
-            speed / max(float(np.linalg.norm(part)), 1e-12)
-            for speed, part in zip(self._speeds, (v, w), strict=True)
-        ))  # fmt: skip
+        scale = min(
+            1.0,
+            *(
+                speed / max(float(np.linalg.norm(part)), 1e-12)
+                for speed, part in zip(self._speeds, (v, w), strict=True)
+            ),
+        )
         v, w = scale * v, scale * w
         R = self._robot.mounted[:3, :3]
         if self._frame == "tool":
@@ -218,9 +221,14 @@ class TwistJointDriver(CartesianJointDriver):
         start = np.array(inner.describe().home)
         home = positions_of(tool_pose(cell.robot, decoded.tool.matrix, start), attitude, np.zeros(6))
         description = cartesian_description(
-            self.driver, limits_of(decoded, cell), rate_hz=decoded.rate_hz, timeout_s=decoded.command_timeout_s,
-            budget_us=inner.call_budget_us + CONTROLLER_US, home=tuple(home.tolist()), simulated=True,
-        )  # fmt: skip
+            self.driver,
+            limits_of(decoded, cell),
+            rate_hz=decoded.rate_hz,
+            timeout_s=decoded.command_timeout_s,
+            budget_us=inner.call_budget_us + CONTROLLER_US,
+            home=tuple(home.tolist()),
+            simulated=True,
+        )
         description = msgspec.structs.replace(description, auxiliary=decoded.auxiliary, notes=cell.robot.notes)
         super().__init__(SimulatedController(decoded, inner, cell.robot, context), description, attitude, decoded.frame)
 
@@ -256,18 +264,24 @@ def limits_of(options: TwistOptions, cell: SimulatedCell) -> VirtualLimits:
     """Limits of the virtual joints around the tool's place at the cell's base."""
     middle, box = tool_pose(cell.robot, options.tool.matrix, cell.base)[:3, 3], np.array(options.box)
     return VirtualLimits(
-        tuple((middle - box).tolist()), tuple((middle + box).tolist()), options.turns, options.velocities,
+        tuple((middle - box).tolist()),
+        tuple((middle + box).tolist()),
+        options.turns,
+        options.velocities,
         options.accelerations,
-    )  # fmt: skip
+    )
 
 
 def seen_as_joints(options: Mapping[str, Any], cell: SimulatedCell) -> SimulatedCell:
     """The truth of a cell of driver ``twist`` with the virtual joints in place of the arm's. Raises DriverError."""
     decoded = decode_options(TwistOptions, options, TwistJointDriver.driver)
     return virtual_cell(
-        cell, decoded.tool.matrix, attitude_of(decoded, cell), limits_of(decoded, cell).joints(),
+        cell,
+        decoded.tool.matrix,
+        attitude_of(decoded, cell),
+        limits_of(decoded, cell).joints(),
         virtual_positions(options, cell, cell.base),
-    )  # fmt: skip
+    )
 
 
 def virtual_positions(options: Mapping[str, Any], cell: SimulatedCell, q: FloatArray) -> FloatArray:

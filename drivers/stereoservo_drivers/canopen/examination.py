@@ -116,9 +116,11 @@ def traffic_finding(options: CanOptions, received: list[CanFrame]) -> Examinatio
     if options.protocol == "cia402" and found:
         foreign = ", ".join(f"0x{can_id:X}" for can_id in sorted(found))
         return ExaminationFinding(
-            "traffic", False, f"another master is on this bus: it sends {foreign}",
+            "traffic",
+            False,
+            f"another master is on this bus: it sends {foreign}",
             "end it (another daemon, the drives' own tool, a PLC), or take the drives off its bus",
-        )  # fmt: skip
+        )
     return ExaminationFinding("traffic", True, f"{len(received)} frames in {LISTEN_S:g} s, none of another master")
 
 
@@ -378,9 +380,11 @@ def noise_finding(joint: CanJoint, positions: FloatArray) -> ExaminationFinding:
         return ExaminationFinding(name, True, message)
     if abs(drift) > 0.8 * range_seen:
         return ExaminationFinding(
-            name, False, f"moves by {drift:+.2g} {unit} while nobody drives it",
+            name,
+            False,
+            f"moves by {drift:+.2g} {unit} while nobody drives it",
             "it sinks: see to its brake; or it was pushed: leave it alone and repeat",
-        )  # fmt: skip
+        )
     return ExaminationFinding(
         name, False, message, "encoder cable, its screen, and the encoder's type set in the drive"
     )
@@ -476,11 +480,12 @@ def jog_finding(trace: JogTrace) -> ExaminationFinding:
         return found
     asked, travel = _travel_text(trace.joint, trace.asked), _travel_text(trace.joint, trace.travel)
     return ExaminationFinding(
-        found.name, None,
+        found.name,
+        None,
         f"asked for {asked}, moved {travel} by its own encoder, but while it moved a cycle took "
         f"{trace.longest_s * 1e3:.0f} ms instead of {trace.cycle_s * 1e3:.0f}, in which drives may stop: not judged",
         "repeat it when this computer has less to do",
-    )  # fmt: skip
+    )
 
 
 def _finding_of_units(trace: JogTrace) -> ExaminationFinding:
@@ -497,15 +502,20 @@ def _finding_of_units(trace: JogTrace) -> ExaminationFinding:
         )
     if ratio < -0.05:
         return ExaminationFinding(
-            name, False, f"asked for {asked}, its encoder moved {travel}: the wrong way",
+            name,
+            False,
+            f"asked for {asked}, its encoder moved {travel}: the wrong way",
             "motor and encoder count in opposite senses: polarity of the encoder in the drive (0x607E turns both)",
-        )  # fmt: skip
+        )
     if ratio < 0.05:
         return ExaminationFinding(
-            name, False, f"asked for {asked}, moved {travel}: it stands",
+            name,
+            False,
+            f"asked for {asked}, moved {travel}: it stands",
             f"brake, safe torque off, the drive's mode; or {_units_remedy(joint, ratio)}"
-            if ratio > 1e-5 else "brake, safe torque off, the drive's mode, its velocity limit",
-        )  # fmt: skip
+            if ratio > 1e-5
+            else "brake, safe torque off, the drive's mode, its velocity limit",
+        )
     if ratio < 1.0 - TOLERANCE:
         return ExaminationFinding(
             name, False, f"asked for {asked}, moved {travel}: {ratio:.3g} times", _units_remedy(joint, ratio)
@@ -513,20 +523,23 @@ def _finding_of_units(trace: JogTrace) -> ExaminationFinding:
     share = trace.reported / trace.travel
     if not 1.0 - 2 * TOLERANCE < share < 1.0 + 2 * TOLERANCE:
         return ExaminationFinding(
-            name, False,
+            name,
+            False,
             f"moved {travel}, but the velocity that the drive reports (0x606C) adds up to "
             f"{_travel_text(joint, trace.reported)}: {share:.3g} times",
             "actual and target velocity differ in units: see the drive's manual; or leave velocity out of feedback",
-        )  # fmt: skip
+        )
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
     lag_s = trace.longest_lag / fastest
     message = f"asked for {asked}, moved {travel} by its own encoder, at most {lag_s * 1e3:.0f} ms behind"
     if lag_s > LAG_S:
         return ExaminationFinding(name, None, message, "velocity loop of the drive: gains, or its acceleration limit")
     return ExaminationFinding(
-        name, True, f"{message}; where your eye saw less or more, gear_ratio is wrong by that factor, where it saw the "
+        name,
+        True,
+        f"{message}; where your eye saw less or more, gear_ratio is wrong by that factor, where it saw the "
         "other way, direction",
-    )  # fmt: skip
+    )
 
 
 def _units_remedy(joint: CanJoint, ratio: float, *, at_least: bool = False) -> str:

@@ -241,9 +241,11 @@ class Gripper:
             return self._fault("drive_fault", self.axis.words(), word, hint)
         if self._was_enabled and not self.axis.enabled:
             return self._fault(
-                "disabled", f"left operation enabled unasked: {self.axis.words()}", word,
+                "disabled",
+                f"left operation enabled unasked: {self.axis.words()}",
+                word,
                 "look at the drive's own inputs and its supply",
-            )  # fmt: skip
+            )
         self._was_enabled |= self.axis.enabled and self._on
         return None
 
@@ -286,14 +288,18 @@ class Gripper:
         waited_s = (now_ns - self._since_ns) * 1e-9
         if self._on and not self._was_enabled and waited_s > ENABLE_LIMIT_S:
             return self._fault(
-                "enable_timeout", f"not enabled after {waited_s:.1f} s: {self.axis.words()}", None,
+                "enable_timeout",
+                f"not enabled after {waited_s:.1f} s: {self.axis.words()}",
+                None,
                 "is its power stage supplied, is the emergency stop released?",
-            )  # fmt: skip
+            )
         if self._was_enabled and self._order is not None and waited_s > TAKEN_LIMIT_S:
             return self._fault(
-                "target_ignored", f"has not taken its order within {TAKEN_LIMIT_S:g} s (bit 12 of the status word)",
-                self.axis.status_word, "does an input or another tool hold it (halt, local mode)?",
-            )  # fmt: skip
+                "target_ignored",
+                f"has not taken its order within {TAKEN_LIMIT_S:g} s (bit 12 of the status word)",
+                self.axis.status_word,
+                "does an input or another tool hold it (halt, local mode)?",
+            )
         return None
 
     def _fault(self, code: str, message: str, value: int | None, hint: str) -> AxisFault:

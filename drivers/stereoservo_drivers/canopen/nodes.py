@@ -142,9 +142,11 @@ def scan_bus(options: Mapping[str, Any], bitrates: Sequence[int] = BITRATES) -> 
         return BusScan({**options, "bitrate": rate}, tuple(drives), tuple(findings))
     tried = ", ".join(map(str, rates))
     nobody = ExaminationFinding(
-        "nodes", False, f"nobody answers on {options['interface']} {options['channel']}, at {tried} bit/s",
+        "nodes",
+        False,
+        f"nobody answers on {options['interface']} {options['channel']}, at {tried} bit/s",
         "power of the drives, cable, 120 ohm at both ends, the adapter's other channel",
-    )  # fmt: skip
+    )
     return BusScan(dict(options), (), (nobody,))
 
 
@@ -157,10 +159,11 @@ def _kernels_bitrate(options: Mapping[str, Any]) -> int | None:
 def wrong_bitrate(nodes: Sequence[int], rate: int, stated: int) -> ExaminationFinding:
     """Finding on nodes that answer at another bit rate than the stated one [bit/s]."""
     return ExaminationFinding(
-        "bit rate", False,
+        "bit rate",
+        False,
         f"nobody answers at {stated} bit/s; nodes {', '.join(map(str, nodes))} answer at {rate}",
         f"bitrate = {rate} in [joints.options]",
-    )  # fmt: skip
+    )
 
 
 def other_bitrate(options: Mapping[str, Any]) -> ExaminationFinding | None:
@@ -219,9 +222,11 @@ def _scan_at(settings: ChannelSettings) -> tuple[list[FoundDrive], list[Examinat
 
 def _duplicate(name: str, node: int, count: int) -> ExaminationFinding:
     return ExaminationFinding(
-        name, False, f"{count} drives answer as node {node}",
+        name,
+        False,
+        f"{count} drives answer as node {node}",
         "give each drive a node id of its own (switches on the drive, or its vendor's tool, one drive at a time)",
-    )  # fmt: skip
+    )
 
 
 def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
@@ -366,9 +371,11 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
     message = f"answers once; device type {device:#010x}, {reported}"
     if device & 0xFFFF != CIA_402:
         return ExaminationFinding(
-            name, False, f"{message}: device profile {device & 0xFFFF} is not CiA 402",
+            name,
+            False,
+            f"{message}: device profile {device & 0xFFFF} is not CiA 402",
             "another device has this node id; or protocol of the cell file",
-        )  # fmt: skip
+        )
     wrong = [
         (what, value)
         for what, value in values.items()
@@ -395,10 +402,11 @@ def limits_findings(joint: CanJoint, low: int | None, high: int | None) -> Itera
         yield ExaminationFinding(f"{joint.name} limits", True, f"within the drive's: {own}")
         return
     yield ExaminationFinding(
-        f"{joint.name} limits", False,
+        f"{joint.name} limits",
+        False,
         f"{joint.position_min:.4g} to {joint.position_max:.4g} {unit} reach beyond the drive: {own}",
         f"position_min and position_max of {joint.name!r} and its [[safety.limit]] within these; or the drive's 0x607D",
-    )  # fmt: skip
+    )
 
 
 def _state(drive: RemoteDrive) -> ExaminationFinding:

@@ -37,9 +37,7 @@ WATCHDOG, WATCHDOG_S = "axis0.config.enable_watchdog", "axis0.config.watchdog_ti
 SPEED, RAMP = "axis0.controller.config.vel_limit", "axis0.controller.config.vel_ramp_rate"
 CONTROL_MODE, INPUT_MODE = "axis0.controller.config.control_mode", "axis0.controller.config.input_mode"
 CHECKED = (WATCHDOG, WATCHDOG_S, SPEED, RAMP, CONTROL_MODE, INPUT_MODE)
-TYPES = {
-    "bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "float": "f",
-}  # fmt: skip
+TYPES = {"bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "float": "f"}
 LEAST_CYCLES = 2.0
 """Velocities that may be missing before the watchdog disarms: a shorter one trips by a single late cycle."""
 

@@ -204,9 +204,13 @@ def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
     try:
         for camera in cell.camera:
             context = DriverContext(
-                clock=MonotonicClock(), cell=cell.cell.name, runtime_dir=path.parent, cell_dir=path.parent,
-                camera=camera.name, mount=camera.mount,
-            )  # fmt: skip
+                clock=MonotonicClock(),
+                cell=cell.cell.name,
+                runtime_dir=path.parent,
+                cell_dir=path.parent,
+                camera=camera.name,
+                mount=camera.mount,
+            )
             driver: CameraDriver = plugins.load(plugins.CAMERA_DRIVERS, camera.driver)(camera.options, context)
             opened[camera.name] = driver
             driver.configure()

@@ -152,13 +152,17 @@ def _spots(picture, mask, gates, scratch):
         if longer > MAX_ASPECT * shorter or area < MIN_FILL * width * height:
             continue
         window = (
-            shrink * left - GROW, shrink * top - GROW, shrink * (left + width) + GROW,
+            shrink * left - GROW,
+            shrink * top - GROW,
+            shrink * (left + width) + GROW,
             shrink * (top + height) + GROW,
-        )  # fmt: skip
+        )
         sought = Sought(
             shrink * (total[SUM_U] / area) + 0.5 * (shrink - 1),
-            shrink * (total[SUM_V] / area) + 0.5 * (shrink - 1), gates.contrast, np.int64(5),
-        )  # fmt: skip
+            shrink * (total[SUM_V] / area) + 0.5 * (shrink - 1),
+            gates.contrast,
+            np.int64(5),
+        )
         status = measure(picture, window, sought, scratch, found[count])
         if status == OK and whole(found[count], gates.lopsided):
             count += 1

@@ -131,9 +131,12 @@ def _ellipse(component, patch, planes, contrast, out):
     mid_u, mid_v = 0.5 * (component.left + component.right), 0.5 * (component.top + component.bottom)
     half = 0.5 * (component.right - component.left) + 2.0
     s, su, sv, suu, suv, svv = _soft_moments(
-        Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]), F(mid_u - patch.left), F(mid_v - patch.top),
-        F(half), F(2.0 / contrast),
-    )  # fmt: skip
+        Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]),
+        F(mid_u - patch.left),
+        F(mid_v - patch.top),
+        F(half),
+        F(2.0 / contrast),
+    )
     if s < 3.0:
         return False
     mu = su / s
@@ -289,9 +292,11 @@ def _window(skirt, out):
     half_u, half_v = half_sizes(q11, q12, q22)
     half_u, half_v = half_u + reach, half_v + reach
     return Window(
-        int(np.ceil(out[U] - half_u)), int(np.floor(out[U] + half_u)),
-        int(np.ceil(out[V] - half_v)), int(np.floor(out[V] + half_v)),
-    )  # fmt: skip
+        int(np.ceil(out[U] - half_u)),
+        int(np.floor(out[U] + half_u)),
+        int(np.ceil(out[V] - half_v)),
+        int(np.floor(out[V] + half_v)),
+    )
 
 
 @kernel
@@ -301,9 +306,11 @@ def _around(skirt, out):
     half_u, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
     half_u, half_v = half_u + reach, half_v + reach
     return (
-        int(np.floor(out[U] - half_u)), int(np.floor(out[V] - half_v)), int(np.floor(out[U] + half_u)) + 1,
+        int(np.floor(out[U] - half_u)),
+        int(np.floor(out[V] - half_v)),
+        int(np.floor(out[U] + half_u)) + 1,
         int(np.floor(out[V] + half_v)) + 1,
-    )  # fmt: skip
+    )
 
 
 @kernel

@@ -293,9 +293,13 @@ class CornerDetector:
             return
         self._since_search = 0
         anywhere = search_by_keypoints(
-            self._patches, self._keypoints, find_keypoints(image, KEYPOINTS), pyramid, self._least,
+            self._patches,
+            self._keypoints,
+            find_keypoints(image, KEYPOINTS),
+            pyramid,
+            self._least,
             self.options.radius_px,
-        )  # fmt: skip
+        )
         self._merge(found, anywhere, missing)
 
     def _where_they_were(self, pyramid: list[ImageArray], missing: BoolArray) -> Alignment:

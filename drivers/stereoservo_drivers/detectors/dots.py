@@ -125,9 +125,14 @@ class _Seen(NamedTuple):
     def observation(self, frame: Frame, count: int) -> CameraObservation:
         """That of a ``frame``, of the first ``count`` rows."""
         return CameraObservation(
-            frame.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, self.ids[:count],
-            self.pixels[:count], self.covariances[:count],
-        )  # fmt: skip
+            frame.camera,
+            frame.seq,
+            frame.t_shutter_ns,
+            frame.t_received_ns,
+            self.ids[:count],
+            self.pixels[:count],
+            self.covariances[:count],
+        )
 
 
 class DotDetector:
@@ -218,17 +223,21 @@ class DotDetector:
         """Measure and judge the dots of a prior, into ``seen`` and for :meth:`_with_others`; the number accepted."""
         options = self.options
         expected = (
-            np.ascontiguousarray(prior.ids, np.int64), np.ascontiguousarray(prior.pixels, np.float64),
+            np.ascontiguousarray(prior.ids, np.int64),
+            np.ascontiguousarray(prior.pixels, np.float64),
             np.ascontiguousarray(prior.velocities, np.float64),
-            np.ascontiguousarray(prior.covariances, np.float64), dt_s,
-        )  # fmt: skip
-        gates = (
-            options.min_contrast, self._gate, options.lopsided, options.consistency_px, options.floor_px
-        )  # fmt: skip
+            np.ascontiguousarray(prior.covariances, np.float64),
+            dt_s,
+        )
+        gates = (options.min_contrast, self._gate, options.lopsided, options.consistency_px, options.floor_px)
         found: int = track(
-            (image, self._dark), (*self._faces, self._order), expected, gates, plain(self._scratch),
+            (image, self._dark),
+            (*self._faces, self._order),
+            expected,
+            gates,
+            plain(self._scratch),
             (self._dots, self._used, *seen),
-        )  # fmt: skip
+        )
         return found
 
     def _with_others(self, image: ImageArray, prior: Prior) -> _Found:
@@ -261,9 +270,7 @@ class DotDetector:
         if taken is not None and len(taken) and len(spots):
             away = np.hypot(*(spots[:, None, :2] - taken[None]).transpose(2, 0, 1)).min(axis=1)
             spots = np.ascontiguousarray(spots[away > SAME_SPOT_PX])
-        copies = acquisition.copies_of(
-            self._searched, sought, spots, options.acquire_dots, options.consistency_px
-        )  # fmt: skip
+        copies = acquisition.copies_of(self._searched, sought, spots, options.acquire_dots, options.consistency_px)
         owners = np.full(self._every_id.shape, -1, np.int64)
         for f, found in enumerate(copies):
             owner = acquisition.choose(found, spots, expected[f])
@@ -540,19 +547,26 @@ def _compile_kernels() -> None:
     """Compile the kernels of tracking, or load them from the cache."""
     seen = written(INT, 1), written(FLOAT, 2), written(FLOAT, 3)
     # before `track`, which calls it with the same types
-    compile_for(
-        report, given(INT, 2), given(INT, 1), written(FLOAT, 2), written(BOOL, 1), FLOAT, fields(*seen)
-    )  # fmt: skip
+    compile_for(report, given(INT, 2), given(INT, 1), written(FLOAT, 2), written(BOOL, 1), FLOAT, fields(*seen))
     faces = given(INT, 2), given(FLOAT, 3), given(FLOAT, 1)
     compile_for(
-        track, fields(IMAGE, BOOL), fields(*faces, given(INT, 1)),
+        track,
+        fields(IMAGE, BOOL),
+        fields(*faces, given(INT, 1)),
         fields(given(INT, 1), given(FLOAT, 2), given(FLOAT, 2), given(FLOAT, 3), FLOAT),
-        fields(INT, FLOAT, FLOAT, FLOAT, FLOAT), SCRATCH, fields(written(FLOAT, 2), written(BOOL, 1), *seen),
-    )  # fmt: skip
+        fields(INT, FLOAT, FLOAT, FLOAT, FLOAT),
+        SCRATCH,
+        fields(written(FLOAT, 2), written(BOOL, 1), *seen),
+    )
     compile_for(
-        settle_faces, fields(*faces), given(FLOAT, 2), given(INT, 2), fields(FLOAT, INT), written(FLOAT, 3),
+        settle_faces,
+        fields(*faces),
+        given(FLOAT, 2),
+        given(INT, 2),
+        fields(FLOAT, INT),
+        written(FLOAT, 3),
         written(BOOL, 2),
-    )  # fmt: skip
+    )
 
 
 # -- options of faces ----------------------------------------------------------------------------------------

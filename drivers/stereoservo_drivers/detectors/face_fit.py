@@ -433,9 +433,7 @@ def _follow(dot, slope, noise, ground, moved):
         t0, t1 = BLURRED_SLOPE * s0, BLURRED_SLOPE * s1
         _add_covariance(dot, G, Symmetric2(t0 * t0, t0 * t1, t1 * t1))
     # (1 - K) P
-    _add_covariance(
-        dot, G, Symmetric2(p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r)
-    )  # fmt: skip
+    _add_covariance(dot, G, Symmetric2(p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r))
     # the dot's own slope has noise in common with its centre: -(X Kᵀ Gᵀ + G K Xᵀ)
     m00, m01 = g00 * k00 + g01 * k10, g00 * k01 + g01 * k11
     m10, m11 = g10 * k00 + g11 * k10, g10 * k01 + g11 * k11

@@ -123,9 +123,7 @@ def _normal(pattern, pixels, used, frame, h):
         return none
     g0 = -rx - a0 * p[0] - b0 * p[1] - c0 * p[2] - d0 * q[0] - e0 * q[1] - f0 * q[2]
     g1 = -ry - a1 * p[0] - b1 * p[1] - c1 * p[2] - d1 * q[0] - e1 * q[1] - f1 * q[2]
-    return Normal(
-        True, root, (a0, a1, b0, b1, c0, c1), (d0, d1, e0, e1, f0, f1), p, q, (s00, s01, s11), (g0, g1)
-    )  # fmt: skip
+    return Normal(True, root, (a0, a1, b0, b1, c0, c1), (d0, d1, e0, e1, f0, f1), p, q, (s00, s01, s11), (g0, g1))
 
 
 @kernel
@@ -136,13 +134,11 @@ def _solution(normal, h):
     g0 = (s[2] * normal.g[0] - s[1] * normal.g[1]) / det
     g1 = (s[0] * normal.g[1] - s[1] * normal.g[0]) / det
     h[0], h[1], h[2] = _backward(
-        normal.root, ux[0] - kx[0] * g0 - kx[1] * g1, ux[1] - kx[2] * g0 - kx[3] * g1,
-        ux[2] - kx[4] * g0 - kx[5] * g1,
-    )  # fmt: skip
+        normal.root, ux[0] - kx[0] * g0 - kx[1] * g1, ux[1] - kx[2] * g0 - kx[3] * g1, ux[2] - kx[4] * g0 - kx[5] * g1
+    )
     h[3], h[4], h[5] = _backward(
-        normal.root, uy[0] - ky[0] * g0 - ky[1] * g1, uy[1] - ky[2] * g0 - ky[3] * g1,
-        uy[2] - ky[4] * g0 - ky[5] * g1,
-    )  # fmt: skip
+        normal.root, uy[0] - ky[0] * g0 - ky[1] * g1, uy[1] - ky[2] * g0 - ky[3] * g1, uy[2] - ky[4] * g0 - ky[5] * g1
+    )
     h[6], h[7] = g0, g1
 
 

@@ -279,9 +279,14 @@ def _passes_backward_check(
     back = ReferencePatches(right, found.pixels[rows], settings.half)
     inverse: FloatArray = np.linalg.inv(found.A[rows])
     result, good = seek(
-        back, build_pyramid(left, TEMPLATE_LEVELS), np.arange(len(rows)), inverse,
-        corners[rows], settings.least_correlation, 0,
-    )  # fmt: skip
+        back,
+        build_pyramid(left, TEMPLATE_LEVELS),
+        np.arange(len(rows)),
+        inverse,
+        corners[rows],
+        settings.least_correlation,
+        0,
+    )
     returned = np.zeros(len(corners), np.bool_)
     returned[rows] = good & (np.linalg.norm(result.pixels - corners[rows], axis=1) <= BACK_PX)
     return returned
@@ -395,9 +400,14 @@ def _motion(
     stayed, moved = np.zeros(m, np.bool_), np.zeros(m, np.bool_)
     stayed[rows] = good & near
     found = search_by_keypoints(
-        patches, find_keypoints(before, settings.keypoints), find_keypoints(after, settings.keypoints), pyramid,
-        alike, settings.radius_px, shifted_px=MOVED_PX,
-    )  # fmt: skip
+        patches,
+        find_keypoints(before, settings.keypoints),
+        find_keypoints(after, settings.keypoints),
+        pyramid,
+        alike,
+        settings.radius_px,
+        shifted_px=MOVED_PX,
+    )
     with np.errstate(invalid="ignore"):
         moved = found.found & (np.linalg.norm(found.pixels - pixels, axis=1) >= MOVED_PX)
     return stayed, moved

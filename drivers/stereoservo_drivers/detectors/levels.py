@@ -164,9 +164,11 @@ def surroundings(patch, planes, box, ellipse, limit):
     left, top, right, bottom = box
     a, b = lanes(patch, max(top, patch.top), min(bottom, patch.bottom))
     middle = (
-        F(0.5 * (left + right) - patch.left), F(0.5 * (right - left)), F(0.5 * (top + bottom) - patch.top),
+        F(0.5 * (left + right) - patch.left),
+        F(0.5 * (right - left)),
+        F(0.5 * (top + bottom) - patch.top),
         F(0.5 * (bottom - top)),
-    )  # fmt: skip
+    )
     pixels, valid = Pixels(planes[LEVEL, a:b], planes[X, a:b], planes[Y, a:b]), planes[VALID, a:b]
     fit, sums = Surface(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), np.empty(15)
     for _ in range(2):

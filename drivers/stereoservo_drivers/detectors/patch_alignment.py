@@ -279,9 +279,13 @@ def compile_kernels() -> None:
     """Compile what the alignment calls, or load it from the cache."""
     compile_for(_sample_cubic, IMAGE, FLOAT, FLOAT)
     compile_for(
-        align_patches, IMAGE, fields(INT, INT, given(SINGLE, 3), given(SINGLE, 2), given(FLOAT, 1)), given(INT, 1),
-        INT, fields(written(FLOAT, 3), written(FLOAT, 2), written(FLOAT, 2), written(INT, 1)),
-    )  # fmt: skip
+        align_patches,
+        IMAGE,
+        fields(INT, INT, given(SINGLE, 3), given(SINGLE, 2), given(FLOAT, 1)),
+        given(INT, 1),
+        INT,
+        fields(written(FLOAT, 3), written(FLOAT, 2), written(FLOAT, 2), written(INT, 1)),
+    )
 
 
 @dataclass(frozen=True, eq=False)

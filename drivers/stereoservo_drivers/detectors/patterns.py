@@ -305,9 +305,14 @@ def find_face(face, dots, gates, owner):
     us, vs = pixels[:, 0].copy(), pixels[:, 1].copy()
     rivals = Rivals(np.zeros((MOST_RIVALS, n), np.int64), np.zeros(MOST_RIVALS))
     scratch = Scratch(
-        np.zeros((3, 3)), np.zeros(7), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n, np.bool_),
-        np.zeros((n, 2)), np.zeros(n),
-    )  # fmt: skip
+        np.zeros((3, 3)),
+        np.zeros(7),
+        np.zeros(n, np.int64),
+        np.zeros(n, np.int64),
+        np.zeros(n, np.bool_),
+        np.zeros((n, 2)),
+        np.zeros(n),
+    )
     best_count = known = np.int64(0)
     owner[:] = -1
     for row in range(bases.shape[0]):
@@ -410,6 +415,11 @@ def find_faces(faces, sought, spots, gates, owners, counts):
 def compile_kernels() -> None:
     """Compile what the detector calls, or load it from the cache."""
     compile_for(
-        find_faces, fields(given(FLOAT, 3), given(FLOAT, 1), given(INT, 3), given(FLOAT, 4)), given(BOOL, 1),
-        written(FLOAT, 2), fields(INT, FLOAT, FLOAT), written(INT, 3), written(INT, 1),
-    )  # fmt: skip
+        find_faces,
+        fields(given(FLOAT, 3), given(FLOAT, 1), given(INT, 3), given(FLOAT, 4)),
+        given(BOOL, 1),
+        written(FLOAT, 2),
+        fields(INT, FLOAT, FLOAT),
+        written(INT, 3),
+        written(INT, 1),
+    )

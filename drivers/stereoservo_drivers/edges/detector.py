@@ -171,9 +171,10 @@ class EdgeDetector:
         pixels = prior.pixels + dt_s * prior.velocities
         variances = 0.5 * np.trace(prior.covariances, axis1=1, axis2=2)
         good = [
-            k for k, marker in enumerate(prior.ids.tolist())
+            k
+            for k, marker in enumerate(prior.ids.tolist())
             if marker in self._place and np.isfinite(pixels[k]).all() and variances[k] >= 0.0
-        ]  # fmt: skip
+        ]
         if len(good) < LEAST_START:
             return None
         rows = [self._place[marker] for marker in prior.ids[good].tolist()]
@@ -206,9 +207,10 @@ class EdgeDetector:
                 break
         off = np.abs(line_distances(self._part, pose, lines)[0]).max(axis=1)
         kept = {
-            number: line for (number, line), px in zip(lines.items(), off.tolist(), strict=True)
+            number: line
+            for (number, line), px in zip(lines.items(), off.tolist(), strict=True)
             if px <= self.options.max_residual_px
-        }  # fmt: skip
+        }
         needed = max(LEAST_EDGES, LEAST_SHARE * steep, LEAST_OF_ALL * tried)
         return (pose, kept) if len(kept) >= needed else None
 
@@ -266,9 +268,14 @@ class EdgeDetector:
         pixels = np.array(found.pixels).reshape(-1, 2)[order]
         covariances = np.array(found.covariances).reshape(-1, 2, 2)[order]
         return CameraObservation(
-            self.camera, frame.seq, frame.t_shutter_ns, frame.t_received_ns, ids[order],
-            np.ascontiguousarray(pixels), np.ascontiguousarray(0.5 * (covariances + covariances.transpose(0, 2, 1))),
-        )  # fmt: skip
+            self.camera,
+            frame.seq,
+            frame.t_shutter_ns,
+            frame.t_received_ns,
+            ids[order],
+            np.ascontiguousarray(pixels),
+            np.ascontiguousarray(0.5 * (covariances + covariances.transpose(0, 2, 1))),
+        )
 
 
 # -- pose of the part ----------------------------------------------------------------------------------------

@@ -116,9 +116,11 @@ def take_profiles(
     place, normal, edge, along_t = place[keep], normal[keep], edge[keep], np.concatenate(t)[keep]
     wide = np.arange(-half - REACH, half + REACH + 0.5 * STEP, STEP)
     samples = place[:, None] + wide[None, :, None] * normal[:, None]
-    levels = cv2.remap(
-        image, samples[..., 0].astype(np.float32), samples[..., 1].astype(np.float32), cv2.INTER_LINEAR
-    ) if len(place) else np.empty((0, len(wide)))  # fmt: skip
+    levels = (
+        cv2.remap(image, samples[..., 0].astype(np.float32), samples[..., 1].astype(np.float32), cv2.INTER_LINEAR)
+        if len(place)
+        else np.empty((0, len(wide)))
+    )
     taps = np.arange(-REACH, REACH + 0.5 * STEP, STEP)
     kernel = taps * np.exp(-0.5 * (taps / SMOOTH) ** 2)
     kernel /= (kernel * taps).sum()
@@ -175,9 +177,14 @@ def measure_lines(
             continue
         along = (b - a) / (2.0 * half)
         lines[number] = MeasuredLine(
-            0.5 * (a + b), along, np.array([-along[1], along[0]]), float(best[1]), float(best[2]),
-            best[[3, 4, 4, 5]].reshape(2, 2), (float(profiles.t[own].min()), float(profiles.t[own].max())),
-        )  # fmt: skip
+            0.5 * (a + b),
+            along,
+            np.array([-along[1], along[0]]),
+            float(best[1]),
+            float(best[2]),
+            best[[3, 4, 4, 5]].reshape(2, 2),
+            (float(profiles.t[own].min()), float(profiles.t[own].max())),
+        )
     return lines
 
 

@@ -472,9 +472,13 @@ def reports_a_lost_device(bench: JointBench) -> str:
 
 @contextmanager
 def _failed(
-    bench: JointBench, driver: JointDriver, fail: Callable[[JointDriver], bool], undo: Callable[[JointDriver], None],
-    missing: str, since: str,
-) -> Iterator[str]:  # fmt: skip
+    bench: JointBench,
+    driver: JointDriver,
+    fail: Callable[[JointDriver], bool],
+    undo: Callable[[JointDriver], None],
+    missing: str,
+    since: str,
+) -> Iterator[str]:
     """The arm in motion while its device fails, until the failure is undone; gives what the driver told, and when.
 
     Raises CheckNotRunError with what is ``missing``, CheckFailedError.

@@ -196,10 +196,13 @@ class PlainVideo:
         self._camera = camera
         self._next = options.start
         settings = [
-            cv2.CAP_PROP_N_THREADS, 1,
-            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(options.open_timeout_s * 1e3),
-            cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(options.read_timeout_s * 1e3),
-        ]  # fmt: skip
+            cv2.CAP_PROP_N_THREADS,
+            1,
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+            round(options.open_timeout_s * 1e3),
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+            round(options.read_timeout_s * 1e3),
+        ]
         self._capture = cv2.VideoCapture(str(place.path), cv2.CAP_FFMPEG, settings)
         try:
             if not self._capture.isOpened():

@@ -149,9 +149,13 @@ class ServerClock:
     def _told(self, sent_ns: int, received_ns: int) -> ClockEstimate:
         if self._line is None or len(self._bins) < LEAST_BINS:
             return ClockEstimate(
-                0, 0.0, math.inf, sent_ns, False,
+                0,
+                0.0,
+                math.inf,
+                sent_ns,
+                False,
                 f"{len(self._bins)} s of pictures with stamps; {LEAST_BINS} s are needed",
-            )  # fmt: skip
+            )
         middle_ns, level, slope, spread = self._line
         bound_ns = self._round_trip_ns
         offset = level + slope * (sent_ns - middle_ns) - (0.5 * bound_ns if math.isfinite(bound_ns) else 0.0)

@@ -111,10 +111,13 @@ class CaptureSource:
 
     def _open_stream(self) -> cv2.VideoCapture:
         times = [
-            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(self._options.open_timeout_s * 1e3),
-            cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(self._options.read_timeout_s * 1e3),
-            cv2.CAP_PROP_N_THREADS, 1,  # of several, FFmpeg holds a picture back for each
-        ]  # fmt: skip
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+            round(self._options.open_timeout_s * 1e3),
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+            round(self._options.read_timeout_s * 1e3),
+            cv2.CAP_PROP_N_THREADS,
+            1,  # of several, FFmpeg holds a picture back for each
+        ]
         return cv2.VideoCapture(self._place.url.geturl(), cv2.CAP_FFMPEG, times)
 
     def _check_device(self) -> None:
@@ -278,27 +281,40 @@ class FormatDescription(ctypes.Structure):
     """``struct v4l2_fmtdesc``."""
 
     _fields_ = [
-        ("index", c_uint32), ("type", c_uint32), ("flags", c_uint32), ("description", c_uint8 * 32),
-        ("pixelformat", c_uint32), ("mbus_code", c_uint32), ("reserved", c_uint32 * 3),
-    ]  # fmt: skip
+        ("index", c_uint32),
+        ("type", c_uint32),
+        ("flags", c_uint32),
+        ("description", c_uint8 * 32),
+        ("pixelformat", c_uint32),
+        ("mbus_code", c_uint32),
+        ("reserved", c_uint32 * 3),
+    ]
 
 
 class FrameSize(ctypes.Structure):
     """``struct v4l2_frmsizeenum``; ``sizes``: width and height, or least, most and step of each."""
 
     _fields_ = [
-        ("index", c_uint32), ("pixel_format", c_uint32), ("type", c_uint32), ("sizes", c_uint32 * 6),
+        ("index", c_uint32),
+        ("pixel_format", c_uint32),
+        ("type", c_uint32),
+        ("sizes", c_uint32 * 6),
         ("reserved", c_uint32 * 2),
-    ]  # fmt: skip
+    ]
 
 
 class FrameInterval(ctypes.Structure):
     """``struct v4l2_frmivalenum``; ``intervals``: numerator and denominator [s], or those of least, most and step."""
 
     _fields_ = [
-        ("index", c_uint32), ("pixel_format", c_uint32), ("width", c_uint32), ("height", c_uint32), ("type", c_uint32),
-        ("intervals", c_uint32 * 6), ("reserved", c_uint32 * 2),
-    ]  # fmt: skip
+        ("index", c_uint32),
+        ("pixel_format", c_uint32),
+        ("width", c_uint32),
+        ("height", c_uint32),
+        ("type", c_uint32),
+        ("intervals", c_uint32 * 6),
+        ("reserved", c_uint32 * 2),
+    ]
 
 
 def _read_write(number: int, structure: type[ctypes.Structure]) -> int:

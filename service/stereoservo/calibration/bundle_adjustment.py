@@ -144,9 +144,8 @@ class _Bundle:
 
     def charts_at(self, rig: RigModel) -> Charts:
         return full_charts(
-            rig, self.stratum, generators=self.generators, cameras=self.cameras, points=self.points,
-            lenses=self.lenses,
-        )  # fmt: skip
+            rig, self.stratum, generators=self.generators, cameras=self.cameras, points=self.points, lenses=self.lenses
+        )
 
     def cost(self, state: _State) -> float:
         squares = residuals(state.rig, state.data) ** 2

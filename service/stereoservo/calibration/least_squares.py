@@ -276,7 +276,7 @@ class DenseFit(Generic[S]):
         rows = self.rows(state)
         return Determined(
             self.cost(state), len(rows), rows.shape[1] - 1, lambda: np.asarray(np.linalg.qr(rows[:, :-1], mode="r"))
-        )  # fmt: skip
+        )
 
 
 def numeric_slopes(

@@ -466,9 +466,8 @@ def _refined(
     z, cost = np.zeros(len(limit)), np.inf
     for scale in (3.0 * bound, 3.0):
         fit = DenseFit(
-            errors, slopes, step, RobustLoss("cauchy", scale),
-            lambda z: np.column_stack([np.eye(len(z)), z])[centres],
-        )  # fmt: skip
+            errors, slopes, step, RobustLoss("cauchy", scale), lambda z: np.column_stack([np.eye(len(z)), z])[centres]
+        )
         found = minimise(fit, z, SEARCH)
         z, cost = found.state, found.cost
     distances = np.abs(errors(z))

@@ -366,9 +366,12 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     lenses = np.array([model.cameras[c].lens for c in seen])
     # An id of no static point: the point itself is held here.
     held = model_jacobian(
-        model, tuple(seen), Moved(matrices, np.eye(4)), replace(views, ids=np.full(len(seen), -1)),
+        model,
+        tuple(seen),
+        Moved(matrices, np.eye(4)),
+        replace(views, ids=np.full(len(seen), -1)),
         np.zeros((0, len(model.zero))),
-    ).reshape(2 * len(seen), -1)  # fmt: skip
+    ).reshape(2 * len(seen), -1)
     chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
     rows = entry_jacobian(matrices, lenses, views)
     J = np.concatenate([_by_point(row, P, point) @ chart for row, P in zip(rows, matrices, strict=True)])

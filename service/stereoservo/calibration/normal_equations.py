@@ -137,7 +137,7 @@ class Markers(NamedTuple):
 @kernel
 def _rows_into(
     motions: Motions, projections: Projections, markers: Markers, seen: Sightings, core: FloatArray, own: FloatArray
-) -> None:  # fmt: skip
+) -> None:
     """Fill weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's
     first.
 
@@ -264,9 +264,13 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
     point_basis = np.array(charts.points)
     width = len(generator_basis) + len(camera_basis) + len(lens_basis)
     projections = Projections(
-        np.ascontiguousarray(rig.cameras), camera_basis, _starts(charts.cameras), np.ascontiguousarray(rig.lenses),
-        lens_basis, _starts(charts.lenses),
-    )  # fmt: skip
+        np.ascontiguousarray(rig.cameras),
+        camera_basis,
+        _starts(charts.cameras),
+        np.ascontiguousarray(rig.lenses),
+        lens_basis,
+        _starts(charts.lenses),
+    )
     for first in range(0, len(data.camera), CHUNK):
         here = slice(first, min(first + CHUNK, len(data.camera)))
         stop = data.stop[here]

@@ -328,7 +328,7 @@ def read_folder(folder: Path) -> RecordedViews:
     order = np.argsort(stamps, kind="stable")
     names, kinds, positions, generators = (
         _joints(folder / JOINTS, motion, key, order) if given[0] == JOINTS else _poses(folder / POSES, motion, order)
-    )  # fmt: skip
+    )
     table = _table(folder / seen[0])
     if _time_column(folder / seen[0], table) != key:
         raise CommandError("dataset", f"{folder / seen[0]} has no column {key!r}, which {given[0]} has")
@@ -430,7 +430,7 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
     sizes = {
         row["camera"]: (_whole(listed, k, row, "width", 1), _whole(listed, k, row, "height", 1))
         for k, row in enumerate(_table(listed, ("camera", "width", "height")), 2)
-    }  # fmt: skip
+    }
     _require(path, rows, ("camera", "marker", "u", "v"))
     frames = GatheredFrames(sizes)
     for line, row in enumerate(rows, 2):

@@ -251,9 +251,14 @@ def _move(client: Client, arm: LearntArm, readings: FloatArray, speed_scale: flo
 
 
 def _report(
-    arm: LearntArm, looks: list[Look], found: JointZeros, telling: TellingMotion | None, error_px: float, check: bool,
+    arm: LearntArm,
+    looks: list[Look],
+    found: JointZeros,
+    telling: TellingMotion | None,
+    error_px: float,
+    check: bool,
     as_json: bool,
-) -> None:  # fmt: skip
+) -> None:
     name, model = arm.cell.cell.name, arm.model
     readings, decided = looks[-1].readings, not found.alternatives
     rows: list[dict[str, Any]] = [

@@ -222,8 +222,13 @@ def _way_text(row: dict[str, Any]) -> str:
         return f"no straight way there from here: {row['refused']}"
     if row["seconds"] is None:
         return "the arm is there"
-    kinds = {"JOINT_LIMIT": "joint limits", "KEEP_OUT": "keep-outs", "FIELD_OF_VIEW": "the images' borders",
-             "FACE_HIDDEN": "a face turned away", "BEHIND_CAMERA": "a camera's plane"}  # fmt: skip
+    kinds = {
+        "JOINT_LIMIT": "joint limits",
+        "KEEP_OUT": "keep-outs",
+        "FIELD_OF_VIEW": "the images' borders",
+        "FACE_HIDDEN": "a face turned away",
+        "BEHIND_CAMERA": "a camera's plane",
+    }
     near = [f"{kinds[a.code]} {a.room:.3g} {a.unit} ({a.subject})" for a in row["approaches"] if a.code in kinds]
     return f"{row['seconds']:.1f} s from here; room on the way: " + ("; ".join(near) or "no limit is near")
 

@@ -46,9 +46,7 @@ def warmup(
 def _compile() -> int:
     """Compile in a process of its own, and tell how far it is; returns its exit code."""
     with TemporaryDirectory(prefix="stereoservo-warmup-") as told:
-        command = [
-            sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid()), "alone", told,
-        ]  # fmt: skip
+        command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid()), "alone", told]
         with subprocess.Popen(command, env=child_environment(), stdout=sys.stderr) as process:
             try:
                 return _wait(process, Path(told))

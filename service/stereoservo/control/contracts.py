@@ -39,10 +39,11 @@ class VirtualCell:
     def __post_init__(self) -> None:
         focal = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
         cameras = [
-            focal @ exp_twist(twist_matrix(np.zeros(3), np.array([0.0, -s * 0.17, 0.0])))[:3]
+            focal
+            @ exp_twist(twist_matrix(np.zeros(3), np.array([0.0, -s * 0.17, 0.0])))[:3]
             @ exp_twist(twist_matrix(np.array([s * 0.1, 0.0, 0.0]), np.zeros(3)))
             for s in (1.0, -1.0)
-        ]  # fmt: skip
+        ]
         inverse = np.linalg.inv(self.frame)
         middle = np.array([0.0, 0.0, 1.1])
         joints = [twist_matrix(axis, np.zeros(3)) for axis in np.eye(3)]
@@ -66,9 +67,14 @@ class VirtualCell:
         """
         points = self.points(q)
         return Scene(
-            moved_operators(self.generators, Composition.BASE_FIRST, q), int(Composition.BASE_FIRST), self.matrices,
-            self.camera_centres, points, project_many(self.matrices, points), np.outer(cameras, np.ones(4)),
-        )  # fmt: skip
+            moved_operators(self.generators, Composition.BASE_FIRST, q),
+            int(Composition.BASE_FIRST),
+            self.matrices,
+            self.camera_centres,
+            points,
+            project_many(self.matrices, points),
+            np.outer(cameras, np.ones(4)),
+        )
 
     def task(self, scene: Scene, q_goal: FloatArray, *, known: bool = True) -> Task:
         """The goal of the plate at joints ``q_goal``; without ``known`` by its pixels alone, its pose unknown."""

@@ -366,9 +366,12 @@ def kept_faces(
         pixels = project_points(matrices, points)[0]
         weights, known = np.full(pixels.shape[:2], 1.0 / SEEN_TO_PX), np.ones(len(points))
         face = choose_face_step(
-            faces, ShownBody(points, pixels, weights), BodyGoal(targets, known), camera_centres,
+            faces,
+            ShownBody(points, pixels, weights),
+            BodyGoal(targets, known),
+            camera_centres,
             Triangle(-2, np.zeros(3, np.int64)),
-        )[0]  # fmt: skip
+        )[0]
         if face >= 0 and lasting[face] > 0.0:
             kept[0], lasting[face], count = triples[face], 0.0, 1
     for f in range(triples.shape[0]):

@@ -104,10 +104,12 @@ def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: Floa
     positions, rates, covariance = track.positions.copy(), track.rates.copy(), track.covariance.copy()
     stamps, tracked = track.stamps_s.copy(), track.tracked.copy()
     jumped = update_track(
-        (positions, rates, covariance, stamps, tracked), stamp_s, np.ascontiguousarray(pixels, dtype=np.float64),
+        (positions, rates, covariance, stamps, tracked),
+        stamp_s,
+        np.ascontiguousarray(pixels, dtype=np.float64),
         np.ascontiguousarray(wanted, dtype=np.float64),
         (s.sigma_px, s.density_px2_s3, s.rate_px_s, s.jump_sigmas, s.gap_s),
-    )  # fmt: skip
+    )
     return TargetTrack(
         s, positions, rates, covariance, stamps, tracked, stamp_s, track.ignored, track.jumps + int(jumped)
     )

@@ -150,9 +150,11 @@ SETTLED_FRAMES = ("settled_innovation", "settled_variance", "settled_count", "se
 
 
 def packed_type(
-    numbers: type[ctypes.Structure], arrays: Shapes, others: Mapping[str, Any],
+    numbers: type[ctypes.Structure],
+    arrays: Shapes,
+    others: Mapping[str, Any],
     parts: Mapping[str, type[ctypes.Structure]],
-) -> np.dtype[Any]:  # fmt: skip
+) -> np.dtype[Any]:
     """The type of a record of ``numbers`` and of the ``arrays`` in the size of the largest cell, of float64 or the
     types in ``others``, and of the ``parts`` of each camera.
     """

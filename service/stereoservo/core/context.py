@@ -295,9 +295,14 @@ class Workspace:
         numbers.modelled, numbers.erring = True, arrays.joint_accuracy is not None
         present = self.prediction
         self.scene = Scene(
-            present.operators, arrays.composition, given["matrices"], given["camera_centres"], given["body"],
-            self.pixels, given["usable"],
-        )  # fmt: skip
+            present.operators,
+            arrays.composition,
+            given["matrices"],
+            given["camera_centres"],
+            given["body"],
+            self.pixels,
+            given["usable"],
+        )
         self.task = Task(
             given["set_points"], given["wanted"], given["no_rates"], given["target_points"], given["target_known"],
             given["centre"], given["centre_target"], given["face"],
@@ -350,9 +355,13 @@ class Workspace:
         """The residuals of the frame that was processed last."""
         given = self.arrays
         return FrameResiduals(
-            t_shutter_ns, given["frame_innovation"], given["frame_spread"], given["frame_noise"],
-            given["frame_seen"].view(np.bool_), given["frame_velocity"],
-        )  # fmt: skip
+            t_shutter_ns,
+            given["frame_innovation"],
+            given["frame_spread"],
+            given["frame_noise"],
+            given["frame_seen"].view(np.bool_),
+            given["frame_velocity"],
+        )
 
 
 Motion = tuple[Callable[[Any, "StepContext"], "SourceOutput | None"], str]

@@ -351,11 +351,13 @@ def see_frame(block: Record, room: Record, k: int) -> int:
         work.jacobian[: 2 * m * n].reshape((1, m, 2, n)),
     )
     predict_into(
-        arm_of(room), q, work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
+        arm_of(room),
+        q,
+        work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
         Predicted(
             work.operators[: 16 * n].reshape((n, 4, 4)), work.points[: 4 * m].reshape((m, 4)), predicted, jacobian
         ),
-    )  # fmt: skip
+    )
     at = MAX_MARKERS * k
     pixels = work.arrived_pixels[2 * at : 2 * (at + count)].reshape((count, 2))
     covariances = work.arrived_covariances[4 * at : 4 * (at + count)].reshape((count, 2, 2))
@@ -368,9 +370,13 @@ def see_frame(block: Record, room: Record, k: int) -> int:
                 row[i] = -1
     standing = 2 * rows * camera
     _compare(
-        room, Sights(row, pixels, covariances), predicted[0],
-        work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)), jacobian[0], speed,
-    )  # fmt: skip
+        room,
+        Sights(row, pixels, covariances),
+        predicted[0],
+        work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)),
+        jacobian[0],
+        speed,
+    )
     return (KNOWN if known else 0) | (TOLD if known and told else 0)
 
 

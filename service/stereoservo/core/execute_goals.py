@@ -194,9 +194,14 @@ def _refused(job: PlanJob, refusal: RefusalError, context: StepContext) -> None:
     goal, state = job.goal, context.state
     if job.purpose in ("reply", "enqueue"):
         context.emit(
-            "reply", request=job.request, accepted=False, id=goal.id, message=str(refusal), reasons=refusal.reasons,
+            "reply",
+            request=job.request,
+            accepted=False,
+            id=goal.id,
+            message=str(refusal),
+            reasons=refusal.reasons,
             plan=refusal.plan,
-        )  # fmt: skip
+        )
     elif job.purpose == "queue":
         _not_begun(goal, refusal, context)
     elif job.purpose == "again" and state.source is job.source:

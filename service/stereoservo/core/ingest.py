@@ -157,9 +157,13 @@ def take_sample(block: Record, room: Record, told: bool) -> bool:
         sound = _sound(values, kept, memory.history_count, elapsed_s, work.velocity_max[:n], work.active_before != 0)
         if sound:
             memory.history_count = _append_sample(
-                Samples(memory.history_ns, kept), memory.history_count, work.joints_ns, values[0],
-                work.velocity_max[:n], Velocities(memory.last_joints_ns, memory.velocities[:n]),
-            )  # fmt: skip
+                Samples(memory.history_ns, kept),
+                memory.history_count,
+                work.joints_ns,
+                values[0],
+                work.velocity_max[:n],
+                Velocities(memory.last_joints_ns, memory.velocities[:n]),
+            )
             memory.last_joints_seq, memory.last_joints_ns = work.joints_seq, work.joints_ns
     for j in range(n):
         q[j] = kept[(memory.history_count - 1) % HISTORY, j] if memory.history_count > 0 else 0.0
@@ -449,11 +453,16 @@ def _gap(gap_s: float, context: StepContext) -> Reason:
     """Reason: the loop was interrupted while the drives were on."""
     limit_s = context.derived.longest_gap_s
     return Reason(
-        "LOOP_GAP", "hold", "", gap_s, limit_s, "s",
+        "LOOP_GAP",
+        "hold",
+        "",
+        gap_s,
+        limit_s,
+        "s",
         f"the servo loop did not run for {gap_s:.3f} s, {limit_s:.3f} s is allowed, and the drives were left alone: "
         "resume, then send the goal again; if it comes again, take load off this computer or give the loop priority "
         "(servo.priority)",
-    )  # fmt: skip
+    )
 
 
 def _late(sample: JointState, context: StepContext) -> Reason:
@@ -465,9 +474,14 @@ def _late(sample: JointState, context: StepContext) -> Reason:
         else f"{-age_s:.6g} s in the future: check the joint driver's clock"
     )
     return Reason(
-        "JOINT_STAMP", "hold", "", age_s, timeout_s if age_s > 0.0 else 0.0, "s",
+        "JOINT_STAMP",
+        "hold",
+        "",
+        age_s,
+        timeout_s if age_s > 0.0 else 0.0,
+        "s",
         f"the stamp of joint sample {sample.seq} is {what}; then resume",
-    )  # fmt: skip
+    )
 
 
 def _wrong(sample: JointState, context: StepContext) -> Reason:
@@ -475,10 +489,15 @@ def _wrong(sample: JointState, context: StepContext) -> Reason:
     if not wrong:
         return _jump(sample, context)
     return Reason(
-        "JOINT_VALUE", "hold", "", None, None, "",
+        "JOINT_VALUE",
+        "hold",
+        "",
+        None,
+        None,
+        "",
         f"joint sample {sample.seq} is refused: {wrong}: check the drive, its encoder and the joint driver; then "
         "resume",
-    )  # fmt: skip
+    )
 
 
 def _wrong_values(sample: JointState, names: tuple[str, ...]) -> str:
@@ -509,10 +528,15 @@ def _jump(sample: JointState, context: StepContext) -> Reason:
     j = int((travel / possible).argmax())
     name, value, limit = settings.joint_names[j], float(travel[j]), float(possible[j])
     return Reason(
-        "JOINT_JUMP", "hold", name, value, limit, "",
+        "JOINT_JUMP",
+        "hold",
+        name,
+        value,
+        limit,
+        "",
         f"the position of joint {name} changed by {value:.4g} within {elapsed_s * 1e3:.3g} ms, {limit:.4g} is "
         "possible: check its encoder, cable and coupling; then resume",
-    )  # fmt: skip
+    )
 
 
 def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
@@ -549,23 +573,38 @@ def _wrong_sights(frame: CameraObservation, k: int, context: StepContext) -> str
 
 def _impossible_frame(observation: CameraObservation, wrong: str) -> Reason:
     return Reason(
-        "CAMERA_VALUE", "hold", observation.camera, None, None, "",
+        "CAMERA_VALUE",
+        "hold",
+        observation.camera,
+        None,
+        None,
+        "",
         f"frame {observation.seq} of camera {observation.camera} is refused: {wrong}: check its detector and driver; "
         "then resume",
-    )  # fmt: skip
+    )
 
 
 def _refused_frame(observation: CameraObservation, age_s: float, timeout_s: float) -> Reason:
     name = observation.camera
     if age_s < 0.0:
         return Reason(
-            "CAMERA_STAMP", "hold", name, age_s, 0.0, "s",
+            "CAMERA_STAMP",
+            "hold",
+            name,
+            age_s,
+            0.0,
+            "s",
             f"the stamp of frame {observation.seq} of camera {name} is {-age_s:.6g} s in the future: check the "
             "camera's clock and its latency_s; then resume",
-        )  # fmt: skip
+        )
     return Reason(
-        "CAMERA_LATE", "info", name, age_s, timeout_s, "s",
+        "CAMERA_LATE",
+        "info",
+        name,
+        age_s,
+        timeout_s,
+        "s",
         f"frame {observation.seq} of camera {name} came {age_s:.3f} s after its shutter, {timeout_s:g} s is allowed: "
         "not used; check the camera's connection and this computer's load; a camera that is always so late needs a "
         "larger safety.coast_s",
-    )  # fmt: skip
+    )

@@ -302,10 +302,12 @@ def account_loads(block: Record, room: Record, halted: bool) -> tuple[bool, bool
     if work.learning != 0:
         limits = Loads(work.stated_effort_limits[:n], work.stated_following_limits[:n])
     history = LoadHistory(
-        mean, memory.effort_excess[: window * n].reshape((window, n)),
-        memory.following_excess[: window * n].reshape((window, n)), memory.contact_low[: 2 * n].reshape((2, n)),
+        mean,
+        memory.effort_excess[: window * n].reshape((window, n)),
+        memory.following_excess[: window * n].reshape((window, n)),
+        memory.contact_low[: 2 * n].reshape((2, n)),
         memory.contact_high[: 2 * n].reshape((2, n)),
-    )  # fmt: skip
+    )
     situation = Situation(elapsed_s, forgets, moving, memory.leave_s > 0.0)
     beyond = _account_loads(Loads(efforts, following), history, situation, limits)
     return moving, beyond and moving
@@ -561,8 +563,9 @@ def judge_round(block: Record, room: Record, moving: int) -> tuple[int, int, boo
         chi2, _, _, largest, count = camera_chi2(
             memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2)),
             memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2)),
-            rows_in_use(memory.frame_seen[at:end], masked), MODEL_SIGMA_PX,
-        )  # fmt: skip
+            rows_in_use(memory.frame_seen[at:end], masked),
+            MODEL_SIGMA_PX,
+        )
         if not (chi2 <= work.noise_chi2[count] and largest <= work.gate):
             odd |= bit
     return known, odd, bool((masked > 0.0).any())
@@ -628,10 +631,15 @@ def _monitor_model(context: StepContext) -> Iterator[Finding]:
             continue
         state.readiness = ModelReadiness.SUSPECT
         reason = Reason(
-            "MODEL_SUSPECT", "hold", camera.name, float(estimate.rejected_frames), float(SUSPECT_FRAMES), "frames",
+            "MODEL_SUSPECT",
+            "hold",
+            camera.name,
+            float(estimate.rejected_frames),
+            float(SUSPECT_FRAMES),
+            "frames",
             state.watching.verdict.text
             or f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
-        )  # fmt: skip
+        )
         context.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
         if MOTION_SOURCES[type(state.source)].runs_law:
             yield Finding("abort", reason, reason.hint)

@@ -111,9 +111,12 @@ def arm_of(room: Record) -> Arm:
     work = room[0]
     n, m = work.joints, work.markers
     return Arm(
-        work.generators[: 16 * n].reshape((n, 4, 4)), work.kinds[:n], work.zero[:n], work.tip_first != 0,
+        work.generators[: 16 * n].reshape((n, 4, 4)),
+        work.kinds[:n],
+        work.zero[:n],
+        work.tip_first != 0,
         work.marker_points[: 4 * m].reshape((m, 4)),
-    )  # fmt: skip
+    )
 
 
 def predict(arrays: ModelArrays, q: FloatArray, camera: int | None = None) -> Prediction:
@@ -313,12 +316,16 @@ def present(block: Record, room: Record) -> None:
     weights = work.weights[: cameras * markers].reshape((cameras, markers))
     pixels = work.pixels[: 2 * cameras * markers].reshape((cameras, markers, 2))
     predict_into(
-        arm, q, matrices,
+        arm,
+        q,
+        matrices,
         Predicted(
-            work.operators[: 16 * n].reshape((n, 4, 4)), work.points[: 4 * markers].reshape((markers, 4)), predicted,
+            work.operators[: 16 * n].reshape((n, 4, 4)),
+            work.points[: 4 * markers].reshape((markers, 4)),
+            predicted,
             jacobian,
         ),
-    )  # fmt: skip
+    )
     row_weights = np.empty(2 * cameras * markers)
     for c in range(cameras):
         for i in range(markers):

@@ -194,11 +194,15 @@ def _health_now(context: StepContext, verdict: ModelDiagnosis, masked: tuple[int
     told = zip(context.settings.cameras, state.watching.sightings, state.mobile, strict=True)
     cameras = {
         camera.name: CameraHealth(
-            seen.chi2, seen.rms_px, ids[seen.worst] if seen.worst >= 0 else -1, seen.worst_px,
-            "" if moves is None else moves.place, advice(seen.timing),
+            seen.chi2,
+            seen.rms_px,
+            ids[seen.worst] if seen.worst >= 0 else -1,
+            seen.worst_px,
+            "" if moves is None else moves.place,
+            advice(seen.timing),
         )
         for camera, seen, moves in told
-    }  # fmt: skip
+    }
     return Health(
         verdict.kind, verdict.subjects, verdict.size, verdict.deviation, verdict.unit, verdict.text, cameras, masked,
         reanchoring,
@@ -235,7 +239,7 @@ def advice(timing: CameraTiming) -> str:
 
 def priors(
     arrays: ModelArrays, context: StepContext, prediction: Prediction, moving: list[int], unknown: tuple[str, ...]
-) -> tuple[Prior, ...]:  # fmt: skip
+) -> tuple[Prior, ...]:
     """One prior a camera for the detectors' windows, in raw pixels. The covariance is that of model and motion; it is
     never fed back.
 
@@ -249,9 +253,8 @@ def priors(
     if arrays.joint_accuracy is not None:
         room.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
     beyond = expect_sights(
-        state.block.record, room.record, prediction.pixels, prediction.jacobian, sum([1 << c for c in moving]),
-        expected,
-    )  # fmt: skip
+        state.block.record, room.record, prediction.pixels, prediction.jacobian, sum([1 << c for c in moving]), expected
+    )
     found = []
     for c, (camera, estimate) in enumerate(zip(context.settings.cameras, state.cameras, strict=True)):
         if camera.name in unknown:

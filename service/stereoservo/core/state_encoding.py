@@ -111,9 +111,11 @@ BEFORE_VERSION_10 = {
 
 
 KNOWN_BY = {
-    "last_positions": "followed", "silent_from": "silence_known", "efforts": "tells_efforts",
+    "last_positions": "followed",
+    "silent_from": "silence_known",
+    "efforts": "tells_efforts",
     "following_errors": "tells_following",
-}  # fmt: skip
+}
 """Values that could be None in former states, and the flags that replace None now."""
 
 
@@ -141,8 +143,11 @@ def _block_of(state: dict[str, Any]) -> dict[str, Any]:
 RUN_BEFORE_VERSION_12 = ("moved_s", "held", "last_frames")
 WATCH_BEFORE_VERSION_12 = ("first_px", "mean_px", "least_px", "least_s")
 FRICTION_BEFORE_VERSION_12 = {
-    "friction": "velocity", "friction_from": "stood_at", "friction_sent": "sent", "friction_s": "sent_s",
-}  # fmt: skip
+    "friction": "velocity",
+    "friction_from": "stood_at",
+    "friction_sent": "sent",
+    "friction_s": "sent_s",
+}
 
 
 def _with_run(state: dict[str, Any]) -> dict[str, Any]:
@@ -154,8 +159,9 @@ def _with_run(state: dict[str, Any]) -> dict[str, Any]:
         block["run"] = {
             **{name: source[name] for name in RUN_BEFORE_VERSION_12},
             **{name: watch[name] for name in WATCH_BEFORE_VERSION_12},
-            "measured": error is not None, "newest_px": math.nan if error is None else error,
-        }  # fmt: skip
+            "measured": error is not None,
+            "newest_px": math.nan if error is None else error,
+        }
         source = {**source, "reasons": watch["reasons"]}
     if friction is not None:
         block |= {name: friction[place] for name, place in FRICTION_BEFORE_VERSION_12.items()}

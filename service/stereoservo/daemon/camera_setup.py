@@ -127,17 +127,29 @@ def recorded_camera(cell: CellFile, cell_path: Path, name: str, file: Path, star
     with ImageReader(file, name) as reader:
         header = reader.header
     options: dict[str, Any] = {
-        "source": str(file.absolute()), "width": header.width, "height": header.height, "rate_hz": header.rate_hz,
-        "pace": "every", "start": start,
-    }  # fmt: skip
+        "source": str(file.absolute()),
+        "width": header.width,
+        "height": header.height,
+        "rate_hz": header.rate_hz,
+        "pace": "every",
+        "start": start,
+    }
     recorded = CameraSection(
-        name=name, driver=VIDEO, detector=section.detector, mount=section.mount, options=options,
-        detector_options=section.detector_options,
-    )  # fmt: skip
-    context = DriverContext(
-        clock=MonotonicClock(), cell=cell.cell.name, runtime_dir=file.parent, cell_dir=cell_path.parent, camera=name,
+        name=name,
+        driver=VIDEO,
+        detector=section.detector,
         mount=section.mount,
-    )  # fmt: skip
+        options=options,
+        detector_options=section.detector_options,
+    )
+    context = DriverContext(
+        clock=MonotonicClock(),
+        cell=cell.cell.name,
+        runtime_dir=file.parent,
+        cell_dir=cell_path.parent,
+        camera=name,
+        mount=section.mount,
+    )
     driver, detector = make_camera(recorded, context)
     description = describe_camera(recorded, driver, detector, cell_path)
     assert detector is not None  # describe_camera refuses a camera of frames without one

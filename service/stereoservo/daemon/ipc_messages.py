@@ -186,9 +186,14 @@ def decode_observation(data: bytes) -> CameraObservation:
     """Inverse of :func:`encode_observation`. Raises ValueError, before anything is allocated."""
     name, k, (seq, shutter_ns, received_ns), numbers = _apart(data, _OBSERVATION, 7)
     return CameraObservation(
-        name, seq, shutter_ns, received_ns, np.ndarray((k,), np.int64, numbers),
-        np.ndarray((k, 2), np.float64, numbers, 8 * k), np.ndarray((k, 2, 2), np.float64, numbers, 24 * k),
-    )  # fmt: skip
+        name,
+        seq,
+        shutter_ns,
+        received_ns,
+        np.ndarray((k,), np.int64, numbers),
+        np.ndarray((k, 2), np.float64, numbers, 8 * k),
+        np.ndarray((k, 2, 2), np.float64, numbers, 24 * k),
+    )
 
 
 def encode_prior(prior: Prior) -> bytes:
@@ -202,9 +207,13 @@ def decode_prior(data: bytes) -> Prior:
     """Inverse of :func:`encode_prior`. Raises ValueError, before anything is allocated."""
     name, k, (t_ns,), numbers = _apart(data, _PRIOR, 9)
     return Prior(
-        name, t_ns, np.ndarray((k,), np.int64, numbers), np.ndarray((k, 2), np.float64, numbers, 8 * k),
-        np.ndarray((k, 2), np.float64, numbers, 24 * k), np.ndarray((k, 2, 2), np.float64, numbers, 40 * k),
-    )  # fmt: skip
+        name,
+        t_ns,
+        np.ndarray((k,), np.int64, numbers),
+        np.ndarray((k, 2), np.float64, numbers, 8 * k),
+        np.ndarray((k, 2), np.float64, numbers, 24 * k),
+        np.ndarray((k, 2, 2), np.float64, numbers, 40 * k),
+    )
 
 
 def _places(ids: IntArray, *numbers: FloatArray) -> bytes:

@@ -198,7 +198,7 @@ def _warm_up_agreement() -> None:
         plain,
         covariance=ModelCovariance(generators, cameras_free, lenses_free, points, 1e-12 * np.eye(free)),
         joint_accuracy=JointAccuracy(*np.full((4, 6), 1e-6)),
-    )  # fmt: skip
+    )
     cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
     core = ServoCore(msgspec.structs.replace(settings, cameras=cameras, hold_frames=1))
     target = {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, pixels, strict=True)}

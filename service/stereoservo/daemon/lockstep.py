@@ -211,9 +211,14 @@ class _ScheduledCamera:
     """A vision loop on the virtual clock. The camera is opened at once."""
 
     def __init__(
-        self, pipeline: CameraPipeline, report: Callable[[str, str], None], clock: VirtualClock,
-        *, camera: str, poll_s: float,
-    ) -> None:  # fmt: skip
+        self,
+        pipeline: CameraPipeline,
+        report: Callable[[str, str], None],
+        clock: VirtualClock,
+        *,
+        camera: str,
+        poll_s: float,
+    ) -> None:
         self._clock = clock
         self._loop = camera_loop(pipeline, report, clock.now_ns, camera=camera, poll_s=poll_s)
         self._due_ns = 0
@@ -298,9 +303,12 @@ class LockstepCell:
         description = self.descriptions[c]
         pipeline = CameraPipeline(self.cameras[c], self.detectors[c], self.links.vision(description.name), self.clock)
         loop = _ScheduledCamera(
-            pipeline, lambda kind, message: self.reports.append((kind, message)), self.clock,
-            camera=description.name, poll_s=min(poll_interval_s(description.rate_hz), self.period_ns * 1e-9),
-        )  # fmt: skip
+            pipeline,
+            lambda kind, message: self.reports.append((kind, message)),
+            self.clock,
+            camera=description.name,
+            poll_s=min(poll_interval_s(description.rate_hz), self.period_ns * 1e-9),
+        )
         if self.reports:
             raise DriverError("camera", self.reports[0][1])
         return loop

@@ -54,9 +54,13 @@ class PlantProcess:
     """
 
     def __init__(
-        self, driver: JointDriver, directories: CellDirectories, clock: Clock, *,
+        self,
+        driver: JointDriver,
+        directories: CellDirectories,
+        clock: Clock,
+        *,
         beat: Callable[[float], None] = lambda limit_s: None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.driver = driver
         self._auxiliary = driver if isinstance(driver, AuxiliaryDriver) else None
         self._description = driver.describe()
@@ -155,9 +159,12 @@ class PlantProcess:
         if self._done.velocities.any() or values[1].any():
             self._moved_ns = self._clock.now_ns()
         self._state = self._state._replace(
-            seq=sample.seq, t_ns=sample.t_ns, numbers=values.tobytes() + self._auxiliary_values(),
-            has_efforts=sample.efforts is not None, has_following=sample.following_errors is not None,
-        )  # fmt: skip
+            seq=sample.seq,
+            t_ns=sample.t_ns,
+            numbers=values.tobytes() + self._auxiliary_values(),
+            has_efforts=sample.efforts is not None,
+            has_following=sample.following_errors is not None,
+        )
 
     def _auxiliary_values(self) -> bytes:
         if not self._names:

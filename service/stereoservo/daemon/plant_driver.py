@@ -64,9 +64,14 @@ class Orders(msgspec.Struct, eq=False):
     def encoded(self) -> bytes:
         """As a record."""
         head = _ORDERS.pack(
-            self.session, self.call, self.active, self.stops, self.velocity_number, self.auxiliary_number,
+            self.session,
+            self.call,
+            self.active,
+            self.stops,
+            self.velocity_number,
+            self.auxiliary_number,
             self.auxiliary_stops,
-        )  # fmt: skip
+        )
         return head + self.velocities.tobytes() + self.auxiliary.tobytes()
 
     @classmethod
@@ -123,9 +128,13 @@ class PlantState(NamedTuple):
         values = np.frombuffer(bytearray(self.numbers), np.float64, 4 * self.joints)
         positions, velocities, efforts, following = values.reshape(4, -1)
         return JointState(
-            self.seq, self.t_ns, positions, velocities, efforts if self.has_efforts else None,
+            self.seq,
+            self.t_ns,
+            positions,
+            velocities,
+            efforts if self.has_efforts else None,
             following if self.has_following else None,
-        )  # fmt: skip
+        )
 
     def auxiliary(self) -> FloatArray:
         """Auxiliary values (m,)."""
@@ -140,9 +149,13 @@ class PlantDriver:
     """
 
     def __init__(
-        self, description: JointDriverDescription, directories: CellDirectories, clock: Clock,
-        *, sleep: Callable[[float], None] = time.sleep,
-    ) -> None:  # fmt: skip
+        self,
+        description: JointDriverDescription,
+        directories: CellDirectories,
+        clock: Clock,
+        *,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         self._description = description
         self._clock = clock
         self._sleep = sleep
@@ -208,9 +221,12 @@ class PlantDriver:
         what the drives say, or a plant that ended or does not answer.
         """
         self._send(
-            active=active, session=session, call=self._orders.call + 1,
-            velocities=np.zeros_like(self._orders.velocities), auxiliary=np.full(len(self._names), np.nan),
-        )  # fmt: skip
+            active=active,
+            session=session,
+            call=self._orders.call + 1,
+            velocities=np.zeros_like(self._orders.velocities),
+            auxiliary=np.full(len(self._names), np.nan),
+        )
         until_ns = self._clock.now_ns() + round(CALL_S * 1e9)
         while True:
             state = self._state_of_session()
@@ -257,9 +273,11 @@ class PlantDriver:
     def stop(self) -> None:
         """Order the drives to brake. Any state; never raises."""
         self._send(
-            stops=self._orders.stops + 1, auxiliary_stops=self._orders.auxiliary_stops + 1,
-            velocities=np.zeros_like(self._orders.velocities), auxiliary=np.full(len(self._names), np.nan),
-        )  # fmt: skip
+            stops=self._orders.stops + 1,
+            auxiliary_stops=self._orders.auxiliary_stops + 1,
+            velocities=np.zeros_like(self._orders.velocities),
+            auxiliary=np.full(len(self._names), np.nan),
+        )
 
     # -- auxiliary joints -----------------------------------------------------------------------------------
 

@@ -231,9 +231,7 @@ class ServoProcess:
             self._silent = True
             if self._moving:
                 messages = messages._replace(requests=(Request(-1, SILENCE, Hold()),))
-        if self._heard_ns and (
-            now_ns - self._heard_ns > UNHEARD_S * 1e9 or now_ns < self._unheard_until_ns
-        ):  # fmt: skip
+        if self._heard_ns and (now_ns - self._heard_ns > UNHEARD_S * 1e9 or now_ns < self._unheard_until_ns):
             return self._extend_leases(messages, now_ns)
         return messages
 

@@ -305,14 +305,20 @@ def prepare(
     Raises StartError.
     """
     arguments = [
-        str(cell_path), str(directories.runtime), str(directories.state), str(os.getpid()),
+        str(cell_path),
+        str(directories.runtime),
+        str(directories.state),
+        str(os.getpid()),
         msgspec.json.encode(options).decode(),
-    ]  # fmt: skip
+    ]
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "stereoservo.daemon.cell_preparation", *arguments],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors, env=child_environment(),
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            env=child_environment(),
+        )
         told = ProgressLines()
         while process.poll() is None:
             if termination.asked:

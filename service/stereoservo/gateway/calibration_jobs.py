@@ -28,9 +28,14 @@ class CalibrationJobs:
     """
 
     def __init__(
-        self, settings: CoreSettings, models: ModelStore, link: ServoConnection, log: EventLog, history: Path,
+        self,
+        settings: CoreSettings,
+        models: ModelStore,
+        link: ServoConnection,
+        log: EventLog,
+        history: Path,
         known_length: str = "",
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._settings = settings
         self._models = models
         self._link = link
@@ -135,9 +140,14 @@ class CalibrationJobs:
         try:
             epoch = self._models.next_epoch()
             self._check = CheckJob(
-                self._job.trials(), path, self._history, self._settings.tolerance_px,
-                body_moves=self._settings.body_moves, reset_to=self._models.path(epoch) if reset else None, epoch=epoch,
-            )  # fmt: skip
+                self._job.trials(),
+                path,
+                self._history,
+                self._settings.tolerance_px,
+                body_moves=self._settings.body_moves,
+                reset_to=self._models.path(epoch) if reset else None,
+                epoch=epoch,
+            )
         except (CalibrationError, OSError) as error:
             self._failed(self._check_id, str(error), getattr(error, "code", ""))
 
@@ -175,9 +185,12 @@ class CalibrationJobs:
         elif "model" in fit.said or "error" in fit.said:
             cause = fit.said.get("report_error", "its process ended early")
             self._log.add(
-                "calibration_report", message=f"no report could be written: {cause}", id=self._fit_id,
-                accepted=False, origin="gateway",
-            )  # fmt: skip
+                "calibration_report",
+                message=f"no report could be written: {cause}",
+                id=self._fit_id,
+                accepted=False,
+                origin="gateway",
+            )
         fit.close()
         self._fit = None
 

@@ -49,8 +49,11 @@ class ChildJob:
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - read when the process has ended
         self._process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments, "--parent", str(os.getpid())],
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=self._errors, env=child_environment(),
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env=child_environment(),
+        )
         assert self._process.stdout is not None
         self._output = self._process.stdout
         os.set_blocking(self._output.fileno(), False)
@@ -162,9 +165,14 @@ class CheckJob(ChildJob):
         wanted = [] if reset_to is None else ["--reset-to", str(reset_to), "--epoch", str(epoch)]
         wanted += ["--body-moves"] if body_moves else []
         super().__init__(
-            "stereoservo.daemon.jobs.check_job", str(path), str(model_path), str(history), "--limit-px",
-            repr(limit_px), *wanted,
-        )  # fmt: skip
+            "stereoservo.daemon.jobs.check_job",
+            str(path),
+            str(model_path),
+            str(history),
+            "--limit-px",
+            repr(limit_px),
+            *wanted,
+        )
 
     def report(self) -> CheckReport:
         """The report of the check. Raises FitFailedError."""

@@ -103,9 +103,10 @@ def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
         return TransferredGoal(goal.target, "")
     then = {camera.name: (camera.matrix, camera.lens) for camera in taught.cameras}
     moved = [
-        camera.name for camera in model.cameras
+        camera.name
+        for camera in model.cameras
         if then.get(camera.name) != (tuple(camera.matrix.ravel().tolist()), tuple(camera.lens.tolist()))
-    ]  # fmt: skip
+    ]
     kept_pixels = {name: pixels for name, pixels in goal.target.set_points.items() if name not in moved}
     if not moved:  # other joint zeros, say: whether the goal holds is the core's to judge
         return TransferredGoal(goal.target, "")

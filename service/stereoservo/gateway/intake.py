@@ -204,9 +204,14 @@ class Intake:
             return
         message = "; ".join(filter(None, (event.message, pending.note)))
         reply = Reply(
-            accepted=bool(event.accepted), message=message, id=event.id, request=event.request,
-            reasons=event.reasons, boot=self._boot, plan=event.plan,
-        )  # fmt: skip
+            accepted=bool(event.accepted),
+            message=message,
+            id=event.id,
+            request=event.request,
+            reasons=event.reasons,
+            boot=self._boot,
+            plan=event.plan,
+        )
         if isinstance(pending.command, RunGoal):
             goal = pending.command.goal
             if not goal.check:

@@ -105,9 +105,11 @@ class RelocalizationJobs:
             save_model(adjusted, self._models.path(adjusted.epoch))
         except (OSError, ModelFileError) as error:
             self._log.add(
-                "warning", origin="gateway", name=event.name,
+                "warning",
+                origin="gateway",
+                name=event.name,
                 message=f"where camera {event.name} stands now is not kept for the next start: {error}",
-            )  # fmt: skip
+            )
 
     def _start(self) -> None:
         self.cancel()
@@ -285,9 +287,12 @@ class RefinementJobs:
         try:
             save_trials(self._poses.trials(), poses)
             self._job = ChildJob(
-                "stereoservo.daemon.jobs.refinement_job", str(poses), str(base),
-                str(self._models.path(model.epoch)), str(self._path),
-            )  # fmt: skip
+                "stereoservo.daemon.jobs.refinement_job",
+                str(poses),
+                str(base),
+                str(self._models.path(model.epoch)),
+                str(self._path),
+            )
         except (CalibrationError, OSError) as error:
             self._refuse(str(error), getattr(error, "code", ""))
 
@@ -354,9 +359,8 @@ class RefinementJobs:
         except OSError as error:
             self._warn(f"taught goals are not stored as restated in model epoch {model.epoch}: {error}")
         of_used = [
-            name for name, goal in sorted(self._taught.goals.items())
-            if goal.target.model_epoch == model.in_place_of
-        ]  # fmt: skip
+            name for name, goal in sorted(self._taught.goals.items()) if goal.target.model_epoch == model.in_place_of
+        ]
         if used is None and of_used:
             self._warn(
                 f"taught goals {', '.join(of_used)} cannot be restated in model epoch {model.epoch}: the file of model "

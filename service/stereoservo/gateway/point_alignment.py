@@ -62,7 +62,7 @@ def align_points(
         own = None if covariance is None else covariance[kept]
         change = align(
             family, old, new, points[kept], now.pixels[:, kept], now.sigmas[:, kept], own, [common[k] for k in kept]
-        )  # fmt: skip
+        )
         return change, point_residuals(new.Ps, move_points(change.H, points[kept]), now.pixels[:, kept])
 
     usable: BoolArray = np.asarray(np.isfinite(points).all(axis=1) & np.isfinite(now.pixels).all(axis=2).any(axis=0))
@@ -262,9 +262,13 @@ def _mixed(views: MarkerViews, features: CommonFeatures) -> MixedFeatures:
     segments[missing], sigmas = np.nan, np.where(missing, np.inf, sigmas)
     planes = [views.subset(plane) for plane in features.planes]
     return MixedFeatures(
-        points.pixels, points.sigmas, segments, sigmas, tuple(plane.pixels for plane in planes),
+        points.pixels,
+        points.sigmas,
+        segments,
+        sigmas,
+        tuple(plane.pixels for plane in planes),
         tuple(plane.sigmas for plane in planes),
-    )  # fmt: skip
+    )
 
 
 def _require_seen(features: CommonFeatures, views: MarkerViews, when: str) -> None:

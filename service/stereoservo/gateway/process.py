@@ -144,9 +144,13 @@ class Gateway:
         self._servo = ServoConnection(directories)
         self._replies = ReplyThread()
         self._calibration = CalibrationJobs(
-            self.settings, self._models, self._servo, self.log, directories.checks,
+            self.settings,
+            self._models,
+            self._servo,
+            self.log,
+            directories.checks,
             "" if plan.cell.calibration is None else plan.cell.calibration.known_length,
-        )  # fmt: skip
+        )
         self._relocalization = RelocalizationJobs(
             self._models, self._servo, self.log, lambda: self._calibration.model, self._use_model
         )

@@ -73,9 +73,11 @@ class ImageRecordings:
         self._directory, self._until, self._told = str(directory), None, {}
         left = f"; {', '.join(self._others)} deliver observations and are not in it" if self._others else ""
         self._log.add(
-            "images", message=f"images of {', '.join(self._cameras)} into {directory}{left}", name=str(directory),
+            "images",
+            message=f"images of {', '.join(self._cameras)} into {directory}{left}",
+            name=str(directory),
             origin="gateway",
-        )  # fmt: skip
+        )
 
     def end(self) -> None:
         """Request them to stop. Idempotent."""
@@ -97,11 +99,15 @@ class ImageRecordings:
             return
         silent = {
             name: RecordedImages(
-                name, f"{self._directory}/{name}.avi", 0, 0, 0,
+                name,
+                f"{self._directory}/{name}.avi",
+                0,
+                0,
+                0,
                 f"or more: its vision process has not said how many within {LAST_WORD_S:g} s; see the daemon's log",
             )
             for name in missing
-        }  # fmt: skip
+        }
         found = tuple((self._told | silent)[name] for name in self._cameras)
         text = "; ".join(
             f"{images.camera}: {images.frames} frames"
@@ -110,9 +116,12 @@ class ImageRecordings:
             for images in found
         )
         self._log.add(
-            "images_recorded", message=f"{self._directory}: {text}", name=self._directory,
-            images=ImagesRecorded(self._directory, found), origin="gateway",
-        )  # fmt: skip
+            "images_recorded",
+            message=f"{self._directory}: {text}",
+            name=self._directory,
+            images=ImagesRecorded(self._directory, found),
+            origin="gateway",
+        )
         self._directory, self._until = "", None
 
 

@@ -144,9 +144,13 @@ class TaughtGoalRegistry:
 
     def _warn(self, name: str, why: str, request: int) -> bool:
         self._log.add(
-            "warning", message=f"taught goal {name!r} is not saved: {why}", name=name, request=request,
-            accepted=False, origin="gateway",
-        )  # fmt: skip
+            "warning",
+            message=f"taught goal {name!r} is not saved: {why}",
+            name=name,
+            request=request,
+            accepted=False,
+            origin="gateway",
+        )
         return False
 
 

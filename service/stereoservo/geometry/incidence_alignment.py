@@ -429,7 +429,7 @@ def _firm(incidences: Sequence[Incidence], firmness: FloatArray) -> list[Inciden
     """Those whose features then are well known: uncertain ones would rule the linear solution."""
     kept = [
         incidence for incidence, trace in zip(incidences, firmness, strict=True) if trace <= FIRM * np.median(firmness)
-    ]  # fmt: skip
+    ]
     return kept if sum(incidence.equations for incidence in kept) > EQUATIONS else list(incidences)
 
 

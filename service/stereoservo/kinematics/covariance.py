@@ -116,10 +116,13 @@ def pixel_covariances(model: CellModel, positions: FloatArray) -> tuple[FloatArr
     """
     positions = np.asarray(positions, dtype=np.float64)
     slopes = [
-        (predicted_pixels(displaced_model(model, STEP * axis), positions)
-         - predicted_pixels(displaced_model(model, -STEP * axis), positions)) / (2.0 * STEP)
+        (
+            predicted_pixels(displaced_model(model, STEP * axis), positions)
+            - predicted_pixels(displaced_model(model, -STEP * axis), positions)
+        )
+        / (2.0 * STEP)
         for axis in covariance_axes(model).T
-    ]  # fmt: skip
+    ]
     if model.joint_accuracy is not None:
         deviations = model.joint_accuracy.deviations(positions - model.zero)
         for joint, deviation in enumerate(deviations.T):

@@ -135,9 +135,9 @@ def _fixed(name: str, pose: FloatArray, carried: bool, link: str, origin: FloatA
     """A link at ``pose`` (4, 4) in the root frame, on the last ``link`` at ``origin`` (3,), or on the base."""
     parent, shift = (link, pose[:3, 3] - origin) if carried else ("base", pose[:3, 3])
     R = pose[:3, :3]
-    angles = np.array([
-        np.arctan2(R[2, 1], R[2, 2]), np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])), np.arctan2(R[1, 0], R[0, 0]),
-    ])  # fmt: skip
+    angles = np.array(
+        [np.arctan2(R[2, 1], R[2, 2]), np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])), np.arctan2(R[1, 0], R[0, 0])]
+    )
     return [
         f"  <link name={quoteattr(name)}/>",
         f'  <joint name={quoteattr(name + "_mount")} type="fixed">',

@@ -170,8 +170,9 @@ class DaemonProcess:
         raise DaemonError(
             f"the daemon was not ready within {timeout_s:g} s, in which it compiled no kernel either: a computer that "
             f"is too busy? Start it again: what was compiled is kept{said}",
-            None, self.output(),
-        )  # fmt: skip
+            None,
+            self.output(),
+        )
 
     def _progress(self) -> tuple[CompilationProgress, ...]:
         root = runtime_root()

@@ -325,10 +325,13 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
     tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
     constraints = _unlimited(p.constraints) if unconstrained else p.constraints
     broken, reached = _go_on(
-        (int(p.stage), p.path, p.residual, p.joint_step), (p.sample, until), plain(constraints),
+        (int(p.stage), p.path, p.residual, p.joint_step),
+        (p.sample, until),
+        plain(constraints),
         (int(p.request.composition), p.operators, p.joints, p.displacement, p.bias),
-        (len(p.joints) > p.rank, tolerance), (p.all_joints, p.all_displacements, p.table),
-    )  # fmt: skip
+        (len(p.joints) > p.rank, tolerance),
+        (p.all_joints, p.all_displacements, p.table),
+    )
     return int(broken), int(reached)
 
 

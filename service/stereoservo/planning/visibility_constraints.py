@@ -192,9 +192,13 @@ def check_view(
                 angle = elevation(points, s.faces, f, s.sides[f, c], s.camera_centres[c])
                 limit = s.grazing[f, c] if bounded else 0.0
                 above = Margin(
-                    math.degrees(angle), math.degrees(limit), math.degrees(angle - limit), c, s.faces[f, 0],
+                    math.degrees(angle),
+                    math.degrees(limit),
+                    math.degrees(angle - limit),
+                    c,
+                    s.faces[f, 0],
                     path_parameter,
-                )  # fmt: skip
+                )
                 if _enter(table, 3, 1.0, above) and broken < 0:
                     broken = 3
     return broken

@@ -198,23 +198,28 @@ class ImageWriter:
             raise ImageFileError(self.path, "closed", "the recording was closed; begin another")
         if image.shape != (self._height, self._width) or image.dtype != np.uint8:
             raise ImageFileError(
-                self.path, "frame",
+                self.path,
+                "frame",
                 f"a picture of shape {image.shape} {image.dtype}; ({self._height}, {self._width}) uint8 is recorded",
                 frame=self.frames,
-            )  # fmt: skip
+            )
         if frame.t_shutter_ns <= self._last_ns:
             raise ImageFileError(
-                self.path, "order",
-                f"stamp {frame.t_shutter_ns} ns is not after the last one, {self._last_ns} ns", frame=self.frames,
-            )  # fmt: skip
+                self.path,
+                "order",
+                f"stamp {frame.t_shutter_ns} ns is not after the last one, {self._last_ns} ns",
+                frame=self.frames,
+            )
         self._first_ns = self._first_ns if self.frames else frame.t_shutter_ns
         seconds = (frame.t_shutter_ns - self._first_ns) * 1e-9
         if seconds > self._limits.max_seconds:
             raise ImageFileError(
-                self.path, "limit",
+                self.path,
+                "limit",
                 f"{seconds:.1f} s are recorded; the limit is {self._limits.max_seconds:g} s. Begin another recording",
-                frame=self.frames, seconds=seconds,
-            )  # fmt: skip
+                frame=self.frames,
+                seconds=seconds,
+            )
         self._check_room(image.nbytes)
         self._video.write(self._even(image))
         line = ImageLine(self.frames, frame.seq, frame.t_shutter_ns, frame.t_received_ns, crc_of(image), left_out)
@@ -242,10 +247,12 @@ class ImageWriter:
         written = self.bytes
         if written + coming > self._limits.max_bytes:
             raise ImageFileError(
-                self.path, "limit",
+                self.path,
+                "limit",
                 f"{written} bytes are recorded; the limit is {self._limits.max_bytes}. Begin another recording",
-                frame=self.frames, bytes=written,
-            )  # fmt: skip
+                frame=self.frames,
+                bytes=written,
+            )
         try:
             found = os.statvfs(self.path.parent)
         except OSError as error:
@@ -253,10 +260,12 @@ class ImageWriter:
         free = found.f_bavail * found.f_frsize
         if free - coming < self._limits.keep_free_bytes:
             raise ImageFileError(
-                self.path, "disk",
+                self.path,
+                "disk",
                 f"{free} bytes are free on its disk; {self._limits.keep_free_bytes} are left to others. Make room",
-                frame=self.frames, free=free,
-            )  # fmt: skip
+                frame=self.frames,
+                free=free,
+            )
 
     def _put(self, line: ImageHeader | ImageLine | ImageEnd) -> None:
         try:
@@ -355,9 +364,10 @@ class ImageReader:
         if size != even:
             capture.release()
             raise ImageFileError(
-                self.path, "size",
+                self.path,
+                "size",
                 f"holds pictures of {size[0]}x{size[1]} px; its sidecar is of {even[0]}x{even[1]}: is it that file's?",
-            )  # fmt: skip
+            )
         return capture
 
     def read(self) -> Frame | None:
@@ -372,11 +382,12 @@ class ImageReader:
         found = crc_of(pixels)
         if found != line.crc:
             raise ImageFileError(
-                self.path, "crc",
+                self.path,
+                "crc",
                 f"its pixels have CRC {found:08x}, recorded were {line.crc:08x}: the file is damaged from here on. "
                 "Take another copy, or use what comes before",
                 frame=line.frame,
-            )  # fmt: skip
+            )
         return Frame(self.header.camera, line.seq, line.t_shutter_ns, line.t_received_ns, pixels)
 
     def skip(self) -> ImageLine | None:

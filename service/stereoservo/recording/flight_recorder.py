@@ -102,9 +102,12 @@ class FlightRecorder:
         self._blocks, self._checkpoints = StepBlocks(), Checkpoints()
         # A message is a chunk: its content is compressed already, by a method for its kind.
         self._writer = Writer(
-            self._stream, chunk_size=1, compression=CompressionType.NONE, enable_data_crcs=True,
+            self._stream,
+            chunk_size=1,
+            compression=CompressionType.NONE,
+            enable_data_crcs=True,
             index_types=IndexType.CHUNK,
-        )  # fmt: skip
+        )
         try:
             self._writer.start(profile=FORMAT, library="stereoservo")
         except OSError:

@@ -186,10 +186,13 @@ def markers_seen(
         points = [Point2(x=float(u) + 0.5, y=float(v) + 0.5) for u, v in pixels if np.isfinite(u + v)]
         drawn.append(
             PointsAnnotation(
-                timestamp=stamp(t_ns), type=PointsAnnotationType.Points, points=points, outline_color=colour,
+                timestamp=stamp(t_ns),
+                type=PointsAnnotationType.Points,
+                points=points,
+                outline_color=colour,
                 thickness=size,
             )
-        )  # fmt: skip
+        )
     return Published(f"/camera/{camera}/annotations", t_ns, ImageAnnotations(timestamp=stamp(t_ns), points=drawn))
 
 
@@ -239,10 +242,13 @@ class MetricScene:
             x, y, z, w = Rotation.from_matrix(rotation.T).as_quat()
             found.append(
                 FrameTransform(
-                    timestamp=stamp(t_ns), parent_frame_id=CELL_FRAME, child_frame_id=camera.name,
-                    translation=_vector(centre), rotation=Quaternion(x=x, y=y, z=z, w=w),
+                    timestamp=stamp(t_ns),
+                    parent_frame_id=CELL_FRAME,
+                    child_frame_id=camera.name,
+                    translation=_vector(centre),
+                    rotation=Quaternion(x=x, y=y, z=z, w=w),
                 )
-            )  # fmt: skip
+            )
         return Published("/tf", t_ns, FrameTransforms(transforms=found))
 
     def update(self, t_ns: int, positions: FloatArray) -> Published:
@@ -252,20 +258,25 @@ class MetricScene:
         size = 0.02
         arm = [
             LinePrimitive(
-                type=LinePrimitiveLineType.LineStrip, pose=_pose(np.zeros(3)), thickness=0.3 * size, color=AXIS,
+                type=LinePrimitiveLineType.LineStrip,
+                pose=_pose(np.zeros(3)),
+                thickness=0.3 * size,
+                color=AXIS,
                 points=[_point(point - 0.2 * direction), _point(point + 0.2 * direction)],
             )
             for direction, point in zip(directions, points, strict=True)
-        ]  # fmt: skip
+        ]
         cameras = [_camera(c, r) for c, r in zip(self.centres, self.rotations, strict=True)]
         entities = [
             _entity(t_ns, "arm", lines=arm, texts=_names(self._model.joint_names, points, size, AXIS)),
             _entity(t_ns, "markers", spheres=[_sphere(marker, size) for marker in markers]),
             _entity(
-                t_ns, "cameras", lines=cameras,
+                t_ns,
+                "cameras",
+                lines=cameras,
                 texts=_names([camera.name for camera in self._model.cameras], self.centres, size, WANTED),
             ),
-        ]  # fmt: skip
+        ]
         return Published("/scene", t_ns, SceneUpdate(entities=entities))
 
 
@@ -298,9 +309,12 @@ def _camera(centre: FloatArray, rotation: FloatArray) -> LinePrimitive:
     for corner, following in zip(corners, [*corners[1:], corners[0]], strict=True):
         strip += [corner, centre, corner, following]
     return LinePrimitive(
-        type=LinePrimitiveLineType.LineStrip, pose=_pose(np.zeros(3)), thickness=0.005, color=WANTED,
+        type=LinePrimitiveLineType.LineStrip,
+        pose=_pose(np.zeros(3)),
+        thickness=0.005,
+        color=WANTED,
         points=[_point(place) for place in strip],
-    )  # fmt: skip
+    )
 
 
 def _names(names: Sequence[str], places: FloatArray, size: float, colour: Color) -> list[TextPrimitive]:

@@ -279,6 +279,11 @@ def _read_sight(reader: _Reader, now_ns: int) -> CameraObservation:
     length, k, seq, shutter_ns, received_ns = reader.unpack(SIGHT)
     name = reader.take(length + -length % 8)[:length].decode()
     return CameraObservation(
-        name, seq, now_ns + shutter_ns, now_ns + received_ns, reader.array(np.int64, k),
-        reader.array(np.float64, k, 2), reader.array(np.float64, k, 2, 2),
-    )  # fmt: skip
+        name,
+        seq,
+        now_ns + shutter_ns,
+        now_ns + received_ns,
+        reader.array(np.int64, k),
+        reader.array(np.float64, k, 2),
+        reader.array(np.float64, k, 2, 2),
+    )

@@ -308,11 +308,13 @@ class FlightReader:
         joints = [{"name": name} for name in settings.joint_names]
         self._run = msgspec.convert(
             {
-                "cell": {"cell": {"name": settings.cell}}, "boot": "", "joints": {"joints": joints},
+                "cell": {"cell": {"name": settings.cell}},
+                "boot": "",
+                "joints": {"joints": joints},
                 "cameras": [{"name": camera.name, "rate_hz": camera.rate_hz} for camera in settings.cameras],
             },
             RunRecord,
-        )  # fmt: skip
+        )
         self._tell("info", self._span.first_ns, {"info": self._info})
         self._tell("goal", self._span.first_ns, no_goal())
 

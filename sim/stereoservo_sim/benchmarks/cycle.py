@@ -100,8 +100,9 @@ def law_calls(p: dict[str, Any]) -> dict[str, Callable[[int], object]]:
     centres = np.array([camera_centre(P) / camera_centre(P)[3] for P in p["Ps"]])
     ones = np.ones((2, 4))
     scene = Scene(operators, int(Composition.BASE_FIRST), p["Ps"], centres, points, pixels, ones)
-    turned = transform_points(chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"] + 0.1)[0],
-                              p["markers"])  # fmt: skip
+    turned = transform_points(
+        chain_forward(p["generators"], np.zeros(6, np.uint8), np.zeros(6), p["q"] + 0.1)[0], p["markers"]
+    )
     task = Task(
         project_points(p["Ps"], turned)[0], ones, np.zeros((2, 4, 2)), turned, np.ones(4), points.mean(axis=0),
         turned.mean(axis=0), np.arange(3),
@@ -304,10 +305,15 @@ def with_joints(count: int) -> SyntheticCell:
     return dataclasses.replace(
         large,
         base=large.frames(large.home)[len(large.kinds) - count],
-        kinds=large.kinds[-count:], links=large.links[-count:], home=large.home[-count:],
-        ranges=large.ranges[-count:], body=small.body, intrinsics=small.intrinsics, poses=small.poses,
+        kinds=large.kinds[-count:],
+        links=large.links[-count:],
+        home=large.home[-count:],
+        ranges=large.ranges[-count:],
+        body=small.body,
+        intrinsics=small.intrinsics,
+        poses=small.poses,
         lenses=small.lenses,
-    )  # fmt: skip
+    )
 
 
 def step_costs(cell: SyntheticCell, count: int, seed: int) -> dict[str, Any]:

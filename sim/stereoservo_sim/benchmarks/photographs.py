@@ -205,11 +205,11 @@ def _in_order(boards: dict[str, Board]) -> dict[str, Board]:
     """Boards (54, 2) of one picture counted from the same end: that of the first that was found."""
     first = next((board for board in boards.values() if board is not None), None)
     return {
-        name: board if board is None or first is None else min(
-            (board, board[::-1]), key=lambda one: float(np.abs(one - first).sum())
-        )
+        name: board
+        if board is None or first is None
+        else min((board, board[::-1]), key=lambda one: float(np.abs(one - first).sum()))
         for name, board in boards.items()
-    }  # fmt: skip
+    }
 
 
 def calibrated_rms(boards: Sequence[tuple[str, Board]], shape: tuple[int, ...]) -> float:

@@ -54,9 +54,13 @@ def _flown(path: Path, folder: Path, seed: int, *, moves: bool) -> tuple[Steps, 
     log: Steps = []
     cell = load_cell_file(demo_cell_path())
     with LockstepCell(
-        cell, cell_dir=demo_cell_path().parent, runtime_dir=folder, seed=seed, recording=path,
+        cell,
+        cell_dir=demo_cell_path().parent,
+        runtime_dir=folder,
+        seed=seed,
+        recording=path,
         on_step=lambda inputs, outputs: log.append((inputs, outputs)),
-    ) as flown:  # fmt: skip
+    ) as flown:
         flown.run_for(0.5)
         if moves:
             flown.submit(Enable())

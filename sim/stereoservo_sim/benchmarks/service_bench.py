@@ -282,8 +282,10 @@ class ServiceBench:
         """What ``stereoservo status --json`` says, and its exit code."""
         done = subprocess.run(
             [sys.executable, "-m", "stereoservo.cli.main", "status", CELL, "--json"],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         return done.returncode, json.loads(done.stdout)
 
 

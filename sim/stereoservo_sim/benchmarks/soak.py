@@ -152,10 +152,13 @@ def fake_cell() -> CellFile:
             "calibration": {
                 "base": dict(zip(names, world.base.tolist(), strict=True)),
                 "range": dict.fromkeys(names, 0.3),
-                "stops": 7, "frames": 2, "settle_s": 0.05, "speed_scale": 1.0,
+                "stops": 7,
+                "frames": 2,
+                "settle_s": 0.05,
+                "speed_scale": 1.0,
             },
         }
-    )  # fmt: skip
+    )
 
 
 class _Soak:

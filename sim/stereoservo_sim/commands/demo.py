@@ -176,6 +176,7 @@ def _print(result: dict[str, Any]) -> None:
                 f"goal {goal['name']}: met after {steady['met_s']:.1f} s on a part at {steady['speed_mm_s']:.0f} mm/s, "
                 f"and held for {steady['seconds']:.1f} s: {steady['rms_px']:.2f} px rms, {steady['largest_px']:.2f} px "
                 f"and {steady['largest_mm']:.2f} mm at most off the truth",
-                highlight=False, soft_wrap=True,
-            )  # fmt: skip
+                highlight=False,
+                soft_wrap=True,
+            )
     console.print(f"report: {result['report']}", highlight=False, soft_wrap=True)

@@ -125,9 +125,13 @@ def _serve(path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, t
     try:
         with _named(path, "joints.options"):
             emulator = make_bus_emulator(
-                options, drives, t_ns=time.monotonic_ns(), runtime_dir=runtime_dir, cell_dir=path.parent,
+                options,
+                drives,
+                t_ns=time.monotonic_ns(),
+                runtime_dir=runtime_dir,
+                cell_dir=path.parent,
                 mount=cell.camera[0].mount,
-            )  # fmt: skip
+            )
     except BaseException:
         endpoint.close()
         raise
@@ -145,9 +149,14 @@ def _serve(path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, t
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     gc.freeze()  # what was imported is not looked through again
     printer.say(
-        "ready", f"listening on {server.channel}", channel=server.channel, t_ns=emulator.start_ns, pid=os.getpid(),
-        nodes=[joint.node_id for joint in options.joint], bit_time=drives.bit_time,
-    )  # fmt: skip
+        "ready",
+        f"listening on {server.channel}",
+        channel=server.channel,
+        t_ns=emulator.start_ns,
+        pid=os.getpid(),
+        nodes=[joint.node_id for joint in options.joint],
+        bit_time=drives.bit_time,
+    )
     try:
         server.run(lambda: termination.asked)
     finally:
@@ -165,9 +174,13 @@ def _cameras(settings: _Settings, termination: Termination) -> None:
     with _named(path, "emulate.cameras"):
         try:
             serve_cameras(
-                load_cell_file(path), path.parent, channel=settings.channel, orders=settings.orders,
-                as_json=settings.as_json, ended=lambda: termination.asked,
-            )  # fmt: skip
+                load_cell_file(path),
+                path.parent,
+                channel=settings.channel,
+                orders=settings.orders,
+                as_json=settings.as_json,
+                ended=lambda: termination.asked,
+            )
         except FaultCommandError as error:
             raise typer.BadParameter(str(error), param_hint="--order") from error
 
@@ -201,9 +214,13 @@ def _conveyor(settings: _Settings, termination: Termination) -> None:
     file.write(running)
     printer = Printer(settings.as_json)
     printer.say(
-        "ready", f"the belt runs at {conveyor.velocity_m_s} m/s, as {file.path} says; Ctrl-C stops it",
-        velocity_m_s=conveyor.velocity_m_s, for_s=conveyor.for_s, t_ns=running.since_ns, pid=os.getpid(),
-    )  # fmt: skip
+        "ready",
+        f"the belt runs at {conveyor.velocity_m_s} m/s, as {file.path} says; Ctrl-C stops it",
+        velocity_m_s=conveyor.velocity_m_s,
+        for_s=conveyor.for_s,
+        t_ns=running.since_ns,
+        pid=os.getpid(),
+    )
     while not termination.asked:
         time.sleep(0.05)
     stopped = running.at(time.monotonic_ns())

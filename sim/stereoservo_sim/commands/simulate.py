@@ -251,10 +251,14 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         table = Table("id", "reason", "steps", "error px", "back face", "out of view", "off line mm", box=None)
         for task in failed:
             table.add_row(
-                str(task["id"]), task["refused"] or task["stopped"] or task["reason"], str(task["iterations"]),
-                _number(task["final_error_px"]), str(task["back_face"]), str(task["out_of_view"]),
+                str(task["id"]),
+                task["refused"] or task["stopped"] or task["reason"],
+                str(task["iterations"]),
+                _number(task["final_error_px"]),
+                str(task["back_face"]),
+                str(task["out_of_view"]),
                 _number(task["line_deviation_mm"]),
-            )  # fmt: skip
+            )
         console.print(table)
     judged = len(answer["tasks"]) - answer["unreachable"]
     rate = "no task can be reached" if answer["success_rate"] is None else f"{answer['success_rate']:.2%}"

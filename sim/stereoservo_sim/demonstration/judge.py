@@ -211,9 +211,14 @@ def _steady(
         apart_mm = max(apart_mm, float(1e3 * apart_m))
     found = np.array(apart_px)
     return Steady(
-        speed, (met.t_ns - start.t_ns) * 1e-9, (stops_ns - met.t_ns) * 1e-9, float(np.sqrt((found**2).mean())),
-        float(np.quantile(found.max(axis=(1, 2)), 0.99)), float(found.max()), apart_mm,
-    )  # fmt: skip
+        speed,
+        (met.t_ns - start.t_ns) * 1e-9,
+        (stops_ns - met.t_ns) * 1e-9,
+        float(np.sqrt((found**2).mean())),
+        float(np.quantile(found.max(axis=(1, 2)), 0.99)),
+        float(found.max()),
+        apart_mm,
+    )
 
 
 def _flown(name: str, flight: Course) -> tuple[Event, Event]:

@@ -135,10 +135,7 @@ class LockstepOperator:
         goal_id = str(next(self._ids))
         self._submit(Calibrate(goal_id, check=check))
         ends = ("calibration_finished", "check_finished", "calibration_aborted")
-        end = self.cell.wait_for(
-            lambda e: e.id == goal_id and e.kind in ends,
-            CALIBRATION_TIMEOUT_S, since,
-        )  # fmt: skip
+        end = self.cell.wait_for(lambda e: e.id == goal_id and e.kind in ends, CALIBRATION_TIMEOUT_S, since)
         if end.kind == "calibration_aborted":
             raise LockstepRefusalError(end)
         job = TrialCollector(self.cell.settings)

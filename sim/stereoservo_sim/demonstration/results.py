@@ -150,9 +150,11 @@ def _calibration(model: CellModel, seconds: float) -> dict[str, Any]:
 def _loop(demonstration: Demonstration) -> dict[str, Any]:
     if demonstration.loop is None:  # virtual time is never late
         return {
-            "rate_hz": demonstration.cell.servo.rate_hz, "overruns": 0,
-            "lateness_us": {"p50": 0.0, "p99": 0.0, "max": 0.0}, "virtual": True,
-        }  # fmt: skip
+            "rate_hz": demonstration.cell.servo.rate_hz,
+            "overruns": 0,
+            "lateness_us": {"p50": 0.0, "p99": 0.0, "max": 0.0},
+            "virtual": True,
+        }
     return {**msgspec.to_builtins(demonstration.loop), "virtual": False}
 
 

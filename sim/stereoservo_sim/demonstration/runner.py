@@ -89,9 +89,13 @@ def conduct_lockstep(
     with tempfile.TemporaryDirectory(prefix="stereoservo-demo-") as scratch:
         history = TrueJointHistory.in_memory(len(truth.base), capacity=1 << 16)
         with LockstepCell(
-            cell, cell_dir=cell_path.parent, runtime_dir=Path(scratch), seed=seed, recording=recording,
+            cell,
+            cell_dir=cell_path.parent,
+            runtime_dir=Path(scratch),
+            seed=seed,
+            recording=recording,
             services={"world": history},
-        ) as lockstep:  # fmt: skip
+        ) as lockstep:
             log = TruthLog(history)
             lockstep.on_step = _every(2000, log.take)
             belt = None if conveyor is None else Belt(conveyor, Path(scratch), lockstep.clock.now_ns)
@@ -106,8 +110,8 @@ def conduct_lockstep(
             )
             times, positions = log.end()
     demonstration = Demonstration(
-        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, truth, goals, belt,
-    )  # fmt: skip
+        cell, names, calibrated, outcomes, times, positions, recording, out, None, seed, truth, goals, belt
+    )
     return _kept(demonstration)
 
 
@@ -190,8 +194,8 @@ def conduct_live(
             if code != 0:
                 raise DemoFailedError(f"the daemon ended with exit code {code}: {daemon.output()}")
     demonstration = Demonstration(
-        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, truth, goals, belt,
-    )  # fmt: skip
+        cell, names, calibrated, outcomes, times, positions, recording, out, loop, seed, truth, goals, belt
+    )
     return _kept(demonstration)
 
 

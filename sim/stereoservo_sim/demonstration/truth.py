@@ -76,9 +76,7 @@ def _simulated_options(section: CameraSection, cell: CellFile) -> Mapping[str, A
     if stream is None:
         streams = ", ".join(stream.stream for stream in settings.camera)
         raise ValueError(f"camera {section.name!r} shows {path!r}, which is not emulated; streams: {streams}")
-    return {
-        "view": stream.view or stream.name, "k1": stream.k1, "moved": stream.moved, "workpiece": settings.workpiece,
-    }  # fmt: skip
+    return {"view": stream.view or stream.name, "k1": stream.k1, "moved": stream.moved, "workpiece": settings.workpiece}
 
 
 class TruthLog:

@@ -103,8 +103,11 @@ class Console:
         self._printer.say(
             event.kind,
             f"{seconds:10.4f} s  {where}{event.kind.replace('_', ' ')}{f' {event.text}' if event.text else ''}",
-            t_ns=event.t_ns, t_s=round(seconds, 6), **event.place(), text=event.text,
-        )  # fmt: skip
+            t_ns=event.t_ns,
+            t_s=round(seconds, 6),
+            **event.place(),
+            text=event.text,
+        )
 
     def order(self, text: str) -> bool:
         """Execute a fault command and print the reply; returns whether it succeeded."""

@@ -56,9 +56,13 @@ class EmulatorProcess:
         stream = log.open("wb") if log is not None else None
         try:
             self.process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True,
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=stream,
+                text=True,
                 env={**os.environ, **(environment or {})},
-            )  # fmt: skip
+            )
         finally:
             if stream is not None:
                 stream.close()

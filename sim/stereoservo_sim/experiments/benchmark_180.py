@@ -96,18 +96,28 @@ def _classical_compared(rows: list[Curve]) -> list[Comparison]:
         seen = all(not row["face_visible"] and row["final_error_px"] < 1.0 for row in mine)
         stalled = max(row["stalled_s"] for row in mine)
         found.append(
-            of_statement("fig. 8.14", told, "self-occlusion, trapped, escapes, converges",
-                         f"{'shows the back' if seen else 'keeps the face'}, stalled {stalled:.1f} s, "
-                         f"{max(row['final_error_px'] for row in mine):.2g} px at the end", seen and stalled > 1.0)
-        )  # fmt: skip
+            of_statement(
+                "fig. 8.14",
+                told,
+                "self-occlusion, trapped, escapes, converges",
+                f"{'shows the back' if seen else 'keeps the face'}, stalled {stalled:.1f} s, "
+                f"{max(row['final_error_px'] for row in mine):.2g} px at the end",
+                seen and stalled > 1.0,
+            )
+        )
     blocks = [row for row in rows if row["law"] == "stereo-block"]
     out = max(row["farthest_m"] for row in blocks)
     back = any(row["converged"] for row in blocks)
     found.append(
-        of_statement("fig. 8.14", "block-wise pseudo-inverse", "diverges while moving towards infinity",
-                     f"goes out to {out:.1f} m" + (" and comes back" if back else ""), out > FAR_OUT_M and not back,
-                     COMES_BACK)
-    )  # fmt: skip
+        of_statement(
+            "fig. 8.14",
+            "block-wise pseudo-inverse",
+            "diverges while moving towards infinity",
+            f"goes out to {out:.1f} m" + (" and comes back" if back else ""),
+            out > FAR_OUT_M and not back,
+            COMES_BACK,
+        )
+    )
     return found
 
 
@@ -118,15 +128,28 @@ def _paths_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison]
         if "planned" in item:
             figure = "fig. 8.15" if item["planned"] == "linear" else "fig. 8.16"
             found.append(
-                of_statement(figure, f"planned, {item['planned']}, {item['scene']}", "self-occlusion avoided",
-                             f"cosine to the face from {item['smallest_facing']:.2f}", item["smallest_facing"] > 0.0)
-            )  # fmt: skip
-    apart = [row["line_deviation_mm"] for row in _of(rows, scene="aside", arm="free", model="projective", gain=0.5)
-             if row["law"] in ("cartesian3", "cartesian2")]  # fmt: skip
+                of_statement(
+                    figure,
+                    f"planned, {item['planned']}, {item['scene']}",
+                    "self-occlusion avoided",
+                    f"cosine to the face from {item['smallest_facing']:.2f}",
+                    item["smallest_facing"] > 0.0,
+                )
+            )
+    apart = [
+        row["line_deviation_mm"]
+        for row in _of(rows, scene="aside", arm="free", model="projective", gain=0.5)
+        if row["law"] in ("cartesian3", "cartesian2")
+    ]
     found.append(
-        of_statement("fig. 8.17", "directTHREE beside directTWO", "very small deviation",
-                     f"{max(apart):.2g} mm from the line at most", max(apart) < 2.0)
-    )  # fmt: skip
+        of_statement(
+            "fig. 8.17",
+            "directTHREE beside directTWO",
+            "very small deviation",
+            f"{max(apart):.2g} mm from the line at most",
+            max(apart) < 2.0,
+        )
+    )
     for law in ("cartesian3", "cartesian2"):
         free = {
             row["gain"]: row["line_deviation_mm"]
@@ -139,12 +162,15 @@ def _paths_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison]
         ways = [free[gain] for gain in sorted(free)]
         limited = slow[0]["line_deviation_mm"]
         found.append(
-            of_statement("fig. 8.18", f"{law}, centre beside its line",
-                         "less at smaller gains, least with joints limited to 5°/s",
-                         f"{', '.join(f'{way:.2g}' for way in ways)} mm at gains "
-                         f"{', '.join(f'{gain:g}' for gain in sorted(free))}; limited {limited:.2g} mm",
-                         ways == sorted(ways) and limited < free[slow[0]["gain"]])
-        )  # fmt: skip
+            of_statement(
+                "fig. 8.18",
+                f"{law}, centre beside its line",
+                "less at smaller gains, least with joints limited to 5°/s",
+                f"{', '.join(f'{way:.2g}' for way in ways)} mm at gains "
+                f"{', '.join(f'{gain:g}' for gain in sorted(free))}; limited {limited:.2g} mm",
+                ways == sorted(ways) and limited < free[slow[0]["gain"]],
+            )
+        )
     return found
 
 
@@ -156,18 +182,27 @@ def _errors_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison
         rates = [row[f"{name}_rate"] for row in mine for name in ("tau", "theta_r", "theta_p", "theta_s")]
         known = [rate for rate in rates if rate is not None]
         found.append(
-            of_statement(figure, f"{law}, control errors", "exponential convergence",
-                         f"rates {min(known):.3f} to {max(known):.3f} of the gain",
-                         min(known) > 0.95 and max(known) < 1.05)
-        )  # fmt: skip
+            of_statement(
+                figure,
+                f"{law}, control errors",
+                "exponential convergence",
+                f"rates {min(known):.3f} to {max(known):.3f} of the gain",
+                min(known) > 0.95 and max(known) < 1.05,
+            )
+        )
     start = _of(rows, scene="aside", law="cartesian2", gain=0.5, step="corrected")[0]["theta_start_deg"][0]
     found.append(of_statement("fig. 8.19", "theta_s at the start", "180°", f"{start:.1f}°", abs(start - 180.0) < 0.5))
     (overlap,) = [item for item in summary if "overlap" in item]
     largest = max(overlap["theta_r_apart_deg"], overlap["theta_p_apart_deg"])
     found.append(
-        of_statement("fig. 8.20", "projective beside Euclidean model", "almost perfect overlap of the angles",
-                     f"{largest:.2g}° apart at most", largest < 0.5)
-    )  # fmt: skip
+        of_statement(
+            "fig. 8.20",
+            "projective beside Euclidean model",
+            "almost perfect overlap of the angles",
+            f"{largest:.2g}° apart at most",
+            largest < 0.5,
+        )
+    )
     return found
 
 
@@ -389,9 +424,7 @@ CLASSICAL = {
 }
 """The classical laws with the model they need, and what the thesis saw of them."""
 CARTESIAN = ("cartesian3", "cartesian2", "trajectory")
-PLANNED: tuple[tuple[str, Profile], ...] = (
-    ("centred", "linear"), ("aside", "linear"), ("aside", "translation-first"),
-)  # fmt: skip
+PLANNED: tuple[tuple[str, Profile], ...] = (("centred", "linear"), ("aside", "linear"), ("aside", "translation-first"))
 THESIS = {
     "figures": "8.13 to 8.22",
     "classical laws": {law: said for law, (_, said) in CLASSICAL.items()},

@@ -75,13 +75,16 @@ def parse_tags(text: str) -> tuple[int, ...]:
 
 REAL_FRANKA = (
     Option(
-        "data", Path, "folder with ee_poses.csv and images", argument="directory",
+        "data",
+        Path,
+        "folder with ee_poses.csv and images",
+        argument="directory",
         required="--data DIR, a folder with ee_poses.csv and images",
     ),
     Option("hand_tag", int, "id of the tag on the hand [default: 9]"),
     Option("table_tags", str, "ids of tags lying on the table, by commas [default: 0,2,3]", parse=parse_tags),
     Option("few_sets", int, "how many training sets of 12 poses predict the rest [default: 10]"),
-)  # fmt: skip
+)
 
 DECLARED = (
     Experiment("real-franka", 0, "real_franka",

@@ -103,9 +103,14 @@ def draw_setting(seed: int) -> EdgeSetting:
     while True:
         goal = solid_cell().base + rng.uniform(-1, 1, 6) * np.array([0.15, 0.15, 0.2, 0.5, 0.3, 0.8])
         setting = EdgeSetting(
-            float(back_m), (float(light[0]), float(light[1]), float(light[2])), float(blur), float(noise), goal, law,
+            float(back_m),
+            (float(light[0]), float(light[1]), float(light[2])),
+            float(blur),
+            float(noise),
+            goal,
+            law,
             seed,
-        )  # fmt: skip
+        )
         world = true_world(setting)
         if all(int(world.visible(goal, camera).sum()) >= LEAST_SEEN for camera in world.rig.cameras):
             return setting
@@ -131,9 +136,12 @@ def align_part(setting: EdgeSetting) -> dict[str, Any]:
         for name, pixels in world.truth_pixels(setting.goal).items()
     }
     pictures = {
-        "solid": True, "light": list(setting.light), "noise": setting.noise_grey, "blur": setting.blur_px,
+        "solid": True,
+        "light": list(setting.light),
+        "noise": setting.noise_grey,
+        "blur": setting.blur_px,
         "moved": {"shift_m": [0.0, 0.0, -setting.back_m]},
-    }  # fmt: skip
+    }
     joints = dict(zip(world.robot.joint_names, setting.goal.tolist(), strict=True))
     file = with_rendered_cameras(load_cell_file(shipped_cell_path("edges")), pictures, start=joints)
     history = TrueJointHistory.in_memory(6, capacity=1 << 14)

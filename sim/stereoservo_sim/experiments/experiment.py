@@ -313,9 +313,13 @@ def whole_table(
         table.add_row(*row)
     needed = Measurement.get(console, console.options.update(width=WIDEST), table).maximum
     whole = Console(
-        file=console.file, width=max(console.width, needed), markup=False, record=console.record,
-        force_terminal=console.is_terminal, no_color=console.no_color,
-    )  # fmt: skip
+        file=console.file,
+        width=max(console.width, needed),
+        markup=False,
+        record=console.record,
+        force_terminal=console.is_terminal,
+        no_color=console.no_color,
+    )
     whole.print(table)
 
 

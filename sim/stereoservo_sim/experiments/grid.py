@@ -489,11 +489,10 @@ def compare_house(answer: dict[str, Any]) -> list[Comparison]:
     """Fig. 3.7 beside our medians, all noises and numbers of motions."""
     worst = {
         method: max(
-            row["e_d_mm"]["median"] for row in answer["rows"]
-            if (row["method"], row["structure"]) == (method, "full")
+            row["e_d_mm"]["median"] for row in answer["rows"] if (row["method"], row["structure"]) == (method, "full")
         )
         for method in ("linear", "non-linear")
-    }  # fmt: skip
+    }
     limit = HOUSE_THESIS["e_d_mm_below"]
     return [
         of_limit("fig. 3.7", f"e_D on the grid, non-linear, largest median to {SIGMAS[-1]:g} px", limit,

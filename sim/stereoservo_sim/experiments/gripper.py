@@ -215,16 +215,20 @@ def compare_gripper(answer: dict[str, Any]) -> list[Comparison]:
                     of_limit(
                         "fig. 3.5",
                         f"e_D at {sigma:g} px, {motions} motions, {told}, {structure}",
-                        limit, row["e_d_mm"]["median"], "mm", why,
+                        limit,
+                        row["e_d_mm"]["median"],
+                        "mm",
+                        why,
                     )
-                )  # fmt: skip
+                )
 
     def median(sigma: float, m: int, method: str, measure: str) -> float:
         return float(rows[sigma, m, method, "upgrade only"][measure]["median"])
 
     low, high = sigmas[0], sigmas[-1]
-    growth = {name: median(high, motions, name, "e_d_mm") / median(low, motions, name, "e_d_mm")
-              for name in ("linear", FREE)}  # fmt: skip
+    growth = {
+        name: median(high, motions, name, "e_d_mm") / median(low, motions, name, "e_d_mm") for name in ("linear", FREE)
+    }
     ratio = median(high, motions, FREE, "e_q_mm") / median(high, motions, FREE, "e_d_mm")
     alone, four = (median(low, m, FREE, "e_d_mm") for m in (1, 4))
     return [

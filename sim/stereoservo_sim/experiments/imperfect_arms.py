@@ -106,13 +106,15 @@ def imperfect_arm(seed: int) -> tuple[RandomCase, Imperfections]:
     ripple = np.exp(rng.uniform(*np.log(RIPPLES)))
     gears = [
         Mechanics(
-            play=float(play * rng.uniform(0.5, 1.0)), sag=float(sag),
+            play=float(play * rng.uniform(0.5, 1.0)),
+            sag=float(sag),
             dead_speed=float(friction * rng.uniform(0.5, 1.0)),
-            ripple=float(ripple), ripple_order=float(rng.uniform(100.0, 320.0)),
+            ripple=float(ripple),
+            ripple_order=float(rng.uniform(100.0, 320.0)),
             ripple_phase=float(rng.uniform(0.0, 2.0 * np.pi)),
         )
         for _ in range(n)
-    ]  # fmt: skip
+    ]
     noise = float(np.exp(rng.uniform(*np.log(NOISES))))
     offset = rng.uniform(-1.0, 1.0, n) * rng.uniform(0.0, ZERO_OFFSET)
     return case, Imperfections(tuple(gears), offset, noise_px=noise)
@@ -309,14 +311,15 @@ def creeping_case(seed: int) -> tuple[RandomCase, str, Imperfections]:
     joints = [
         {
             "ripple": Mechanics(
-                ripple=float(np.exp(rng.uniform(*np.log((0.02e-3, 1e-3))))), ripple_order=float(rng.uniform(100, 320)),
+                ripple=float(np.exp(rng.uniform(*np.log((0.02e-3, 1e-3))))),
+                ripple_order=float(rng.uniform(100, 320)),
                 ripple_phase=float(rng.uniform(0.0, 2.0 * np.pi)),
             ),
             "play": Mechanics(play=float(np.deg2rad(rng.uniform(0.0, 0.5)))),
             "sag": Mechanics(sag=float(np.deg2rad(rng.uniform(0.0, 1.0)))),
         }.get(kind, Mechanics())
         for _ in case.cell.home
-    ]  # fmt: skip
+    ]
     late_s, jitter_s = (float(rng.uniform(0.0, 0.03)), 0.01) if kind == "late" else (0.0, 0.0)
     creep = drawn_creep(case.cell, rng)
     return case, kind, Imperfections(joints, late_s=late_s, jitter_s=jitter_s, noise_px=noise, creep=creep)
@@ -475,12 +478,16 @@ def run_preset_verdicts(seeds: int, seed: int = 0, progress: ProgressCall = sile
     watched = [of_seed for several in zip(*found, strict=True) for of_seed in several]
     rows = [
         {
-            "preset": case.preset, "seed": case.seed, "minutes": case.minutes, "goals": sum(case.ends.values()),
-            "reached": case.ends.get("goal_reached", 0), "refused": case.ends.get("refused", 0),
+            "preset": case.preset,
+            "seed": case.seed,
+            "minutes": case.minutes,
+            "goals": sum(case.ends.values()),
+            "reached": case.ends.get("goal_reached", 0),
+            "refused": case.ends.get("refused", 0),
             "verdicts": ", ".join(case.verdicts) or case.code or "none",
         }
         for case in watched
-    ]  # fmt: skip
+    ]
     return {
         "title": f"preset-verdicts: cases {seed} to {seed + seeds - 1}",
         "rows": rows,

@@ -151,9 +151,7 @@ def notes_late_drives(answer: dict[str, Any]) -> Iterator[str]:
 
 # -- damping ---------------------------------------------------------------------------------------------------
 
-DRIVES = {
-    "lag 0.1 s": Mechanics(lag_s=0.1), "lag 0.2 s": Mechanics(lag_s=0.2), "0.1 s late": Mechanics(delay_s=0.1),
-}  # fmt: skip
+DRIVES = {"lag 0.1 s": Mechanics(lag_s=0.1), "lag 0.2 s": Mechanics(lag_s=0.2), "0.1 s late": Mechanics(delay_s=0.1)}
 SETTINGS = ((2.0, 0.0), (4.0, 0.0), (8.0, 0.0), (4.0, 0.5), (8.0, 0.5), (8.0, 0.7))
 """Gain [1/s] and damping."""
 

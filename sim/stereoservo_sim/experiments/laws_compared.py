@@ -119,9 +119,13 @@ def report_laws(comparison: LawComparison) -> dict[str, Any]:
     """JSON report: a row a task and law."""
     rows = [_row(law, run) for runs in comparison.runs.values() for law, run in runs.items()]
     return {
-        "experiment": "laws", "rows": rows, "thesis": THESIS, "seed": comparison.seed, "noise_px": NOISE_PX,
+        "experiment": "laws",
+        "rows": rows,
+        "thesis": THESIS,
+        "seed": comparison.seed,
+        "noise_px": NOISE_PX,
         "calibration": "self",
-    }  # fmt: skip
+    }
 
 
 def _row(law: str, run: ComparedRun) -> dict[str, Any]:
@@ -139,17 +143,21 @@ def _row(law: str, run: ComparedRun) -> dict[str, Any]:
 def show_laws(answer: dict[str, Any], console: Console) -> None:
     """Print the rows; a view angle of 90° and more is the back, a negative margin is out of the image."""
     numbers = {
-        "error [px]": ("final_error_px", ".3f"), "off the line [mm]": ("line_deviation_mm", ".2f"),
-        "view angle [°]": ("worst_view_angle_deg", ".0f"), "room [px]": ("closest_view_px", ".0f"),
-    }  # fmt: skip
+        "error [px]": ("final_error_px", ".3f"),
+        "off the line [mm]": ("line_deviation_mm", ".2f"),
+        "view angle [°]": ("worst_view_angle_deg", ".0f"),
+        "room [px]": ("closest_view_px", ".0f"),
+    }
     lines = [
         [
-            f"{row['task']}, {row['angle_deg']:.0f}°, {row['distance_m']:.2f} m", row["law"],
-            "the goal" if row["success"] else row["reason"], str(row["iterations"]),
+            f"{row['task']}, {row['angle_deg']:.0f}°, {row['distance_m']:.2f} m",
+            row["law"],
+            "the goal" if row["success"] else row["reason"],
+            str(row["iterations"]),
             *("-" if row[key] is None else format(row[key], form) for key, form in numbers.values()),
         ]
         for row in answer["rows"]
-    ]  # fmt: skip
+    ]
     columns = dict.fromkeys(("task", "law", "comes to"), "left") | dict.fromkeys(("steps", *numbers), "right")
     whole_table(console, "laws on demanding tasks, self-calibrated, 25 Hz", columns, lines)
     console.print(f"thesis: {answer['thesis']['roll']}")
@@ -251,9 +259,14 @@ class World:
         knowledge = self.knowledge
         pixels, _ = project_points(knowledge.matrices, points)
         return Scene(
-            knowledge.basis, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points, pixels,
+            knowledge.basis,
+            int(knowledge.composition),
+            knowledge.matrices,
+            knowledge.camera_centres,
+            points,
+            pixels,
             np.ones(pixels.shape[:2]),
-        )  # fmt: skip
+        )
 
     def _known(self, pose: FloatArray) -> Knowledge:
         task = AlignmentTask(0, 0, 0.0, 0.0, np.array([1.0, 0.0, 0.0]), pose, pose)
@@ -400,9 +413,7 @@ AROUND_PX = 25.0
 """Drawn around the markers' tracks, so that what leaves the image shows beside its border."""
 LONGEST_S, EVERY = 16.0, 5
 """Of the curves over time: their length, and every how many steps a point is drawn."""
-TASKS = {
-    "large": "132° and 0.32 m", "roll": "half a turn, the face tilted by 60°", "bent": "117° and 0.39 m",
-}  # fmt: skip
+TASKS = {"large": "132° and 0.32 m", "roll": "half a turn, the face tilted by 60°", "bent": "117° and 0.39 m"}
 
 
 def draw_laws(comparison: LawComparison) -> dict[str, bytes]:

@@ -43,9 +43,14 @@ def lockstep(
         for name, text in (files or {}).items():
             (folder / name).write_text(text, "utf-8")
         with LockstepCell(
-            cell, cell_dir=folder, runtime_dir=folder, seed=seed, recording=recording, on_step=on_step,
+            cell,
+            cell_dir=folder,
+            runtime_dir=folder,
+            seed=seed,
+            recording=recording,
+            on_step=on_step,
             services=None if history is None else {"world": history},
-        ) as running:  # fmt: skip
+        ) as running:
             yield running, folder
 
 
@@ -99,9 +104,8 @@ def taught_and_reached(
     taught = msgspec.structs.replace(operator.taught["goal"], model_epoch=None)
     operator.goal(JointTarget(dict(zip(names, away.tolist(), strict=True))))
     event = operator.goal(
-        taught, law=law, tolerance_px=TOLERANCE_PX, hold_frames=HOLD_FRAMES, time_limit_s=LIMIT_S,
-        timeout_s=2 * LIMIT_S,
-    )  # fmt: skip
+        taught, law=law, tolerance_px=TOLERANCE_PX, hold_frames=HOLD_FRAMES, time_limit_s=LIMIT_S, timeout_s=2 * LIMIT_S
+    )
     operator.cell.run_for(REST_S)
     return event, taught
 

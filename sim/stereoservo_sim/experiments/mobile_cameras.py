@@ -133,14 +133,18 @@ def cell_of() -> CellFile:
     """The demo's cell with fakes for the arm and for four cameras, and a short calibration."""
     cameras = (
         CameraSection(
-            name, "fake", mobile=name in MOBILE,
+            name,
+            "fake",
+            mobile=name in MOBILE,
             options={
-                "view": view, "noise_px": NOISE_PX, "rate_hz": RATE_HZ,
+                "view": view,
+                "noise_px": NOISE_PX,
+                "rate_hz": RATE_HZ,
                 "moved": {"shift_m": list(moved.shift_m), "turn_deg": list(moved.turn_deg)},
             },
         )
         for name, (view, moved) in PLACES.items()
-    )  # fmt: skip
+    )
     return with_fake_arm(load_cell_file(demo_cell_path()), cameras, calibrates_fast=True)
 
 
@@ -263,11 +267,14 @@ def compare_mobile_cameras(answer: dict[str, Any]) -> list[Comparison]:
     reached, asked = sum(goal["reached"] for goal in answer["goals"]), len(answer["goals"])
     return [
         Comparison(
-            "fig. 9.1", "several cameras, mobile ones adjusted on-line against one tool", "further work",
-            f"{reached} of {asked} goals reached", "not comparable" if reached == asked else "not reproduced",
+            "fig. 9.1",
+            "several cameras, mobile ones adjusted on-line against one tool",
+            "further work",
+            f"{reached} of {asked} goals reached",
+            "not comparable" if reached == asked else "not reproduced",
             "the thesis sketches it and measures nothing",
         )
-    ]  # fmt: skip
+    ]
 
 
 def draw_mobile_cameras(answer: dict[str, Any]) -> Figures:

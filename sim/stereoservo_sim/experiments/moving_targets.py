@@ -47,8 +47,10 @@ ON_THE_ARM, STANDING, ON_A_HEAD = "on the arm", "standing", "on a pan-tilt head"
 CELLS = {ON_THE_ARM: "eye_in_hand", STANDING: "workpiece", ON_A_HEAD: "pan_tilt"}
 """Where the cameras are, and the shipped cell with them there."""
 LAWS: dict[str, tuple[LawName, ...]] = {
-    ON_THE_ARM: ("stereo", "cartesian3"), STANDING: ("stereo", "cartesian3"), ON_A_HEAD: ("image",),
-}  # fmt: skip
+    ON_THE_ARM: ("stereo", "cartesian3"),
+    STANDING: ("stereo", "cartesian3"),
+    ON_A_HEAD: ("image",),
+}
 
 
 class Way(NamedTuple):
@@ -63,9 +65,14 @@ class Way(NamedTuple):
 
 
 MOTIONS = {
-    "5 mm/s": Way(0.005), "20 mm/s": Way(0.02), "50 mm/s": Way(0.05), "±20 mm at 0.5 Hz": Way(0.0, 0.02, 0.5),
-    "turns at 0.1 rad/s": Way(turn=0.1), "turns at 0.3 rad/s": Way(turn=0.3), "turns at 0.5 rad/s": Way(turn=0.5),
-}  # fmt: skip
+    "5 mm/s": Way(0.005),
+    "20 mm/s": Way(0.02),
+    "50 mm/s": Way(0.05),
+    "±20 mm at 0.5 Hz": Way(0.0, 0.02, 0.5),
+    "turns at 0.1 rad/s": Way(turn=0.1),
+    "turns at 0.3 rad/s": Way(turn=0.3),
+    "turns at 0.5 rad/s": Way(turn=0.5),
+}
 RADIUS_M, TILT = 0.1, 0.1
 """Of a target on a turntable from its axis, and of the axis from the line of sight, at most [rad]."""
 SPEED_SHARE, STEP_S, DRAWS = 0.8, 0.05, 100
@@ -157,9 +164,11 @@ def motion_of(place: str, name: str, seed: int, since_ns: int) -> Motion:
         return next(motion for motion in drawn if share_of_speed(place, motion) <= SPEED_SHARE)
     direction = direction_of(cell, seed)
     return Motion(
-        velocity_m_s=_three(way.speed * direction), swing_m=_three(way.amplitude * direction), swing_hz=way.hz,
+        velocity_m_s=_three(way.speed * direction),
+        swing_m=_three(way.amplitude * direction),
+        swing_hz=way.hz,
         since_ns=since_ns,
-    )  # fmt: skip
+    )
 
 
 def direction_of(cell: SimulatedCell, seed: int) -> FloatArray:
@@ -184,9 +193,10 @@ def turntable_of(cell: SimulatedCell, turn: float, rng: np.random.Generator, sin
         beside = cell.marker_positions(cell.base).mean(axis=0) - middle
     beside = beside - axis * float(axis @ beside)
     return Motion(
-        turn_rate_deg_s=_three(np.rad2deg(turn) * axis), about_m=_three(RADIUS_M * beside / np.linalg.norm(beside)),
+        turn_rate_deg_s=_three(np.rad2deg(turn) * axis),
+        about_m=_three(RADIUS_M * beside / np.linalg.norm(beside)),
         since_ns=since_ns,
-    )  # fmt: skip
+    )
 
 
 def share_of_speed(place: str, motion: Motion) -> float:
@@ -245,9 +255,11 @@ def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> 
     judged_by = _judged_by(place, world)
     errors = np.array([_errors(world, motion.at(t), q)[judged_by] for t, q in judged[::3]])
     return Followed(
-        float(errors.max()), float(np.sqrt((errors**2).mean())), tuple(sorted(verdicts)),
+        float(errors.max()),
+        float(np.sqrt((errors**2).mean())),
+        tuple(sorted(verdicts)),
         "; ".join(reason.code for event in ends for reason in event.reasons),
-    )  # fmt: skip
+    )
 
 
 @contextmanager
@@ -354,14 +366,18 @@ def draw_moving_targets(answer: dict[str, Any]) -> Figures:
 
 Fault = Literal["camera bumped", "joint zero drifts", "joint zero jumps", "marker slipped"]
 FAULTS: dict[Fault, tuple[str, ...]] = {
-    "camera bumped": ("camera_moved",), "joint zero drifts": ("joint_zero", "JOINT_NOT_FOLLOWING"),
-    "joint zero jumps": ("joint_zero", "JOINT_NOT_FOLLOWING"), "marker slipped": ("marker_slipped",),
-}  # fmt: skip
+    "camera bumped": ("camera_moved",),
+    "joint zero drifts": ("joint_zero", "JOINT_NOT_FOLLOWING"),
+    "joint zero jumps": ("joint_zero", "JOINT_NOT_FOLLOWING"),
+    "marker slipped": ("marker_slipped",),
+}
 """What happens, and the verdicts and faults that name it."""
 FAULT_PX: dict[Fault, tuple[float, float]] = {
-    "camera bumped": (2.0, 10.0), "joint zero drifts": (2.0, 10.0), "joint zero jumps": (10.0, 40.0),
+    "camera bumped": (2.0, 10.0),
+    "joint zero drifts": (2.0, 10.0),
+    "joint zero jumps": (10.0, 40.0),
     "marker slipped": (2.0, 10.0),
-}  # fmt: skip
+}
 """How far it moves the markers that it moves in the images [px], rms."""
 BEFORE_S, AFTER_S = 1.5, 1.5
 """The target moves, then there is a fault, and the watch has so long to name it."""
@@ -558,9 +574,11 @@ def _slip_marker(
 
 
 _DISTURBANCES: dict[Fault, Callable[..., str]] = {
-    "camera bumped": _bump, "joint zero drifts": partial(_zero_off, over_ns=DRIFT_NS),
-    "joint zero jumps": partial(_zero_off, over_ns=JUMP_NS), "marker slipped": _slip_marker,
-}  # fmt: skip
+    "camera bumped": _bump,
+    "joint zero drifts": partial(_zero_off, over_ns=DRIFT_NS),
+    "joint zero jumps": partial(_zero_off, over_ns=JUMP_NS),
+    "marker slipped": _slip_marker,
+}
 """Each does it to a cell, and returns the subject that is to be named."""
 
 

@@ -354,9 +354,14 @@ def head_before_pictures(rng: np.random.Generator, positions: int) -> SeenHead:
     order = rng.permutation(np.flatnonzero(kept))
     seen = cell.with_body(points[order])
     tracks = Tracks(
-        tracked["pan"][:, :, order], tracked["tilt"][:, :, order], seen.pixels(pan), seen.pixels(tilt), pan,
-        tilt, "drifting",
-    )  # fmt: skip
+        tracked["pan"][:, :, order],
+        tracked["tilt"][:, :, order],
+        seen.pixels(pan),
+        seen.pixels(tilt),
+        pan,
+        tilt,
+        "drifting",
+    )
     return SeenHead(seen, tracks, general, tracked["general"][:, 1:, order], seen.pixels(general))
 
 
@@ -633,8 +638,11 @@ def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
             why = f"{row['perfect_calibration_delta_lr']['median']:.2f} px with the head known: noise"
             found.append(of_error("table 4.1", f"{row['condition']}: {name}", said[key], row[key]["median"], "px", why))
     moved = next(row for row in answer["rows"] if (row["condition"], row["noise"]) == ("feed-forward", "drifting"))
-    equal = [(row["condition"], row["delta_l"]["median"], row["delta_r"]["median"]) for row in answer["rows"]
-             if row["noise"] == "drifting" and row["condition"] != "feed-forward"]  # fmt: skip
+    equal = [
+        (row["condition"], row["delta_l"]["median"], row["delta_r"]["median"])
+        for row in answer["rows"]
+        if row["noise"] == "drifting" and row["condition"] != "feed-forward"
+    ]
     return [
         *found,
         *(

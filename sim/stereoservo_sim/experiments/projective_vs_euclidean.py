@@ -92,11 +92,16 @@ def compare_projective_vs_euclidean(answer: dict[str, Any]) -> list[Comparison]:
         own, exact = rows["projective", "triangulated", None], rows["metric", "triangulated", 0.0]
         apart = [row["line_deviation_mm"]["median"] for row in (own, exact)]
         found.append(
-            of_statement("8.7", f"{law}, projective beside an exact Euclidean model", "almost perfect overlap",
-                         f"{own['solved']} and {exact['solved']} of {answer['seeds']} solved; {apart[0]:.2g} and "
-                         f"{apart[1]:.2g} mm from the line", abs(apart[0] - apart[1]) <= 0.1 * apart[1]
-                         and abs(own["solved"] - exact["solved"]) <= 0.04 * answer["seeds"])
-        )  # fmt: skip
+            of_statement(
+                "8.7",
+                f"{law}, projective beside an exact Euclidean model",
+                "almost perfect overlap",
+                f"{own['solved']} and {exact['solved']} of {answer['seeds']} solved; {apart[0]:.2g} and "
+                f"{apart[1]:.2g} mm from the line",
+                abs(apart[0] - apart[1]) <= 0.1 * apart[1]
+                and abs(own["solved"] - exact["solved"]) <= 0.04 * answer["seeds"],
+            )
+        )
     asked = "the thesis asks for it as further work and has no figure"
     return [*found, Comparison("9.3", "growing metric errors", "-", "see the rows", "not comparable", asked)]
 
@@ -131,9 +136,14 @@ def draw_projective_vs_euclidean(answer: dict[str, Any]) -> Figures:
         rate = np.array([row["success_rate"] for row in metric])
         bounds = np.array([(row["wilson_low"], row["wilson_high"]) for row in metric])
         success.errorbar(
-            across, rate, yerr=np.abs(bounds - rate[:, None]).T, fmt="o-", color=colour, capsize=3,
+            across,
+            rate,
+            yerr=np.abs(bounds - rate[:, None]).T,
+            fmt="o-",
+            color=colour,
+            capsize=3,
             label=f"{law}, metric",
-        )  # fmt: skip
+        )
         success.axhline(level["success_rate"], color=colour, linestyle="--", label=f"{law}, projective")
         drawn = [row for row in metric if row["solved"]]
         deviation.plot(

@@ -802,18 +802,23 @@ def show_real_franka(answer: dict[str, Any], console: Console) -> None:
     """Tables of the held-out errors and of the figures beside the reference."""
     reference, told, few = answer["reference"], answer["uncertainty"], answer["few_poses"]
     flat, (low, high) = answer["table_flatness_mm"], told["interval"]
-    sides, others = (", ".join(f"{side:.2f}" for side in answer["tag_sides_mm"]),
-                     "–".join(f"{side:.2f}" for side in reference["tag_sides_mm"]))  # fmt: skip
+    sides, others = (
+        ", ".join(f"{side:.2f}" for side in answer["tag_sides_mm"]),
+        "–".join(f"{side:.2f}" for side in reference["tag_sides_mm"]),
+    )
     lines = [
         ["median [px]", f"{answer['median_px']:.3f}", f"{reference['median_px']}"],
         ["rms [px]", f"{answer['rms_px']:.3f}", f"{reference['rms_px']}"],
         ["tag sides [mm]", sides, others],
-        ["table flatness [mm]", answer["table_flatness_reason"] if flat is None else f"{flat:.3f}",
-         f"{reference['table_flatness_mm']}"],
+        [
+            "table flatness [mm]",
+            answer["table_flatness_reason"] if flat is None else f"{flat:.3f}",
+            f"{reference['table_flatness_mm']}",
+        ],
         ["predicted deviation, median [px]", f"{told['median_px']:.3f}", ""],
         ["inside 95 % ellipses", f"{told['inside']:.1%}", f"{low:.1%} to {high:.1%}"],
         ["largest error [predicted deviations]", f"{told['largest_sigmas']:.2f}", ""],
-    ]  # fmt: skip
+    ]
     title = "real-franka: held-out poses predicted from the arm's poses"
     whole_table(console, title, {"": "left", "ours": "right", "reference": "right"}, lines)
     console.print(

@@ -588,8 +588,10 @@ def _show_tables(rows: list[dict[str, Any]], setting: str, console: Console) -> 
 def draw_robot(answer: dict[str, Any]) -> Figures:
     """Tracks, residuals and errors."""
     painters = {
-        "tracks": (_draw_tracks, 5.8, 11), "residuals": (_draw_residuals, 6, 11), "errors": (_draw_errors, 5, 12),
-    }  # fmt: skip
+        "tracks": (_draw_tracks, 5.8, 11),
+        "residuals": (_draw_residuals, 6, 11),
+        "errors": (_draw_errors, 5, 12),
+    }
     found = {}
     for name, (painter, height, width) in painters.items():
         found[f"robot-{name}"] = picture(width, height)

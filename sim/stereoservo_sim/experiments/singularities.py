@@ -118,11 +118,16 @@ def run_singularities(seeds: int, seed: int = 0, progress: ProgressCall = silent
             low, high = wilson(reached, len(counted)) if counted else (0.0, 1.0)
             rows.append(
                 {
-                    "law": law, "singularity": kind, "reached": reached, "of": len(counted), "wilson_low": low,
-                    "wilson_high": high, "time_outs": sum("TIME_LIMIT" in v.codes for v in of_law),
+                    "law": law,
+                    "singularity": kind,
+                    "reached": reached,
+                    "of": len(counted),
+                    "wilson_low": low,
+                    "wilson_high": high,
+                    "time_outs": sum("TIME_LIMIT" in v.codes for v in of_law),
                     "seconds_median": float(np.median([v.seconds for v in of_law])) if of_law else None,
                 }
-            )  # fmt: skip
+            )
             lost += [msgspec.to_builtins(v) for v in of_law if v.outcome not in ("reached", "refused")]
     return {
         "title": f"singularities: cases {seed} to {seed + seeds - 1}",

@@ -429,14 +429,22 @@ def compare_tasks_abc(answer: dict[str, Any]) -> list[Comparison]:
         asked = ", ".join(f"{row['gain']:g}" for row in own)
         told = f"at gains {', '.join(f'{gain:g}' for gain in reached)} of {asked}"
         found.append(of_statement("fig. 8.6", f"task {name}, projective", "realized successfully", told, bool(reached)))
-    rates = [(row["rate_over_gain"], row["r_squared"]) for row in rows
-             if row["calibration"] == "projective" and row["converged"]]  # fmt: skip
+    rates = [
+        (row["rate_over_gain"], row["r_squared"])
+        for row in rows
+        if row["calibration"] == "projective" and row["converged"]
+    ]
     low, high, straight = min(r for r, _ in rates), max(r for r, _ in rates), min(r for _, r in rates)
     simple = all(row["converged"] for how in CALIBRATIONS for row in ends("A", how))
-    levels = [{"focal_error": FOCAL_ERROR, "hand_eye_error_deg": HAND_EYE_ERROR_DEG,
-               "A": "converges" if all(row["converged"] for row in ends("A", "coarse")) else "fails",
-               "B": "converges" if all(row["converged"] for row in ends("B", "coarse")) else "fails"},
-              *answer["coarser"]]  # fmt: skip
+    levels = [
+        {
+            "focal_error": FOCAL_ERROR,
+            "hand_eye_error_deg": HAND_EYE_ERROR_DEG,
+            "A": "converges" if all(row["converged"] for row in ends("A", "coarse")) else "fails",
+            "B": "converges" if all(row["converged"] for row in ends("B", "coarse")) else "fails",
+        },
+        *answer["coarser"],
+    ]
     failing = [level for level in levels if level["A"] == "converges" and level["B"] != "converges"]
     shown = failing[0] if failing else levels[-1]
     size = f"{shown['focal_error']:.0%} focal and {shown['hand_eye_error_deg']:g}° hand-eye error"

@@ -112,9 +112,7 @@ def fly(condition: TimingCondition, seed: int) -> list[TimedGoalResult]:
 def cell_of(condition: TimingCondition) -> CellFile:
     """The demo's cell with fakes for arm and cameras, and a short calibration."""
     cell = load_cell_file(demo_cell_path())
-    options = {
-        "rate_hz": RATE_HZ, "latency_s": LATENCY_S, "told_latency_s": condition.told_s, "noise_px": NOISE_PX,
-    }  # fmt: skip
+    options = {"rate_hz": RATE_HZ, "latency_s": LATENCY_S, "told_latency_s": condition.told_s, "noise_px": NOISE_PX}
     cameras = (
         msgspec.structs.replace(
             camera, driver="fake", detector="", options={**options, "phase_s": k * condition.skew_s}
@@ -163,9 +161,11 @@ class _Watch:
 def _figures(one: TimedGoalResult) -> dict[str, float]:
     goal = one.goal
     return {
-        "final_error_px": goal.final_error_px, "final_error_mm": goal.final_error_mm,
-        "line_deviation_mm": goal.max_line_deviation_mm, "innovation_px": one.innovation_px,
-    }  # fmt: skip
+        "final_error_px": goal.final_error_px,
+        "final_error_mm": goal.final_error_mm,
+        "line_deviation_mm": goal.max_line_deviation_mm,
+        "innovation_px": one.innovation_px,
+    }
 
 
 def _row(condition: TimingCondition, flown: list[TimedGoalResult], trigger: list[TimedGoalResult]) -> dict[str, Any]:

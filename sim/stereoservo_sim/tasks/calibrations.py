@@ -188,9 +188,8 @@ def known_at_start(calibration: TaskCalibration, task: AlignmentTask, joints: Fl
         chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero)
         points = model.marker_points @ chain.displacement(joints).T
         return Knowledge(
-            Composition.BASE_FIRST, matrices, centres, infinity, model.generators, points, model.joint_kinds,
-            model.zero,
-        )  # fmt: skip
+            Composition.BASE_FIRST, matrices, centres, infinity, model.generators, points, model.joint_kinds, model.zero
+        )
     shift, turn = readings(task.start)
     moved = exp_twist(np.tensordot(shift, model.generators[:3], axes=1))
     turned = exp_twist(np.tensordot(turn, model.generators[3:], axes=1))

@@ -267,9 +267,14 @@ class Controller:
             self._task = self._start(points)
         task = self._task._replace(centre=self._centre_weights @ points)
         scene = Scene(
-            self._operators, int(knowledge.composition), knowledge.matrices, knowledge.camera_centres, points,
-            self.estimate.pixels, self._wanted if self._coasts else seen * self._wanted,
-        )  # fmt: skip
+            self._operators,
+            int(knowledge.composition),
+            knowledge.matrices,
+            knowledge.camera_centres,
+            points,
+            self.estimate.pixels,
+            self._wanted if self._coasts else seen * self._wanted,
+        )
         if self._plans:
             if self._path is None:
                 self._path = plan_task_path(scene, task, joints, self._limits, knowledge.kinds)
@@ -616,19 +621,27 @@ class CoreController:
         return ""
 
     def _step(
-        self, arm: TaskArm, *commands: Command, observations: tuple[CameraObservation, ...] = (),
+        self,
+        arm: TaskArm,
+        *commands: Command,
+        observations: tuple[CameraObservation, ...] = (),
         model_update: ModelUpdate | None = None,
-    ) -> StepOutputs:  # fmt: skip
+    ) -> StepOutputs:
         self._now_ns += self._period_ns
         self._seq += 1
         requests = tuple(Request(self._seq, "task", command) for command in commands)
         joints = JointState(self._seq, self._now_ns, arm.joints.copy(), np.zeros(len(arm.joints)))
         outputs = self._core.step(
             StepInputs(
-                self._now_ns, self._period_ns, joints, observations, requests, driver_active=self._active,
+                self._now_ns,
+                self._period_ns,
+                joints,
+                observations,
+                requests,
+                driver_active=self._active,
                 model_update=model_update,
             )
-        )  # fmt: skip
+        )
         if outputs.driver_request:
             self._active = outputs.driver_request == "activate"
         if outputs.command is not None:
@@ -731,9 +744,12 @@ class PlannedPath:
         begin_s, self._time_s = self._time_s, advance(self.plan, self._time_s, dt_s, lag)
         planned = planned_joints(self.plan, begin_s, self._time_s, dt_s, joints)
         return task._replace(
-            set_points=set_points, rates=(self._set_points(scene) - set_points) / dt_s, joint_rates=planned.rates,
-            joint_error=planned.error, joint_weight=planned.weight,
-        )  # fmt: skip
+            set_points=set_points,
+            rates=(self._set_points(scene) - set_points) / dt_s,
+            joint_rates=planned.rates,
+            joint_error=planned.error,
+            joint_weight=planned.weight,
+        )
 
     def _set_points(self, scene: Scene) -> FloatArray:
         points = transform_points(sample_plan(self.plan, self._time_s).displacement, self._start)

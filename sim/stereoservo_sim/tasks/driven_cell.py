@@ -165,10 +165,15 @@ class DrivenCell:
         requests = tuple(Request(self._seq, "campaign", command) for command in commands)
         outputs = self.core.step(
             StepInputs(
-                self._now_ns, self._period_ns, joints, due, requests, driver_active=self._active,
+                self._now_ns,
+                self._period_ns,
+                joints,
+                due,
+                requests,
+                driver_active=self._active,
                 model_update=model_update,
             )
-        )  # fmt: skip
+        )
         self.verdicts += [event.name for event in outputs.events if event.kind == "health" and event.name != "ok"]
         if outputs.driver_request:
             self._active = outputs.driver_request == "activate"
@@ -180,9 +185,14 @@ class DrivenCell:
         return outputs
 
     def run_goal(
-        self, wanted: FloatArray, *, law: LawName | None = None, time_limit_s: float = TIME_LIMIT_S,
-        gain: float | None = None, damping: float | None = None,
-    ) -> GoalEnd:  # fmt: skip
+        self,
+        wanted: FloatArray,
+        *,
+        law: LawName | None = None,
+        time_limit_s: float = TIME_LIMIT_S,
+        gain: float | None = None,
+        damping: float | None = None,
+    ) -> GoalEnd:
         """Drive to set-points (c, m, 2) [px], of which the markers in view count, until an event ends the goal."""
         ids = self.cell.marker_ids
         inside = (wanted > -0.5).all(axis=-1) & (wanted < (self.cell.width - 0.5, self.cell.height - 0.5)).all(axis=-1)
@@ -264,10 +274,15 @@ class DrivenCell:
             seen = exact[c, there] + wrong.noise_px * self._rng.standard_normal((int(there.sum()), 2))
             self._pending.append(
                 CameraObservation(
-                    f"cam{c}", self._seq, self._now_ns, self._now_ns + round(1e9 * TRANSFER_S), ids[there], seen,
+                    f"cam{c}",
+                    self._seq,
+                    self._now_ns,
+                    self._now_ns + round(1e9 * TRANSFER_S),
+                    ids[there],
+                    seen,
                     np.tile(covariance, (len(seen), 1, 1)),
                 )
-            )  # fmt: skip
+            )
 
     def _links_at(self, t_ns: int) -> FloatArray:
         times = np.array([t for t, _ in self._past], dtype=np.float64)
@@ -310,4 +325,4 @@ def _settings(
         filter_s=0.2,
         gate_sigma=6.0,
         resolution=() if mechanics is None else tuple(joint.encoder_step for joint in mechanics),
-    )  # fmt: skip
+    )

@@ -185,9 +185,11 @@ def _pose(path: Path, number: int, row: dict[str, str], names: Sequence[str]) ->
     where = f"{names[0]} to {names[10]}"
     if not defect <= RIGID_TOLERANCE:
         raise TaskFileError(
-            path, number, where,
+            path,
+            number,
+            where,
             f"no rotation: RᵀR is off the identity by {defect:.3g}; at most {RIGID_TOLERANCE:g} is taken",
-        )  # fmt: skip
+        )
     if np.linalg.det(R) < 0.0:
         raise TaskFileError(path, number, where, "a mirror image: det R is -1; a rotation has determinant 1")
     return pose

@@ -58,11 +58,14 @@ class TwistArm:
         )  # nothing is read from files
         joints = [
             {
-                "name": joint.name, "min": joint.position_min, "max": joint.position_max,
-                "velocity": joint.velocity_max, "acceleration": joint.acceleration_max,
+                "name": joint.name,
+                "min": joint.position_min,
+                "max": joint.position_max,
+                "velocity": joint.velocity_max,
+                "acceleration": joint.acceleration_max,
             }
             for joint in self._robot.joints
-        ]  # fmt: skip
+        ]
         at = {joint.name: value for joint, value in zip(self._robot.joints, start.tolist(), strict=True)}
         inner = FakeJointDriver({"joints": joints, "start": at, "rate_hz": RATE_HZ}, context)
         options = TwistOptions(speeds=CONTROLLER_SPEEDS, accelerations=ACCELERATIONS)

@@ -42,9 +42,12 @@ class Conveyor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def running(self, since_ns: int) -> Motion:
         """The part's motion with the belt on from the monotonic time ``since_ns`` [ns]."""
         return Motion(
-            shift_m=self.begin_m, velocity_m_s=self.velocity_m_s, since_ns=since_ns, for_s=self.for_s,
+            shift_m=self.begin_m,
+            velocity_m_s=self.velocity_m_s,
+            since_ns=since_ns,
+            for_s=self.for_s,
             every_s=self.every_s,
-        )  # fmt: skip
+        )
 
 
 def conveyor_of(cell: CellFile) -> Conveyor | None:

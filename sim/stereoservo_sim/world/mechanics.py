@@ -205,9 +205,13 @@ def gear_offset(mechanics: Sequence[Mechanics], motor: FloatArray) -> FloatArray
 
 
 def gravity_torques(
-    points: FloatArray, axes: FloatArray, centres: FloatArray, masses: FloatArray,
-    gravity: FloatArray = GRAVITY, prismatic: BoolArray | None = None,
-) -> FloatArray:  # fmt: skip
+    points: FloatArray,
+    axes: FloatArray,
+    centres: FloatArray,
+    masses: FloatArray,
+    gravity: FloatArray = GRAVITY,
+    prismatic: BoolArray | None = None,
+) -> FloatArray:
     """Torques (n,) [N m] of gravity about revolute joints, positive about their axes; forces [N] along prismatic ones.
 
     ``points``, ``axes`` (n, 3): on and along each joint's axis. ``centres`` (n, 3) [m], ``masses`` (n,) [kg]: of the

@@ -80,11 +80,13 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
         try:
             body = int(
                 bullet.loadURDF(
-                    str(path), robot.mounted[:3, 3].tolist(),
+                    str(path),
+                    robot.mounted[:3, 3].tolist(),
                     bullet.getQuaternionFromEuler(roll_pitch_yaw(robot.mounted).tolist()),
-                    useFixedBase=True, physicsClientId=client,
+                    useFixedBase=True,
+                    physicsClientId=client,
                 )
-            )  # fmt: skip
+            )
         except bullet.error as error:
             raise PhysicsError(
                 f"pybullet cannot load {path}: {error} (are its meshes where it says? driver 'fake' and "
@@ -139,9 +141,13 @@ class PybulletPlant(RigidPlant):
         self._places = [loaded.moving.index(joint) for joint in loaded.joints]
         for joint, rest in loaded.beside.items():
             self._bullet.setJointMotorControl2(
-                self._arm, joint, self._bullet.POSITION_CONTROL, targetPosition=rest, force=MAX_TORQUE,
+                self._arm,
+                joint,
+                self._bullet.POSITION_CONTROL,
+                targetPosition=rest,
+                force=MAX_TORQUE,
                 physicsClientId=self._client,
-            )  # fmt: skip
+            )
         self.place(positions)
 
     def _pull(self, gravity: FloatArray) -> None:

@@ -76,9 +76,7 @@ UNFOLDED = 1.1
 MARGIN = 4.0
 """Distance of markers from the edge of the image [px]."""
 
-UR_ROWS: tuple[Row, ...] = (
-    (0, 90, 0.15), (-0.42, 0, 0), (-0.39, 0, 0), (0, 90, 0.13), (0, -90, 0.1), (0, 0, 0.08),
-)  # fmt: skip
+UR_ROWS: tuple[Row, ...] = ((0, 90, 0.15), (-0.42, 0, 0), (-0.39, 0, 0), (0, 90, 0.13), (0, -90, 0.1), (0, 0, 0.08))
 """Three parallel axes and a wrist whose axes do not meet, rows (a [m], alpha [°], d [m])."""
 
 

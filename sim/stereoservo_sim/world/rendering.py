@@ -497,9 +497,14 @@ class PybulletBackdrop(Backdrop):
         camera = self._cell.in_world(self._camera, q)
         view = (np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.world_to_camera).T.ravel().tolist()
         _, _, rgba, _, _ = self._bullet.getCameraImage(
-            camera.width // SHRINK, camera.height // SHRINK, viewMatrix=view, projectionMatrix=self._projection,
-            shadow=0, renderer=self._bullet.ER_TINY_RENDERER, physicsClientId=self._client,
-        )  # fmt: skip
+            camera.width // SHRINK,
+            camera.height // SHRINK,
+            viewMatrix=view,
+            projectionMatrix=self._projection,
+            shadow=0,
+            renderer=self._bullet.ER_TINY_RENDERER,
+            physicsClientId=self._client,
+        )
         grey = (
             np.reshape(rgba, (camera.height // SHRINK, camera.width // SHRINK, 4))[..., :3].mean(axis=-1) * BRIGHTNESS
         )

@@ -248,9 +248,7 @@ RX90_ROWS = ((0, -90, 0.42), (0.40, 0, 0), (0, 90, 0), (0, -90, 0.80), (0, 90, 0
 """Six revolute joints with a spherical wrist, rows (a [m], alpha [°], d [m]) after the Stäubli RX 90 (5.5)."""
 OFFSET_ROWS = ((0, -90, 0.36), (0.45, 0, 0.12), (0.4, 0, 0), (0, -90, 0.11), (0, 90, 0.095), (0, 0, 0.08))
 """Six revolute joints whose last three axes do not meet."""
-SEVEN_ROWS = (
-    (0, -90, 0.36), (0, 90, 0), (0, 90, 0.42), (0, -90, 0), (0, -90, 0.40), (0, 90, 0), (0, 0, 0.126),
-)  # fmt: skip
+SEVEN_ROWS = ((0, -90, 0.36), (0, 90, 0), (0, 90, 0.42), (0, -90, 0), (0, -90, 0.40), (0, 90, 0), (0, 0, 0.126))
 """Seven revolute joints, shoulder, elbow and wrist."""
 
 

@@ -78,11 +78,15 @@ def load_opencv(path: Path) -> tuple[RigCamera, ...]:
         R, t = (matrix(f"{one}{k}") if not pair or matrix(one) is None else matrix(one) for one in "RT")
         cameras.append(
             _camera(
-                path, name.string() if not name.empty() else f"camera{k}",
-                (number("image_width", k), number("image_height", k)), K, matrix(f"D{k}"),
-                R if k > 1 else None, t if k > 1 else None,
+                path,
+                name.string() if not name.empty() else f"camera{k}",
+                (number("image_width", k), number("image_height", k)),
+                K,
+                matrix(f"D{k}"),
+                R if k > 1 else None,
+                t if k > 1 else None,
             )
-        )  # fmt: skip
+        )
     if not cameras:
         raise _bad(path, "it has neither camera_matrix nor M1")
     return tuple(cameras)
@@ -93,9 +97,11 @@ def save_ros(cameras: Sequence[RigCamera], folder: Path) -> list[Path]:
     holds the relative pose. The pose of more than two cameras has no place in the format.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    rectified = _rectified(cameras) if len(cameras) == 2 else [
-        (np.eye(3), np.hstack([camera.matrix, np.zeros((3, 1))])) for camera in cameras
-    ]  # fmt: skip
+    rectified = (
+        _rectified(cameras)
+        if len(cameras) == 2
+        else [(np.eye(3), np.hstack([camera.matrix, np.zeros((3, 1))])) for camera in cameras]
+    )
     written = []
     for camera, (R, P) in zip(cameras, rectified, strict=True):
         tree = {
@@ -273,9 +279,14 @@ def _numbers(path: Path, tree: dict[str, Any], key: str) -> FloatArray:
 
 
 def _camera(
-    path: Path, name: str, size: tuple[int, int], K: FloatArray, D: FloatArray | None, R: FloatArray | None,
+    path: Path,
+    name: str,
+    size: tuple[int, int],
+    K: FloatArray,
+    D: FloatArray | None,
+    R: FloatArray | None,
     t: FloatArray | None,
-) -> RigCamera:  # fmt: skip
+) -> RigCamera:
     distortion = [] if D is None else D.ravel().tolist()
     if len(distortion) > 5 and any(distortion[5:]):
         raise _bad(path, f"camera {name!r} has {len(distortion)} coefficients; k1, k2, p1, p2, k3 are valid")
@@ -287,9 +298,14 @@ def _camera(
     x, y, z = (0.0, 0.0, 0.0) if t is None else t.ravel().tolist()
     kept = distortion[:5] if len(distortion) >= 5 and distortion[4] != 0.0 else [*distortion, 0.0, 0.0, 0.0, 0.0][:4]
     return RigCamera(
-        name, *size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])), tuple(kept),
-        tuple(map(tuple, R.tolist())), (x, y, z),
-    )  # fmt: skip
+        name,
+        *size,
+        (float(K[0, 0]), float(K[1, 1])),
+        (float(K[0, 2]), float(K[1, 2])),
+        tuple(kept),
+        tuple(map(tuple, R.tolist())),
+        (x, y, z),
+    )
 
 
 def _bad(path: Path, why: str) -> CalibrationError:

@@ -210,9 +210,13 @@ def _extrinsics(poses: FloatArray) -> FloatArray:
         count, j, k = max(common)
         if not count:
             raise refused(
-                "camera_apart", "a camera has no place of the board in common with another", 0, 1, " places",
+                "camera_apart",
+                "a camera has no place of the board in common with another",
+                0,
+                1,
+                " places",
                 "Hold it where two cameras at a time see it",
-            )  # fmt: skip
+            )
         both = np.flatnonzero(there[j] & there[k])
         motions = np.array([poses[k, i] @ np.linalg.inv(poses[j, i]) for i in both])
         turns = Rotation.from_matrix(motions[:, :3, :3])
@@ -258,9 +262,13 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
         scaled = scaled_plane(np.array([0.0, 0.0, 0.0, 1.0]), everywhere)
     if scaled is None:
         raise refused(
-            "no_upgrade", "no plane at infinity leaves the body in front of the cameras", 0, 1, " planes",
+            "no_upgrade",
+            "no plane at infinity leaves the body in front of the cameras",
+            0,
+            1,
+            " planes",
             "Turn the body about two axes, by 30 degrees or more, and hold it still for each picture",
-        )  # fmt: skip
+        )
     A = projective_to_euclidean(scaled, np.eye(3))
     affine = A @ motions @ np.linalg.inv(A)
     turning = 0.5 * (affine - np.linalg.inv(affine))
@@ -291,21 +299,33 @@ def _displacements(points: FloatArray, reference: int) -> FloatArray:
     if len(found) < 2:
         if flat:
             raise refused(
-                "flat_body", "the markers lie in one plane within their noise: places that show the body's depth",
-                len(found), 2, " places",
+                "flat_body",
+                "the markers lie in one plane within their noise: places that show the body's depth",
+                len(found),
+                2,
+                " places",
                 "State the layout (--board with --pitch, or --layout), or use a body with markers off one plane",
-            )  # fmt: skip
+            )
         raise refused(
-            "too_few_markers", "too few places show six markers in two cameras", len(found), 2, " places",
+            "too_few_markers",
+            "too few places show six markers in two cameras",
+            len(found),
+            2,
+            " places",
             "Turn the body so that two cameras at a time see the same six markers",
-        )  # fmt: skip
+        )
     return np.array(found)
 
 
 def _metric_start(
-    views: RigViews, cameras: FloatArray, points: FloatArray, reference: int, plane: FloatArray,
-    intrinsics: FloatArray, lenses: FloatArray,
-) -> RigStart:  # fmt: skip
+    views: RigViews,
+    cameras: FloatArray,
+    points: FloatArray,
+    reference: int,
+    plane: FloatArray,
+    intrinsics: FloatArray,
+    lenses: FloatArray,
+) -> RigStart:
     """The start in the Euclidean frame of ``plane`` (4,) and ``intrinsics`` (3, 3) [half widths]."""
     upgrade = projective_to_euclidean(plane, intrinsics)
     matrices = cameras @ np.linalg.inv(upgrade)
@@ -493,9 +513,14 @@ def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeT
     data, kept = replace(begun.data, pinhole_ties=ties), begun.kept
     for _ in range(ROUNDS):
         solution = solve(
-            rig, data.select(kept), "metric", generators=False, points=not begun.length_known, lenses=lenses,
+            rig,
+            data.select(kept),
+            "metric",
+            generators=False,
+            points=not begun.length_known,
+            lenses=lenses,
             max_evaluations=EVALUATIONS,
-        )  # fmt: skip
+        )
         data, rig = replace(data, offsets=solution.data.offsets), solution.rig
         fit = RigFit(begun.views, data, kept, begun.body_frame, begun.aspect, begun.length_known, solution)
         sizes = np.linalg.norm(fit.residuals, axis=1) / data.sigmas
@@ -550,7 +575,12 @@ def _measurements(views: RigViews, start: RigStart) -> tuple[Measurements, Float
     noise = JointNoise(own, np.full((s, 6), -1), np.zeros(0), np.zeros((s, 0)), np.zeros(6))
     camera, stop, marker = np.nonzero(views.seen)
     data = Measurements(
-        offsets, camera, stop, marker, views.pixels[camera, stop, marker], views.sigmas[camera, stop, marker],
+        offsets,
+        camera,
+        stop,
+        marker,
+        views.pixels[camera, stop, marker],
+        views.sigmas[camera, stop, marker],
         joint_noise=noise,
-    )  # fmt: skip
+    )
     return data, frame.as_matrix()

@@ -162,9 +162,13 @@ def _best_fit(views: RigViews, begun: list[RigStart]) -> RigFit:
     if not ended:
         raise _open(str(failure)) from failure
     raise refused(
-        "no_fit", "the fit did not converge: steps", ended[-1].solution.evaluations, EVALUATIONS, "",
+        "no_fit",
+        "the fit did not converge: steps",
+        ended[-1].solution.evaluations,
+        EVALUATIONS,
+        "",
         "The data leave the cameras open, or views are wrong: wave the body also tilted, near and far",
-    )  # fmt: skip
+    )
 
 
 def _turn_deviations(fit: RigFit) -> FloatArray:
@@ -210,25 +214,35 @@ def _require_fit(fit: RigFit) -> None:
     share = 1.0 - float(fit.kept.mean())
     if share > MOST_LEFT_OUT:
         raise refused(
-            "views_disagree", "measurements that fit no rigid body before cameras at rest", 100 * share,
-            100 * MOST_LEFT_OUT, " %",
+            "views_disagree",
+            "measurements that fit no rigid body before cameras at rest",
+            100 * share,
+            100 * MOST_LEFT_OUT,
+            " %",
             "Look for a camera that moved, markers that were mixed up, pictures not taken at one instant",
-        )  # fmt: skip
+        )
     noise = float(np.sqrt(fit.variance * np.mean(fit.data.sigmas[fit.kept] ** 2)))
     if noise > MOST_NOISE:
         raise refused(
-            "misfit", "the views do not fit cameras with radial and tangential distortion: noise", noise, MOST_NOISE,
+            "misfit",
+            "the views do not fit cameras with radial and tangential distortion: noise",
+            noise,
+            MOST_NOISE,
             " px",
             "Check the board's size, that pictures of one place are of one instant, and the lens: a fisheye is none",
-        )  # fmt: skip
+        )
     for camera, matrix in zip(fit.views.cameras, fit.rig.cameras, strict=True):
         K = decompose_camera(matrix)[0]
         off = max(abs(K[0, 2] / camera.width - 0.5), abs(K[1, 2] / fit.aspect / camera.height - 0.5))
         if not off <= OUTSIDE:
             raise refused(
-                "no_camera", f"the principal point of {camera.name!r} lies outside its picture: from the middle", off,
-                OUTSIDE, " image sizes", WAVE,
-            )  # fmt: skip
+                "no_camera",
+                f"the principal point of {camera.name!r} lies outside its picture: from the middle",
+                off,
+                OUTSIDE,
+                " image sizes",
+                WAVE,
+            )
 
 
 def _require_determined(result: RigCalibration) -> None:
@@ -414,9 +428,14 @@ def next_views(fit: RigFit, result: RigCalibration) -> list[ViewAdvice]:
             found.append(
                 ViewAdvice(
                     f"the body {where}: its focal length to {would:.3f} px from {now:.3f}",
-                    worst.name, place, tilt, distance, now, would,
+                    worst.name,
+                    place,
+                    tilt,
+                    distance,
+                    now,
+                    would,
                 )
-            )  # fmt: skip
+            )
     return sorted(found, key=lambda one: one.would_be_px)
 
 
@@ -456,9 +475,13 @@ def _rows(
     noise = fit.data.joint_noise
     assert noise is not None
     one = Measurements(
-        offsets[None], cameras, np.zeros(c * m, dtype=np.int64), markers, np.zeros((c * m, 2)),
+        offsets[None],
+        cameras,
+        np.zeros(c * m, dtype=np.int64),
+        markers,
+        np.zeros((c * m, 2)),
         np.full(c * m, float(np.median(fit.data.sigmas))),
-    )  # fmt: skip
+    )
     pixels = predicted(fit.rig, one)
     size = np.array([(one.width, one.height * fit.aspect) for one in result.cameras])[cameras]
     inside = np.asarray((np.isfinite(pixels) & (pixels > 0.0) & (pixels < size - 1.0)).all(axis=1))

@@ -96,10 +96,13 @@ def _require_stops(views: RigViews) -> None:
     for camera, mine in zip(views.cameras, by_camera, strict=True):
         if int(mine.sum()) < LEAST_STOPS:
             raise refused(
-                "too_few_views", f"camera {camera.name!r} saw the body at too few places", int(mine.sum()),
-                LEAST_STOPS, " places",
+                "too_few_views",
+                f"camera {camera.name!r} saw the body at too few places",
+                int(mine.sum()),
+                LEAST_STOPS,
+                " places",
                 "Wave it before every camera, at ten places or more, at least four markers in the picture",
-            )  # fmt: skip
+            )
     reached = {0}
     for _ in views.cameras:
         reached |= {k for k in range(len(views.cameras)) if any((by_camera[k] & by_camera[j]).any() for j in reached)}
@@ -109,30 +112,44 @@ def _require_stops(views: RigViews) -> None:
             "camera_apart",
             f"camera(s) {', '.join(apart)} never saw the body together with {views.cameras[0].name!r} or a camera "
             "that did",
-            0, 1, " places in common", "Hold it where two cameras at a time see it; a chain of pairs will do",
-        )  # fmt: skip
+            0,
+            1,
+            " places in common",
+            "Hold it where two cameras at a time see it; a chain of pairs will do",
+        )
 
 
 def _require_layout(views: RigViews) -> None:
     if views.layout is None:
         if len(views.cameras) < 2:
             raise refused(
-                "one_camera", "one camera alone cannot find where the markers of the body are", 1, 2, " cameras",
+                "one_camera",
+                "one camera alone cannot find where the markers of the body are",
+                1,
+                2,
+                " cameras",
                 "State the layout (--board with --pitch, or --layout), or use a second camera",
-            )  # fmt: skip
+            )
         return
     spread = np.linalg.svd(views.layout - views.layout.mean(axis=0), compute_uv=False)
     if not spread[1] > STRAIGHT * spread[0]:
         raise refused(
-            "markers_on_a_line", "the markers lie on one line: width of the layout, relative to its length",
-            float(spread[1] / spread[0]), STRAIGHT, "", "Use a board, or a body with markers beside that line",
-        )  # fmt: skip
+            "markers_on_a_line",
+            "the markers lie on one line: width of the layout, relative to its length",
+            float(spread[1] / spread[0]),
+            STRAIGHT,
+            "",
+            "Use a board, or a body with markers beside that line",
+        )
     if len(spread) > 2 and spread[2] > FLAT * spread[0]:
         raise refused(
-            "layout_not_flat", "the stated layout is no plane: its depth, relative to its length",
-            float(spread[2] / spread[0]), FLAT, "",
+            "layout_not_flat",
+            "the stated layout is no plane: its depth, relative to its length",
+            float(spread[2] / spread[0]),
+            FLAT,
+            "",
             "Leave the layout out, for a body in space is found with the cameras, and state one length (--length)",
-        )  # fmt: skip
+        )
 
 
 STILL_PX = 0.5
@@ -163,9 +180,11 @@ def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[Cam
     common = [(still.began, still.ended) for still in times[0]] if times else []
     for one in times[1:]:
         common = [
-            (max(a, still.began), min(b, still.ended)) for a, b in common for still in one
+            (max(a, still.began), min(b, still.ended))
+            for a, b in common
+            for still in one
             if min(b, still.ended) - max(a, still.began) >= HELD_S * 1e9
-        ]  # fmt: skip
+        ]
     pixels: list[FloatArray] = []
     sigmas: list[FloatArray] = []
     names: list[str] = []

@@ -98,9 +98,14 @@ def diagnose(
     sizes, answer = np.zeros(count, dtype=np.int64), np.zeros(3, dtype=np.int64)
     chi2, amounts, effects = np.zeros(count), np.zeros(count), np.zeros(count)
     seen = change_detection_kernel.Innovations(
-        np.ascontiguousarray(matrices), np.ascontiguousarray(X), markers, np.ascontiguousarray(e),
-        np.ascontiguousarray(w), np.ascontiguousarray(operators), np.zeros((0, 4, 4)) if twists is None else twists,
-    )  # fmt: skip
+        np.ascontiguousarray(matrices),
+        np.ascontiguousarray(X),
+        markers,
+        np.ascontiguousarray(e),
+        np.ascontiguousarray(w),
+        np.ascontiguousarray(operators),
+        np.zeros((0, 4, 4)) if twists is None else twists,
+    )
     found = change_detection_kernel.Explanations(sizes, chi2, amounts, effects, answer)
     change_detection_kernel.explain_innovations(
         plain(seen), thresholds.ratios, thresholds.log_alpha, thresholds.least_px, plain(found)

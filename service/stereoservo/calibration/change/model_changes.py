@@ -135,8 +135,12 @@ def known_measurements(model: CellModel, trials: TrialData, order: tuple[int, ..
     index = np.array([model.marker_ids.index(i) if i in model.marker_ids else -1 for i in trials.marker_ids])
     return Measurements(
         (trials.positions - model.zero)[:, list(order)],
-        camera, stop, index[marker], trials.pixels[camera, stop, marker], trials.sigmas[camera, stop, marker],
-    )  # fmt: skip
+        camera,
+        stop,
+        index[marker],
+        trials.pixels[camera, stop, marker],
+        trials.sigmas[camera, stop, marker],
+    )
 
 
 def linearised_problem(

@@ -429,13 +429,17 @@ def _unexplained(
     rms_px = float(np.sqrt((squares * problem.data.sigmas**2).mean()))
     what = "the rest is" if also else "residuals are"
     return FoundCause(
-        "unexplained", model.cameras[c].name, found.chi2, found.left.size - found.x.size, rms_px,
+        "unexplained",
+        model.cameras[c].name,
+        found.chi2,
+        found.left.size - found.x.size,
+        rms_px,
         f"{what} {left:.3g} times the expected noise and no single cause explains it: most in camera "
         f"{model.cameras[c].name} ({by_camera[c]:.3g} times), at marker {worst} ({by_marker[worst]:.3g} times) and "
         f"{_describe_stop(model, problem, stop)} ({by_stop[stop]:.3g} times). Noise of the images (light, focus, "
         "dirt), play in a joint, joints listed in another order than they follow each other, or several "
         "changes at once",
-    )  # fmt: skip
+    )
 
 
 def _describe_stop(model: CellModel, problem: LinearisedProblem, stop: int) -> str:
@@ -512,10 +516,14 @@ def reset_zeros(
     )
     after = float(np.sqrt(rest.chi2 / max(1, report.measurements - drift.size)))
     reset = ZeroReset(
-        epoch, model.epoch, joints, report.sigmas, after,
+        epoch,
+        model.epoch,
+        joints,
+        report.sigmas,
+        after,
         f"zeros reset in model epoch {epoch}: {told}; residuals {report.sigmas:.3g} times the expected noise before, "
         f"{after:.3g} times after. Teach the goals of epoch {model.epoch} again",
-    )  # fmt: skip
+    )
     return msgspec.structs.replace(
         model, epoch=epoch, created=created, source=source, zero=zero, refined_from=0, in_place_of=0,
         covariance=None if stated is None else _with_zeros(model, stated, problem, rest, covariance),
@@ -706,8 +714,12 @@ def _fit_line(line: list[Drift], days: FloatArray, limit_px: float) -> DriftTren
     aa, ab, bb = (float(u @ information @ v) * scale**2 for u, v in ((now, now), (now, b), (b, b)))
     left = _crossing(aa, ab, bb, limit_px)
     speed = float(np.sqrt(bb))
-    what = {"joint": "the zero of joint {}", "camera": "the place of camera {}", "cameras": "the place of the cameras",
-            "body": "the place of the marker body"}[last.kind].format(last.subject)  # fmt: skip
+    what = {
+        "joint": "the zero of joint {}",
+        "camera": "the place of camera {}",
+        "cameras": "the place of the cameras",
+        "body": "the place of the marker body",
+    }[last.kind].format(last.subject)
     text = f"{what} has changed steadily over {len(line)} checks, by {speed * 30:.3g} px a month"
     if left == 0.0:
         text += f"; it is beyond the limit of {limit_px:g} px"

@@ -128,8 +128,9 @@ def refine_model(
             f"not refined: at each of {poses} rest poses, a model refined by the others "
             f"predicts the pixels to {after:.3g} px rms, the one in use to {before:.3g}: better by {score:.1f} "
             f"deviations of chance, {limit:.1f} are needed. The model in use stays",
-            score=score, limit=limit,
-        )  # fmt: skip
+            score=score,
+            limit=limit,
+        )
     whole = estimate_step(base, data)
     if whole.chi2 > whole.limit:
         raise CalibrationError(
@@ -137,8 +138,9 @@ def refine_model(
             f"not refined: the step away from calibrated model epoch {base.epoch} has chi-square {whole.chi2:.0f} by "
             f"that model's covariance, {whole.limit:.0f} is allowed: the model does not fit any more. Check it "
             "(`calibrate --check`), or calibrate anew",
-            chi2=whole.chi2, limit=whole.limit,
-        )  # fmt: skip
+            chi2=whole.chi2,
+            limit=whole.limit,
+        )
     model = _refined(base, whole, created)
     report = RefinementReport(
         base.epoch, poses, before, after, score, limit, whole.chi2, whole.limit,
@@ -242,9 +244,13 @@ def _refined(base: CellModel, step: RefinementStep, created: str) -> CellModel:
     stated = base.covariance
     assert stated is not None
     model = msgspec.structs.replace(
-        displaced_model(base, step.x), epoch=0, created=created, statistics=base.statistics,
-        covariance=msgspec.structs.replace(stated, covariance=step.covariance), refined_from=base.epoch,
-    )  # fmt: skip
+        displaced_model(base, step.x),
+        epoch=0,
+        created=created,
+        statistics=base.statistics,
+        covariance=msgspec.structs.replace(stated, covariance=step.covariance),
+        refined_from=base.epoch,
+    )
     return model if not base.scene_ids else _with_scene(base, model)
 
 

@@ -106,9 +106,10 @@ def step_of_camera(
     forms, single = _forms(views)
     mine = every[(single if frames is None else frames & single)[every]]
     tracks = [
-        track for i in (range(views.pixels.shape[1]) if marker is None else (marker,))
+        track
+        for i in (range(views.pixels.shape[1]) if marker is None else (marker,))
         if (track := _track(views, mine, i, forms, marker is None)) is not None
-    ]  # fmt: skip
+    ]
     if len(mine) < 2 * LASTING + 1 or not tracks:
         return None
     # A step between two of the frames may be at any of those between them.
@@ -366,9 +367,14 @@ def best_change(
 
 
 def change_of(
-    problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset: int, span: tuple[int, int], x: float,
+    problem: ExaminedFrames,
+    views: RecordedViews,
+    one: Hypothesis,
+    onset: int,
+    span: tuple[int, int],
+    x: float,
     deviation: float,
-) -> ChangePoint:  # fmt: skip
+) -> ChangePoint:
     """A change of one known parameter, from ``onset`` on: what it does to the pixels."""
     frames = _frames_of(_Candidate(one, True, onset, 0.0), views, onset)
     rows = frames[problem.data.stop]

@@ -155,10 +155,12 @@ def _better(views: RecordedViews, reference: ReferenceModel) -> tuple[RecordedVi
         if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
             offsets = reference.offsets + again.offsets
             alike = [
-                other.hypothesis for other in steps
-                if other is not step and other.share >= ALIKE * step.share
+                other.hypothesis
+                for other in steps
+                if other is not step
+                and other.share >= ALIKE * step.share
                 and max(step.span[0], other.span[0]) <= min(step.span[1], other.span[1])
-            ]  # fmt: skip
+            ]
             step = step._replace(beside=alike[0] if alike else None)
             return again.put_right(mended), replace(again, offsets=offsets), step
     return None
@@ -203,9 +205,13 @@ def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset:
     if not known[best]:
         return _Step(one, 0, (0, 0), 0.0, np.inf, 0.0)
     return _Step(
-        one, int(onsets[best]), (int(onsets[first]), int(onsets[last])), float(-moment[best] / information[best]),
-        float(np.sqrt(level / information[best])), float(gain[best]) / max(chi2, 1e-300),
-    )  # fmt: skip
+        one,
+        int(onsets[best]),
+        (int(onsets[first]), int(onsets[last])),
+        float(-moment[best] / information[best]),
+        float(np.sqrt(level / information[best])),
+        float(gain[best]) / max(chi2, 1e-300),
+    )
 
 
 def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> ChangePoint:
@@ -246,9 +252,13 @@ RecordingCauseKind = Literal[
     "joint_errors", "unexplained", "not_learnt",
 ]  # fmt: skip
 _KINDS: dict[str, RecordingCauseKind] = {
-    "camera": "camera_moved", "cameras": "cameras_moved", "body": "body_moved", "marker": "marker_slipped",
-    "joint": "joint_zero", "stamps": "late_stamps",
-}  # fmt: skip
+    "camera": "camera_moved",
+    "cameras": "cameras_moved",
+    "body": "body_moved",
+    "marker": "marker_slipped",
+    "joint": "joint_zero",
+    "stamps": "late_stamps",
+}
 
 _REFUSALS: dict[str, RecordingCauseKind] = {
     "camera_moved": "camera_moved",
@@ -357,13 +367,18 @@ def examine_views(views: RecordedViews) -> RecordingReport:
     causes += _joint_errors(reference) + _unexplained(model, views, problem)
     left = _residuals_px(problem)
     return RecordingReport(
-        _rms(left), _rms(before), float(np.median(problem.data.sigmas)), model.stratum,
-        _by_camera(views, problem, left, tested, found, dropped), _by_joint(views, problem, left),
+        _rms(left),
+        _rms(before),
+        float(np.median(problem.data.sigmas)),
+        model.stratum,
+        _by_camera(views, problem, left, tested, found, dropped),
+        _by_joint(views, problem, left),
         {str(e): _rms(left[views.episodes[problem.data.stop] == e]) for e in np.unique(views.episodes).tolist()},
         tuple(sorted(causes, key=_when)),
         (*views.notes, *(() if reference.report is None else reference.report.notes)),
-        _learnt_from(reference), int(outliers.sum()),
-    )  # fmt: skip
+        _learnt_from(reference),
+        int(outliers.sum()),
+    )
 
 
 def _learnt_from(reference: ReferenceModel) -> tuple[int, int, int] | None:
@@ -376,9 +391,11 @@ def _offsets(
     """Offsets (c,) [s] of stamps that were put right before the model was learnt, as changes."""
     return [
         change_of(problem, views, one, 0, (0, 0), float(offsets[c]), LEAST_DEVIATION_S)
-        for c, camera in enumerate(views.cameras) if offsets[c] != 0.0
-        for one in tested if one.kind == "stamps" and one.subject == camera.name
-    ]  # fmt: skip
+        for c, camera in enumerate(views.cameras)
+        if offsets[c] != 0.0
+        for one in tested
+        if one.kind == "stamps" and one.subject == camera.name
+    ]
 
 
 def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
@@ -386,11 +403,14 @@ def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
     kept: list[ChangePoint] = []
     for one in found:
         same = [
-            k for k, other in enumerate(kept)
-            if len(one.x) == 1 and one.hypothesis.kind == other.hypothesis.kind
-            and one.hypothesis.subject == other.hypothesis.subject and one.after == other.after
+            k
+            for k, other in enumerate(kept)
+            if len(one.x) == 1
+            and one.hypothesis.kind == other.hypothesis.kind
+            and one.hypothesis.subject == other.hypothesis.subject
+            and one.after == other.after
             and abs(one.onset - other.onset) <= SAME_ONSET
-        ]  # fmt: skip
+        ]
         if same:
             other = kept[same[0]]
             x = other.x + one.x
@@ -404,9 +424,13 @@ def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
         for k, one in enumerate(kept):
             if one.hypothesis == early.hypothesis and one.throughout and _cancel(one, early):
                 kept[k] = replace(
-                    one, onset=early.onset, span=early.span, frames=one.frames & ~early.frames,
-                    rows=one.rows & ~early.rows, effect=one.effect[~early.rows[one.rows]],
-                )  # fmt: skip
+                    one,
+                    onset=early.onset,
+                    span=early.span,
+                    frames=one.frames & ~early.frames,
+                    rows=one.rows & ~early.rows,
+                    effect=one.effect[~early.rows[one.rows]],
+                )
                 kept = [other for other in kept if other is not early]
                 break
     return kept
@@ -683,10 +707,10 @@ def _by_camera(
             estimate = estimate_changes(problem.select(mine), (late[camera.name].change,))
             deviation = 1.0 / math.sqrt(max(float(estimate.information[0, 0]), 1e-12))
             known = [
-                one for one in found
-                if one.hypothesis.kind == "stamps" and one.throughout
-                and one.hypothesis.subject in ("", camera.name)
-            ]  # fmt: skip
+                one
+                for one in found
+                if one.hypothesis.kind == "stamps" and one.throughout and one.hypothesis.subject in ("", camera.name)
+            ]
             if known:
                 own = max(LEAST_DEVIATION_S, *(float(np.sqrt(one.covariance[0, 0])) for one in known))
                 offset = sum(float(one.x[0]) for one in known), own

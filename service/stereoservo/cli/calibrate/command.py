@@ -287,8 +287,9 @@ def _must_be_idle(client: Client) -> None:
             "not_idle",
             f"no check: the cell is {state.lifecycle if state.lifecycle != 'active' else doing}; an unattended check "
             "waits for nothing and enables nothing. Enable the cell, or choose another hour",
-            lifecycle=state.lifecycle, source=state.source,
-        )  # fmt: skip
+            lifecycle=state.lifecycle,
+            source=state.source,
+        )
 
 
 def _with_bar(client: Client, what: str, run: Any) -> Any:

@@ -161,10 +161,11 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
     pictures = {
         folder.name: {
             path.stem.replace(folder.name, ""): path
-            for path in sorted(folder.glob("*")) if path.suffix.lower() in PICTURES
+            for path in sorted(folder.glob("*"))
+            if path.suffix.lower() in PICTURES
         }
         for folder in folders
-    }  # fmt: skip
+    }
     pictures = {name: files for name, files in pictures.items() if files}
     if not pictures:
         raise CommandError(

@@ -153,8 +153,9 @@ def _must_not_run(name: str) -> None:
             f"the daemon of cell {name!r} runs (pid {pid or 'unknown'}): it would keep its model and silently take "
             "this one at its next start. Either give --output FILE.json in another directory than "
             f"{directories.models}, or stop the daemon and run this again",
-            cell=name, pid=pid,
-        )  # fmt: skip
+            cell=name,
+            pid=pid,
+        )
 
 
 def _must_fit(file: CellFile, data: Any, path: Path) -> None:
@@ -485,8 +486,9 @@ class RecordedTrialCollector:
                 f"none of {len(self._stops)} rests of the flight recording has pictures with enough markers "
                 f"({self.used} frames fall into rests): do pictures and flight belong together, and does the cell's "
                 "detector find its markers in them?",
-                rests=len(self._stops), frames=self.used,
-            )  # fmt: skip
+                rests=len(self._stops),
+                frames=self.used,
+            )
         base = self._base([joints for _, joints in seen])
         near = SAME_POSITION * self.settings.arrival
         events: list[Event] = []

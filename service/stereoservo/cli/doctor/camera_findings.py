@@ -73,9 +73,11 @@ def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Examinati
         return
     if len(record.seen) < 2:
         yield ExaminationFinding(
-            what, False, f"{len(record.seen)} frames while it was watched; at least 2 are needed",
+            what,
+            False,
+            f"{len(record.seen)} frames while it was watched; at least 2 are needed",
             f"[camera.options] of {record.name!r}: source; is another program using the camera?",
-        )  # fmt: skip
+        )
         return
     yield _rate(record)
     yield from _server_clock(record)
@@ -98,11 +100,13 @@ def _server_clock(record: CameraRecord) -> list[ExaminationFinding]:
         return [ExaminationFinding(name, True, told)]
     return [
         ExaminationFinding(
-            name, None, f"its stamps are refused: {told}",
+            name,
+            None,
+            f"its stamps are refused: {told}",
             "watch for longer (--seconds 20), keep the network free, let the server follow an NTP clock slowly; "
             "meanwhile the time of reception less latency_s counts",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _rate(record: CameraRecord) -> ExaminationFinding:
@@ -130,13 +134,17 @@ def _rate(record: CameraRecord) -> ExaminationFinding:
     delivered = rate + max(missing, 0) / (1e-3 * float(gaps_ms.sum())) if counted is None else rate
     if delivered >= HELD_RATE * asked:
         return ExaminationFinding(
-            f"{record.name} rate", None, summary,
+            f"{record.name} rate",
+            None,
+            summary,
             f"the camera delivers {delivered:.0f} Hz, this computer keeps up with {rate:.1f}: end what else it does",
-        )  # fmt: skip
+        )
     return ExaminationFinding(
-        f"{record.name} rate", None, summary,
+        f"{record.name} rate",
+        None,
+        summary,
         f"more light for a shorter exposure, or rate_hz = {rate:.0f}, which is what it holds",
-    )  # fmt: skip
+    )
 
 
 def _latency(record: CameraRecord) -> ExaminationFinding:
@@ -144,9 +152,11 @@ def _latency(record: CameraRecord) -> ExaminationFinding:
     summary = f"{np.median(ms):.1f} ms from shutter to reception by its driver's word, at most {ms.max():.1f}"
     if ms.max() <= 0.0:
         return ExaminationFinding(
-            f"{record.name} latency", None, f"{summary}: none is stated",
+            f"{record.name} latency",
+            None,
+            f"{summary}: none is stated",
             "latency_s of its options; `stereoservo status` tells it once the arm has moved",
-        )  # fmt: skip
+        )
     return ExaminationFinding(f"{record.name} latency", True, summary)
 
 
@@ -158,19 +168,25 @@ def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
     summary = f"{np.median(counts):.0f} of {known} seen (median), at least {counts.min()}; {min_markers} are needed"
     if counts.max() == 0 and record.flipped:
         return ExaminationFinding(
-            name, False, f"none is seen, but {record.flipped} in the mirror image",
+            name,
+            False,
+            f"none is seen, but {record.flipped} in the mirror image",
             "print the plate again, not mirrored; or undo the camera's flip (option flip)",
-        )  # fmt: skip
+        )
     if counts.max() == 0:
         return ExaminationFinding(
-            name, False, f"none of {known} is seen; look at the picture",
+            name,
+            False,
+            f"none of {known} is seen; look at the picture",
             "the plate in view, light on it, lens cap off; polarity, dictionary, landmarks of detector_options",
-        )  # fmt: skip
+        )
     if steady < STEADY_MARKERS:
         return ExaminationFinding(
-            name, False, f"{summary}; enough in {100 * steady:.0f} % of the frames",
+            name,
+            False,
+            f"{summary}; enough in {100 * steady:.0f} % of the frames",
             "more light, a nearer or larger plate, less tilt; or calibration.min_markers",
-        )  # fmt: skip
+        )
     sigma = float(np.median([np.sqrt(0.5 * np.trace(C)) for C in record.seen[-1].covariances]))
     return ExaminationFinding(name, True, f"{summary}; standard deviation {sigma:.3f} px{_scatter(record)}")
 
@@ -182,9 +198,11 @@ def _refused(record: CameraRecord) -> ExaminationFinding:
         by_reason.setdefault(reason, []).append("" if marker < 0 else str(marker))
     told = [f"{', '.join(ids)}: {reason}".removeprefix(": ") for reason, ids in by_reason.items()]
     return ExaminationFinding(
-        f"{record.name} refused", None, f"not reported in the newest picture: {'; '.join(told)}",
+        f"{record.name} refused",
+        None,
+        f"not reported in the newest picture: {'; '.join(told)}",
         "better light, the part nearer, its file; or the limits in detector_options",
-    )  # fmt: skip
+    )
 
 
 def _scatter(record: CameraRecord) -> str:
@@ -239,10 +257,11 @@ def _picture_quality(name: str, image: ImageArray, observation: CameraObservatio
         yield ExaminationFinding(f"{name} contrast", True, summary)
     if saturated > MUCH_SATURATED:
         yield ExaminationFinding(
-            f"{name} exposure", None,
+            f"{name} exposure",
+            None,
             f"{100 * saturated:.0f} % of the pixels around the markers are white to the limit: edges are cut",
             "shorter exposure, less gain",
-        )  # fmt: skip
+        )
     summary = f"edges at the markers are blurred by {blur:.1f} px"
     sharp = bool(blur <= WIDE_EDGE_PX)
     remedy = "" if sharp else "focus the lens at the plate; shorter exposure where it moves"
@@ -256,9 +275,10 @@ def examine_skew(records: Sequence[CameraRecord]) -> Iterator[ExaminationFinding
         intervals = first.shutters_ns[:, None] - second.shutters_ns[None, :]
         nearest = intervals[np.arange(len(intervals)), np.abs(intervals).argmin(axis=1)] * 1e-6
         yield ExaminationFinding(
-            f"skew {first.name}-{second.name}", True,
+            f"skew {first.name}-{second.name}",
+            True,
             f"{np.median(nearest):+.1f} ms (median; {np.abs(nearest).max():.1f} at most): used, each at its own time",
-        )  # fmt: skip
+        )
 
 
 def mean_observations(record: CameraRecord) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
@@ -285,7 +305,8 @@ def near_border(record: CameraRecord) -> ExaminationFinding | None:
     if not close.size:
         return None
     return ExaminationFinding(
-        f"{record.name} view", None,
+        f"{record.name} view",
+        None,
         f"markers {close.tolist()} are within {EDGE_PX} px of the picture's border: they leave it with the next motion",
         "aim the camera so that the plate stands near the middle at calibration.base",
-    )  # fmt: skip
+    )

@@ -100,10 +100,13 @@ class WatchedCamera:
         if now is not None:
             before = self._began or CameraStatistics()
             self.record.statistics = CameraStatistics(
-                frames=now.frames - before.frames, dropped=now.dropped - before.dropped,
-                frozen=now.frozen - before.frozen, reconnects=now.reconnects - before.reconnects,
-                settings=now.settings, server_clock=now.server_clock,
-            )  # fmt: skip
+                frames=now.frames - before.frames,
+                dropped=now.dropped - before.dropped,
+                frozen=now.frozen - before.frozen,
+                reconnects=now.reconnects - before.reconnects,
+                settings=now.settings,
+                server_clock=now.server_clock,
+            )
             self.record.watched_s = time.monotonic() - self._began_s
         frame = self.record.frame
         none = not any(o.ids.size for o in self.record.seen)
@@ -215,7 +218,7 @@ def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
         cv2.circle(picture, centre, max(16, round(16 * 100 * sigma)), RED, 1, cv2.LINE_AA, 4)
         cv2.putText(
             picture, str(marker), (round(u) + 10, round(v) - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.4, GREEN, 1, cv2.LINE_AA
-        )  # fmt: skip
+        )
     caption = f"{observation.camera}: {observation.ids.size} markers; red: 100 standard deviations"
     cv2.putText(picture, caption, (8, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, GREEN, 1, cv2.LINE_AA)
     return np.asarray(picture, dtype=np.uint8)
@@ -268,9 +271,10 @@ def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> I
     if moving:
         told = ", ".join(f"by {scatter:.1f} px in {name}" for name, scatter in moving.items())
         yield ExaminationFinding(
-            "views " + "-".join(record.name for record in seen), None,
+            "views " + "-".join(record.name for record in seen),
+            None,
             f"the markers move meanwhile ({told}): views are compared where the arm stands",
-        )  # fmt: skip
+        )
         return
     cameras = [] if model is None else [c for r in seen for c in model.cameras if c.name == r.name]
     if len(cameras) == len(seen):
@@ -326,10 +330,11 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
                 "exchange their sources, or their cables; none has moved",
             )
     return ExaminationFinding(
-        name, False,
+        name,
+        False,
         f"{summary}; {FITS_PX:g} is the limit for cameras that stand where they stood: one has moved or zoomed",
         "re-anchor it (the running daemon does, once it sees enough), or `stereoservo calibrate`",
-    )  # fmt: skip
+    )
 
 
 def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFinding:
@@ -353,9 +358,11 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFindin
         return ExaminationFinding(name, True, summary)
     off = [marker for marker, inside in zip(ids, inliers, strict=True) if not inside]
     return ExaminationFinding(
-        name, False, f"{summary}; markers {off} do not",
+        name,
+        False,
+        f"{summary}; markers {off} do not",
         "are they mistaken for others, or is there a second plate in view?",
-    )  # fmt: skip
+    )
 
 
 def same_camera_twice(records: Sequence[CameraRecord], pixels: float = SAME_PX) -> ExaminationFinding | None:
@@ -368,10 +375,11 @@ def same_camera_twice(records: Sequence[CameraRecord], pixels: float = SAME_PX) 
                 continue
             if abs(at - where).max() <= pixels:
                 return ExaminationFinding(
-                    f"cameras {first.name}-{second.name}", False,
+                    f"cameras {first.name}-{second.name}",
+                    False,
                     f"{first.name!r} and {second.name!r} show one and the same picture: one camera given twice",
                     "camera.options of one of them: source",
-                )  # fmt: skip
+                )
     return None
 
 
@@ -395,9 +403,11 @@ def examine_coverage(
         summary = f"{100 * share:.0f} % of the markers' places in the calibrated range are in the picture"
         wide = share >= WORKSPACE_SHARE
         yield ExaminationFinding(
-            f"{record.name} coverage", True if wide else None, summary,
+            f"{record.name} coverage",
+            True if wide else None,
+            summary,
             "" if wide else "a shorter lens, more distance, or goals that keep to the middle",
-        )  # fmt: skip
+        )
 
 
 def _corners(trials: TrialSettings) -> FloatArray:

@@ -134,10 +134,11 @@ def _values(plan: RunPlan, states: list[JointState]) -> ExaminationFinding:
     for what, values in (("positions", newest.positions), ("velocities", newest.velocities)):
         if np.shape(values) != (len(names),) or not np.isfinite(values).all():
             return ExaminationFinding(
-                "joint positions", False,
+                "joint positions",
+                False,
                 f"{what} are {np.asarray(values).tolist()}; {len(names)} finite ones are needed",
                 f"the joint driver {plan.joints.driver!r}",
-            )  # fmt: skip
+            )
     limits = {limit.joint: limit for limit in plan.cell.safety.limit}
     outside = [
         f"{name} is at {q:.4g}, its limits are {limits[name].min:g} to {limits[name].max:g}"
@@ -146,9 +147,11 @@ def _values(plan: RunPlan, states: list[JointState]) -> ExaminationFinding:
     ]
     if outside:
         return ExaminationFinding(
-            "joint positions", False, "; ".join(outside),
+            "joint positions",
+            False,
+            "; ".join(outside),
             "move the arm by hand, or mend zeros, directions and units of [joints.options], or [[safety.limit]]",
-        )  # fmt: skip
+        )
     told = ", ".join(f"{name} {q:.4g}" for name, q in zip(names, newest.positions.tolist(), strict=True))
     return ExaminationFinding("joint positions", True, f"{told} [rad or m], within the cell's limits")
 
@@ -166,7 +169,9 @@ def _stamps(plan: RunPlan, states: list[JointState], ages: list[float]) -> Exami
         return ExaminationFinding("joint samples", False, f"{summary}; {what} (safety.joint_timeout_s)", cure)
     if age_ms > 0.5 * timeout_ms:
         return ExaminationFinding(
-            "joint samples", None, f"{summary}; the arm stops at {timeout_ms:g} ms",
+            "joint samples",
+            None,
+            f"{summary}; the arm stops at {timeout_ms:g} ms",
             "a larger safety.joint_timeout_s, or a device that is read more often",
-        )  # fmt: skip
+        )
     return ExaminationFinding("joint samples", True, f"{summary}; the arm stops at {timeout_ms:g} ms")

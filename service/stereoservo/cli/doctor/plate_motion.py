@@ -194,22 +194,27 @@ def judge_turn(joint: str, travel: float, turn: Turn | None) -> ExaminationFindi
     tolerance = AGREES * abs(travel) + SIGMAS * turn.sigma
     if SIGMAS * turn.sigma > UNSEEN * abs(travel):
         return ExaminationFinding(
-            name, None, f"the encoder told {told}; the pictures saw {seen}: too small to judge; {shift}",
+            name,
+            None,
+            f"the encoder told {told}; the pictures saw {seen}: too small to judge; {shift}",
             "a larger or nearer plate, sharper pictures",
-        )  # fmt: skip
+        )
     if abs(turn.angle - abs(travel)) <= tolerance:
         return ExaminationFinding(name, True, f"the encoder told {told}, the pictures saw {seen}; {shift}")
     factor = turn.angle / abs(travel)
     if factor < AGREES:
         return ExaminationFinding(
-            name, False, f"the encoder told {told}, the pictures saw {seen}: the plate stands still",
+            name,
+            False,
+            f"the encoder told {told}, the pictures saw {seen}: the plate stands still",
             "is the plate on the arm, behind this joint; does the coupling between motor and joint hold?",
-        )  # fmt: skip
+        )
     return ExaminationFinding(
-        name, False,
+        name,
+        False,
         f"the encoder told {told}, the pictures saw {seen}: {factor:.2f} times; {shift}",
         f"gear_ratio of {joint!r} divided by {factor:.2f} (or counts_per_rev)",
-    )  # fmt: skip
+    )
 
 
 def _direction(shift: FloatArray) -> str:
@@ -240,9 +245,11 @@ def examine_sides(records: Sequence[CameraRecord]) -> ExaminationFinding | None:
     if min(offsets) > 0.0:
         return ExaminationFinding(name, True, f"{right.name!r} stands to the right of {left.name!r}")
     return ExaminationFinding(
-        name, False, f"{left.name!r} looks from the right of {right.name!r}: they are swapped",
+        name,
+        False,
+        f"{left.name!r} looks from the right of {right.name!r}: they are swapped",
         "exchange their sources (or their names, or cables)",
-    )  # fmt: skip
+    )
 
 
 def side_offsets(left: CameraRecord, right: CameraRecord) -> list[float]:

@@ -78,9 +78,11 @@ def setup(
         finally:
             _keep_answers(file, dialogue)
         result |= {
-            "cell": file.stem, "file": str(file), "answers": len(dialogue.asked),
+            "cell": file.stem,
+            "file": str(file),
+            "answers": len(dialogue.asked),
             "longest_silence_s": round(dialogue.longest_silence_s, 2),
-        }  # fmt: skip
+        }
     emit(result, "", json)
 
 
@@ -409,14 +411,18 @@ def eye_finding(joint: str, travel: float, answer: tuple[str, str]) -> Examinati
         )
     if moved != joint:
         return ExaminationFinding(
-            name, False, f"{joint} was driven, and {moved} moved: they are swapped",
+            name,
+            False,
+            f"{joint} was driven, and {moved} moved: they are swapped",
             f"exchange node_id (and what else is of the drive) of {joint!r} and {moved!r}",
-        )  # fmt: skip
+        )
     if sense and sense != expected:
         return ExaminationFinding(
-            name, False, f"{joint} was driven to {expected} and turned to {sense}: its sign is inverted",
+            name,
+            False,
+            f"{joint} was driven to {expected} and turned to {sense}: its sign is inverted",
             f"direction of {joint!r}: the other sign; then offset_rad anew",
-        )  # fmt: skip
+        )
     return ExaminationFinding(name, True, "it is the joint that moved, and the way it is counted")
 
 
@@ -483,9 +489,11 @@ def calibrated(client: Client, dialogue: Dialogue) -> dict[str, Any]:
         f"measurements. {result.verdict}\n   report: {result.report or 'none could be written'}"
     )
     return {
-        "rms_px": result.rms_px, "stratum": result.stratum, "covariance_ok": result.covariance_ok,
+        "rms_px": result.rms_px,
+        "stratum": result.stratum,
+        "covariance_ok": result.covariance_ok,
         "model": result.model,
-    }  # fmt: skip
+    }
 
 
 def first_goal(client: Client, directories: CellDirectories, dialogue: Dialogue) -> dict[str, Any]:

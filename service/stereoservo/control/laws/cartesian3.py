@@ -419,11 +419,13 @@ def _normalised_step_into(arm: PresentArm, task: BodyTask, eyes: FloatArray, rat
     before = norm(centres[1] - centres[0])
     ratio = norm(inner[1] - inner[0]) / before if before > 0.0 else 1.0
     found = cartesian_step(
-        turned, composition,
+        turned,
+        composition,
         FaceTask(transform_points(change, points), transform_points(change, targets), inner[0], inner[1]),
         transform_points(change, eyes),
-        Pace(np.full(count, gain), dt_s, rotation_rate, ratio * translation_rate), count == 2,
-    )  # fmt: skip
+        Pace(np.full(count, gain), dt_s, rotation_rate, ratio * translation_rate),
+        count == 2,
+    )
     for j in range(n):
         velocity[j] = found[0][j]
     for i in range(count):
@@ -552,9 +554,12 @@ def fill_step(room: Record, count: int) -> None:
     n, m, c = work.joints, work.markers, work.eye_count
     arm = PresentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
     task = BodyTask(
-        work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.face, work.centre,
+        work.body[: 4 * m].reshape((m, 4)),
+        work.target_points[: 4 * m].reshape((m, 4)),
+        work.face,
+        work.centre,
         work.centre_target,
-    )  # fmt: skip
+    )
     stepped = Stepped(
         work.velocity[:n], work.components[: 2 * count].reshape((2, count)), work.component_status[:count]
     )

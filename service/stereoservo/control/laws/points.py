@@ -118,13 +118,16 @@ def points_kernel(room: Record) -> None:
             seen[i] = max(seen[i], work.usable[k * m + i])
         seen[i] *= 1.0 if work.target_known[i] > 0.0 else 0.0
     task = PointTask(
-        body, work.target_points[: 4 * m].reshape((m, 4)), seen,
+        body,
+        work.target_points[: 4 * m].reshape((m, 4)),
+        seen,
         pixel_metrics(work.matrices[: 12 * c].reshape((c, 3, 4)), body),
-    )  # fmt: skip
+    )
     velocity, work.conditioning = points_step(
-        work.operators[: 16 * n].reshape((n, 4, 4)), task,
+        work.operators[: 16 * n].reshape((n, 4, 4)),
+        task,
         Gains(gain_held(work.gain, work.dt_s), work.jacobian_choice, DAMPING),
-    )  # fmt: skip
+    )
     work.velocity[:n] = velocity
 
 
@@ -134,9 +137,7 @@ def points(scene: Scene, task: Task, options: Options) -> LawStep:
     With the mean Jacobian ``Ĥ_j (M + M*)/2`` the motion is the screw from the current pose to the goal, from any pose
     less than half a turn away. There is no fixed depth in space: that choice means the current points.
     """
-    measured = (
-        scene.points, task.target_points, _seen(scene, task), pixel_metrics(scene.matrices, scene.points)
-    )  # fmt: skip
+    measured = (scene.points, task.target_points, _seen(scene, task), pixel_metrics(scene.matrices, scene.points))
     gains = (held_gain(options), int(options.jacobian), options.damping)
     velocity, conditioning = step_by_points(scene.operators, measured, gains)
     return limited(scene, task, options, velocity, conditioning)

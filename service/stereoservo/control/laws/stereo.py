@@ -204,11 +204,14 @@ def image_kernel(room: Record) -> None:
     work = room[0]
     n, c, m = work.joints, work.cameras, work.markers
     view = View(
-        work.matrices[: 12 * c].reshape((c, 3, 4)), work.camera_centres[: 4 * c].reshape((c, 4)),
-        work.pixels[: 2 * c * m].reshape((c, m, 2)), work.set_points[: 2 * c * m].reshape((c, m, 2)),
-        work.no_rates[: 2 * c * m].reshape((c, m, 2)), work.usable[: c * m].reshape((c, m)),
+        work.matrices[: 12 * c].reshape((c, 3, 4)),
+        work.camera_centres[: 4 * c].reshape((c, 4)),
+        work.pixels[: 2 * c * m].reshape((c, m, 2)),
+        work.set_points[: 2 * c * m].reshape((c, m, 2)),
+        work.no_rates[: 2 * c * m].reshape((c, m, 2)),
+        work.usable[: c * m].reshape((c, m)),
         work.wanted[: c * m].reshape((c, m)),
-    )  # fmt: skip
+    )
     body = Body(work.body[: 4 * m].reshape((m, 4)), work.target_points[: 4 * m].reshape((m, 4)), work.target_known[:m])
     operators = work.operators[: 16 * n].reshape((n, 4, 4))
     gains = Gains(gain_held(work.gain, work.dt_s), work.jacobian_choice, DAMPING)
@@ -257,9 +260,7 @@ def held_gain(options: Options) -> float:
 
 def image_velocity_step(scene: Scene, task: Task, options: Options, jacobian: int, rates: FloatArray) -> LawStep:
     """The kernel's step for a choice of the Jacobian and a feed-forward (c, m, 2) [px/s]."""
-    view = (
-        scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted
-    )  # fmt: skip
+    view = (scene.matrices, scene.camera_centres, scene.pixels, task.set_points, rates, scene.weights, task.wanted)
     body = (scene.points, task.target_points, task.target_known)
     gains = (held_gain(options), int(jacobian), options.damping)
     velocity = np.empty(len(scene.operators))

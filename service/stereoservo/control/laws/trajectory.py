@@ -176,14 +176,15 @@ def trajectory(scene: Scene, task: Task, options: Options) -> LawStep:
             f"an arm of {n} joints takes {n} planned rates and errors, or none of both; got "
             f"{len(task.joint_rates)} and {len(task.joint_error)}"
         )
-    view = (
-        scene.matrices, scene.camera_centres, scene.pixels, task.set_points, task.rates, scene.weights, task.wanted
-    )  # fmt: skip
+    view = (scene.matrices, scene.camera_centres, scene.pixels, task.set_points, task.rates, scene.weights, task.wanted)
     plan = (task.joint_rates, task.joint_error, task.joint_weight)
     velocity, conditioning = trajectory_step(
-        (scene.operators, int(scene.composition)), view, scene.points, plan,
+        (scene.operators, int(scene.composition)),
+        view,
+        scene.points,
+        plan,
         (options.gain, options.dt_s, options.damping),
-    )  # fmt: skip
+    )
     return limited(scene, task, options, velocity, conditioning)
 
 

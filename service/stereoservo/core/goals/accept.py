@@ -288,18 +288,23 @@ def refuse(requests: list[Request], reasons: tuple[Reason, ...], context: StepCo
     """Answer requests that will not be carried out."""
     for request in requests:
         context.emit(
-            "reply", request=request.request, accepted=False, id=id_of(request.command), message=reasons[0].hint,
+            "reply",
+            request=request.request,
+            accepted=False,
+            id=id_of(request.command),
+            message=reasons[0].hint,
             reasons=reasons,
-        )  # fmt: skip
+        )
 
 
 def refuse_waiting(reasons: tuple[Reason, ...], context: StepContext) -> None:
     """Refuse the waiting requests that would move the arm: they were sent before motion was forbidden."""
     state = context.state
     moves = [
-        r for r in state.waiting
+        r
+        for r in state.waiting
         if isinstance(r.command, Home | Calibrate) or (isinstance(r.command, RunGoal) and not r.command.goal.check)
-    ]  # fmt: skip
+    ]
     state.waiting = [r for r in state.waiting if r not in moves]
     refuse(moves, reasons, context)
 
@@ -388,9 +393,13 @@ def _answer(request: Request, context: StepContext) -> None:
 
 def _reply_refused(request: Request, refusal: RefusalError, context: StepContext) -> None:
     context.emit(
-        "reply", request=request.request, accepted=False, message=str(refusal), reasons=refusal.reasons,
+        "reply",
+        request=request.request,
+        accepted=False,
+        message=str(refusal),
+        reasons=refusal.reasons,
         id=id_of(request.command),
-    )  # fmt: skip
+    )
 
 
 def _run(command: RunGoal, request: Request, context: StepContext) -> Accepted | None:

@@ -213,9 +213,14 @@ def displacement_by_law(
 
 
 def refined_pose(
-    arrays: ModelArrays, basis: FloatArray, points: FloatArray, displacement: FloatArray, set_points: FloatArray,
-    wanted: FloatArray, refinements: int = REFINEMENTS,
-) -> tuple[GoalPose, bool]:  # fmt: skip
+    arrays: ModelArrays,
+    basis: FloatArray,
+    points: FloatArray,
+    displacement: FloatArray,
+    set_points: FloatArray,
+    wanted: FloatArray,
+    refinements: int = REFINEMENTS,
+) -> tuple[GoalPose, bool]:
     """Least squares on all set-points from a nearby ``displacement`` (4, 4), and whether it has converged in so many
     ``refinements``; ``basis`` (k, 4, 4) of displacements.
     """
@@ -230,9 +235,13 @@ def refined_pose(
 
 @kernel
 def _displacement_by_law(
-    basis: FloatArray, points: FloatArray, there: tuple[FloatArray, BoolArray], face: IntArray,
-    displacement: FloatArray, steps: int,
-) -> tuple[FloatArray, bool]:  # fmt: skip
+    basis: FloatArray,
+    points: FloatArray,
+    there: tuple[FloatArray, BoolArray],
+    face: IntArray,
+    displacement: FloatArray,
+    steps: int,
+) -> tuple[FloatArray, bool]:
     """Displacement (4, 4) to which the Cartesian law converges: the face of ``points`` (m, 4) onto that of the targets.
     Returns it after so many ``steps`` from a ``displacement``, and whether it is close to the solution.
 
@@ -341,14 +350,20 @@ def one_body(pose: GoalPose, points: FloatArray, targets: FloatArray, known: Boo
         raise RefusalError(
             "MIRRORED_GOAL",
             f"no displacement of the marker body explains the goal, it is its mirror image: {said}",
-            subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
-        )  # fmt: skip
+            subject=str(pose.worst_marker),
+            value=value,
+            threshold=MAX_GOAL_RESIDUAL_PX,
+            unit="px",
+        )
     raise RefusalError(
         "NOT_RIGID",
         f"no displacement of the marker body explains the set-points: {said}: are ids swapped, is it another body, or "
         "is it mirrored?",
-        subject=str(pose.worst_marker), value=value, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
-    )  # fmt: skip
+        subject=str(pose.worst_marker),
+        value=value,
+        threshold=MAX_GOAL_RESIDUAL_PX,
+        unit="px",
+    )
 
 
 @dataclass(frozen=True)
@@ -408,8 +423,11 @@ def enough_in_view(place: BodyState, pixels: FloatArray, shown: FloatArray, know
         f"at the goal camera {camera.name!r} shows {count} of its markers, the others less; {MIN_MARKERS} are needed: "
         f"marker {place.arrays.marker_ids[lost]} would be at ({u:.0f}, {v:.0f}), its image is "
         f"{camera.width}x{camera.height}",
-        subject=camera.name, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
-    )  # fmt: skip
+        subject=camera.name,
+        value=float(count),
+        threshold=float(MIN_MARKERS),
+        unit="markers",
+    )
 
 
 def keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> None:
@@ -423,8 +441,10 @@ def keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> 
             "NOT_RIGID",
             f"the goal is no rigid displacement of the marker body: it differs from the nearest by {share:.2f} of the "
             f"body's extent; up to {RIGID_SHARE} is accepted",
-            value=share, threshold=RIGID_SHARE, unit="of the body's extent",
-        )  # fmt: skip
+            value=share,
+            threshold=RIGID_SHARE,
+            unit="of the body's extent",
+        )
 
 
 def turned_to(place: BodyState, displacement: FloatArray) -> FloatArray:
@@ -454,8 +474,11 @@ def enough_shown(place: BodyState, shown: FloatArray) -> None:
         "FACE_HIDDEN",
         f"at the goal camera {camera!r} would see the front of {count} markers, the others of less; {MIN_MARKERS} are "
         "needed: the body turns its back",
-        subject=camera, value=float(count), threshold=float(MIN_MARKERS), unit="markers",
-    )  # fmt: skip
+        subject=camera,
+        value=float(count),
+        threshold=float(MIN_MARKERS),
+        unit="markers",
+    )
 
 
 def in_front(place: BodyState, targets: FloatArray, known: BoolArray) -> None:
@@ -474,8 +497,11 @@ def in_front(place: BodyState, targets: FloatArray, known: BoolArray) -> None:
                 "BEHIND_CAMERA",
                 f"at the goal marker {place.arrays.marker_ids[i]} lies behind camera {camera!r} "
                 f"(at {share:.2f} of its present depth; more than 0 is needed)",
-                subject=camera, value=share, threshold=0.0, unit="of the present depth",
-            )  # fmt: skip
+                subject=camera,
+                value=share,
+                threshold=0.0,
+                unit="of the present depth",
+            )
 
 
 def mirrored(points: FloatArray, targets: FloatArray, known: BoolArray) -> bool:

@@ -173,9 +173,14 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
     approaches = tuple(_approach(failure, job, context) for failure in failures)
     texts = tuple(_text(failure, context, source.goal.posture is not None) for failure in approaches)
     report = PlanReport(
-        law=source.law, way=f"not guaranteed: {texts[0]}", seconds=_exponential_s(job, context), approaches=approaches,
-        shares=(), joints={}, pixels={},
-    )  # fmt: skip
+        law=source.law,
+        way=f"not guaranteed: {texts[0]}",
+        seconds=_exponential_s(job, context),
+        approaches=approaches,
+        shares=(),
+        joints={},
+        pixels={},
+    )
     at_goal = failures[0].share >= 1.0
     path = context.derived.laws[source.law].path
     if path == "free" and not at_goal:
@@ -217,8 +222,11 @@ def _require_components(job: PlanJob, context: StepContext) -> None:
         f"the arm reaches the goal, and not by law {source.law!r}, which makes each component of the motion by itself: "
         f"with {len(job.joints)} joints it would stop {left:.1f} px beside it (up to {MAX_GOAL_RESIDUAL_PX:g} px is "
         f"accepted); take one of {others}",
-        subject=source.law, value=left, threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
-    )  # fmt: skip
+        subject=source.law,
+        value=left,
+        threshold=MAX_GOAL_RESIDUAL_PX,
+        unit="px",
+    )
 
 
 def planning_reason(job: PlanJob) -> Reason:
@@ -365,10 +373,15 @@ def prepare(
     of_this_model(target.model_epoch, epoch)
     body = place_now(context) if place is None else place
     job = PlanJob(
-        request=request, purpose=purpose, source=None, planning=None,
-        joints=(context.q if joints is None else joints).copy(), points=body.points.copy(), goal=goal,
+        request=request,
+        purpose=purpose,
+        source=None,
+        planning=None,
+        joints=(context.q if joints is None else joints).copy(),
+        points=body.points.copy(),
+        goal=goal,
         resolution=begin_resolution(body, context.q + context.state.block.correction, law.needs_goal_pose),
-    )  # fmt: skip
+    )
     if body.arrays.sights <= AT_ONCE:
         set_up(job, context)
     if job.source is None or (job.planning is not None):

@@ -102,8 +102,9 @@ def of_this_model(model_epoch: int | None, epoch: int) -> None:
         raise RefusalError(
             "OTHER_MODEL",
             f"the goal was taught with model epoch {model_epoch}; the cell has epoch {epoch}: teach it again",
-            value=float(model_epoch), threshold=float(epoch),
-        )  # fmt: skip
+            value=float(model_epoch),
+            threshold=float(epoch),
+        )
 
 
 # -- set-points in images -------------------------------------------------------------------------------------
@@ -123,8 +124,10 @@ def _triangulated(aim: GoalResolution, place: BodyState) -> None:
         raise RefusalError(
             "TOO_FEW_MARKERS",
             f"the goal shows {shown} markers; at least {needed} are needed to fix a pose",
-            value=float(shown), threshold=float(needed), unit="markers",
-        )  # fmt: skip
+            value=float(shown),
+            threshold=float(needed),
+            unit="markers",
+        )
     aim.points = aim.targets
     aim.pose_known = aim.needs_pose or int(aim.known.sum()) >= MIN_MARKERS
 
@@ -251,8 +254,10 @@ def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
         raise RefusalError(
             "TOO_FEW_MARKERS",
             f"the goal gives {len(target.points)} points; at least {needed} that are not on one line are needed",
-            value=float(len(target.points)), threshold=float(needed), unit="markers",
-        )  # fmt: skip
+            value=float(len(target.points)),
+            threshold=float(needed),
+            unit="markers",
+        )
     targets, known = given_points(target, arrays)
     _projected(aim, place, targets, known)
 
@@ -302,9 +307,10 @@ def normalize_scale(point: FloatArray, arrays: ModelArrays, what: str, subject: 
         raise RefusalError(
             "POINT_AT_INFINITY",
             f"{what} lies at infinity, or is no point: {point.tolist()}; a finite point in the model's frame is needed",
-            subject=subject, value=abs(height) / size if isfinite(size) and size > 0.0 else None,
+            subject=subject,
+            value=abs(height) / size if isfinite(size) and size > 0.0 else None,
             threshold=FINITE_HEIGHT,
-        )  # fmt: skip
+        )
     scaled: FloatArray = point / height
     return scaled
 
@@ -330,8 +336,9 @@ def _displacement(aim: GoalResolution, target: DisplacementTarget, place: BodySt
             "NOT_RIGID",
             "the matrix is no displacement of the marker body: it takes a part of it through infinity; heights of the "
             f"markers go from {float(heights.min()):.3g} to {float(heights.max()):.3g}, of a displacement they agree",
-            value=lowest / highest if highest > 0.0 else 0.0, threshold=1.0,
-        )  # fmt: skip
+            value=lowest / highest if highest > 0.0 else 0.0,
+            threshold=1.0,
+        )
     _projected(aim, place, moved / heights[:, None], np.ones(heights.size, dtype=bool))
 
 
@@ -347,14 +354,16 @@ def _proper(matrix: FloatArray) -> FloatArray:
             "NOT_RIGID",
             f"the matrix is singular (determinant {determinant:.3g} at a largest entry of 1); a displacement "
             "has full rank",
-            value=abs(determinant), threshold=SINGULAR,
-        )  # fmt: skip
+            value=abs(determinant),
+            threshold=SINGULAR,
+        )
     if determinant < 0.0:
         raise RefusalError(
             "MIRRORED_GOAL",
             f"the matrix mirrors (determinant {determinant:.3g}); a displacement has a positive one",
-            value=determinant, threshold=0.0,
-        )  # fmt: skip
+            value=determinant,
+            threshold=0.0,
+        )
     proper: FloatArray = scaled / determinant**0.25
     return proper
 
@@ -370,16 +379,18 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
     volume = abs(determinant4(M)) / (extent**3 * float(np.sqrt((middle * middle).sum())))
     fifth = (
         transform_points(invert4(M), np.ascontiguousarray(place.points[indices[4:]]))[0]
-        if volume > COPLANAR**2 else np.zeros(4)
-    )  # fmt: skip
+        if volume > COPLANAR**2
+        else np.zeros(4)
+    )
     least = float(np.abs(fifth).min())
     if not least > COPLANAR:
         raise RefusalError(
             "DEGENERATE_BASIS",
             f"four of the basis markers {list(ids)} lie in one plane, or nearly; choose five of which no four do, or "
             "state the displacement in the model's frame",
-            value=least, threshold=COPLANAR,
-        )  # fmt: skip
+            value=least,
+            threshold=COPLANAR,
+        )
     E: FloatArray = M * fifth[None, :]
     return E
 
@@ -448,9 +459,11 @@ def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
             f"the arm's {start.size} joints cannot bring the markers there: {reached.worst:.1f} px are left of marker "
             f"{arrays.marker_ids[i]} in camera {cameras[c].name!r} (up to {MAX_GOAL_RESIDUAL_PX:g} px is accepted); "
             f"the nearest that they reach is ({u:.1f}, {v:.1f}) there",
-            subject=str(arrays.marker_ids[i]), threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
+            subject=str(arrays.marker_ids[i]),
+            threshold=MAX_GOAL_RESIDUAL_PX,
+            unit="px",
             value=reached.worst if isfinite(reached.worst) else None,
-        )  # fmt: skip
+        )
     aim.points = aim.targets = reached.points
     aim.known, aim.pose_known = np.ones(len(reached.points), dtype=bool), True
     in_front(place, aim.points, aim.known)
@@ -520,8 +533,10 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
         raise RefusalError(
             "TOO_FEW_MARKERS",
             f"{MIN_MARKERS} markers that two cameras show at the goal are needed; {candidates.size} are",
-            value=float(candidates.size), threshold=float(MIN_MARKERS), unit="markers",
-        )  # fmt: skip
+            value=float(candidates.size),
+            threshold=float(MIN_MARKERS),
+            unit="markers",
+        )
     found: IntArray
     found, area = _largest_triangle(candidates, set_points, wanted)
     if not area >= MIN_FACE_AREA_PX2:
@@ -529,8 +544,10 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
         raise RefusalError(
             "COLLINEAR_MARKERS",
             f"the markers {ids} of the goal lie on one line; three that span a face are needed",
-            value=float(area), threshold=MIN_FACE_AREA_PX2, unit="px²",
-        )  # fmt: skip
+            value=float(area),
+            threshold=MIN_FACE_AREA_PX2,
+            unit="px²",
+        )
     return found
 
 

@@ -106,8 +106,11 @@ def _stable_damping(goal: Goal, gain: float, context: StepContext) -> float:
             "DAMPING_UNSTABLE",
             f"damping {damping:g} at a gain of {gain:g}/s: the velocity of {joint} is known {late_s:.3f} s after its "
             f"command, by which gains up to {most:.2g}/s are damped; lower the gain, or the damping",
-            subject=joint, value=gain, threshold=most, unit="1/s",
-        )  # fmt: skip
+            subject=joint,
+            value=gain,
+            threshold=most,
+            unit="1/s",
+        )
     return damping
 
 
@@ -126,8 +129,10 @@ def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatA
             "TOO_FEW_MARKERS",
             f"cameras {', '.join(goal.cameras) or '(none)'} show {shown} markers of the goal; at least {needed} "
             "are needed",
-            value=float(shown), threshold=float(needed), unit="markers",
-        )  # fmt: skip
+            value=float(shown),
+            threshold=float(needed),
+            unit="markers",
+        )
     return used
 
 
@@ -162,9 +167,10 @@ def _centre(
 def unplanned_report(source: ServoGoal, context: StepContext) -> PlanReport:
     """The report of a goal whose pose, and so its path, is not known beforehand."""
     return no_plan(
-        source.law, "the pose at the goal is not known: fewer than three of its markers are shown by two cameras",
+        source.law,
+        "the pose at the goal is not known: fewer than three of its markers are shown by two cameras",
         source.time_limit_s,
-    )  # fmt: skip
+    )
 
 
 def no_plan(law: str, why: str, seconds: float) -> PlanReport:

@@ -115,17 +115,25 @@ def reasons(state: CoreState) -> tuple[Reason, ...]:
     if run.reason is not None:
         return (run.reason,)
     doing = {
-        "brake": "the arm comes to rest", "collect": "looking at rest", "wait": "it is being found anew",
-        "take": "its new place is taken over", "verify": "its new place is verified",
-    }[run.phase]  # fmt: skip
+        "brake": "the arm comes to rest",
+        "collect": "looking at rest",
+        "wait": "it is being found anew",
+        "take": "its new place is taken over",
+        "verify": "its new place is verified",
+    }[run.phase]
     if run.doubt:
         return (_doubtful(run, f"{run.doubt}. {doing[0].upper()}{doing[1:]}, to look once more"),)
     return (
         Reason(
-            "CAMERA_MOVED", "hold", ", ".join(run.cameras), run.moved_px, None, "px",
+            "CAMERA_MOVED",
+            "hold",
+            ", ".join(run.cameras),
+            run.moved_px,
+            None,
+            "px",
             f"{named(run.cameras)} moved: {doing}; laws go on by themselves. Leave it alone now",
         ),
-    )  # fmt: skip
+    )
 
 
 def _doubtful(run: Relocalization, hint: str) -> Reason:
@@ -152,9 +160,13 @@ def refuse_while_moved(state: CoreState) -> None:
     run = state.reanchoring
     if run is not None and run.doubt:
         raise RefusalError(
-            "CAMERAS_OR_ARM", run.doubt, subject=", ".join(run.cameras), value=run.moved_px, threshold=LEAST_PX,
+            "CAMERAS_OR_ARM",
+            run.doubt,
+            subject=", ".join(run.cameras),
+            value=run.moved_px,
+            threshold=LEAST_PX,
             unit="px",
-        )  # fmt: skip
+        )
     if run is not None:
         raise RefusalError(
             "CAMERA_MOVED",
@@ -316,17 +328,25 @@ def _look(run: Relocalization, context: StepContext) -> None:
         if sample.camera in run.cameras and len(_known(sample, context)) < FEWEST:
             few, frames = len(_known(sample, context)), sample.frames
             _fail(
-                run, context,
+                run,
+                context,
                 f"camera {sample.camera} sees {few} known markers in {frames} frames, {FEWEST} are needed: turn it "
                 "back to the arm or to the static markers, or move the arm before it by joints",
-                float(few), "markers", float(FEWEST),
-            )  # fmt: skip
+                float(few),
+                "markers",
+                float(FEWEST),
+            )
             return
     context.emit(
-        "reanchor", id=goal_of(context.state.source), joints=run.joint_sum / max(run.joint_frames, 1),
-        samples=samples, trial=run.poses, cameras=run.cameras, rigid=run.together,
+        "reanchor",
+        id=goal_of(context.state.source),
+        joints=run.joint_sum / max(run.joint_frames, 1),
+        samples=samples,
+        trial=run.poses,
+        cameras=run.cameras,
+        rigid=run.together,
         message=f"{named(run.cameras)} seen at rest: to be found anew",
-    )  # fmt: skip
+    )
     run.poses += 1
     _enter(run, "wait", context)
 
@@ -367,10 +387,12 @@ def _where_they_were(run: Relocalization, context: StepContext) -> bool:
     goal = goal_of(state.source)
     on = f"; goal {goal} goes on" if goal else ""
     context.emit(
-        "health", id=goal, name="ok",
+        "health",
+        id=goal,
+        name="ok",
         message=f"{named(run.cameras)}, seen at rest, stand where they stood: what was seen in motion was of other "
         f"moments than stated, or passed by{on}",
-    )  # fmt: skip
+    )
     return True
 
 
@@ -411,9 +433,8 @@ def _give_up(run: Relocalization, context: StepContext, reason: Reason) -> None:
     run.reason = reason
     _enter(run, "failed", context)
     context.emit(
-        "reanchor_failed", id=goal_of(context.state.source), message=reason.hint, reasons=(reason,),
-        cameras=run.cameras,
-    )  # fmt: skip
+        "reanchor_failed", id=goal_of(context.state.source), message=reason.hint, reasons=(reason,), cameras=run.cameras
+    )
 
 
 def _carry_over(run: Relocalization, context: StepContext) -> None:
@@ -504,10 +525,13 @@ def _known_again(run: Relocalization, context: StepContext) -> None:
     goal = goal_of(state.source)
     on = f"; goal {goal} goes on" if goal else ""
     context.emit(
-        "reanchored", id=goal, cameras=run.cameras, rigid=run.together,
+        "reanchored",
+        id=goal,
+        cameras=run.cameras,
+        rigid=run.together,
         message=f"{named(run.cameras)} moved by {run.moved_px:.3g} px and is known again after {seconds:.1f} s: now "
         f"{px}{on}",
-    )  # fmt: skip
+    )
 
 
 def carry_run(source: LawRun, place: BodyState, new: ModelArrays, moved: tuple[int, ...]) -> Reason | None:
@@ -540,9 +564,14 @@ def _intersected(set_points: FloatArray, wanted: FloatArray, arrays: ModelArrays
 
 
 def _say_anew(
-    set_points: FloatArray, wanted: FloatArray, points: FloatArray, known: BoolArray, settings: CoreSettings,
-    new: ModelArrays, moved: tuple[int, ...],
-) -> None:  # fmt: skip
+    set_points: FloatArray,
+    wanted: FloatArray,
+    points: FloatArray,
+    known: BoolArray,
+    settings: CoreSettings,
+    new: ModelArrays,
+    moved: tuple[int, ...],
+) -> None:
     """Set-points (c, m, 2) in the cameras ``moved``; those outside their new images do not count there any more."""
     pixels, depths = project_points(new.matrices, np.ascontiguousarray(points))
     for c in moved:
@@ -562,10 +591,15 @@ def _raw_in_view(settings: CoreSettings, arrays: ModelArrays, camera: int, pixel
 
 def _stale(goal_id: str, shown: int) -> Reason:
     return Reason(
-        "SET_POINTS_STALE", "hold", goal_id, float(shown), float(MIN_MARKERS), "markers",
+        "SET_POINTS_STALE",
+        "hold",
+        goal_id,
+        float(shown),
+        float(MIN_MARKERS),
+        "markers",
         "a camera was moved, and the goal cannot be said in its new pixels: fewer of its markers are shown by two "
         "cameras, or come into the new image, than are needed. State it again from the pictures of now",
-    )  # fmt: skip
+    )
 
 
 def carry_goal(

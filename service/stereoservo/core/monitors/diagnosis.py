@@ -48,9 +48,12 @@ def emit_diagnosis(verdict: ModelDiagnosis, context: StepContext) -> None:
     message = verdict.text or "the images agree with the model again"
     reason = diagnosis_reason(verdict)
     context.emit(
-        "health", message=message, name=verdict.kind, reasons=() if reason is None else (reason,),
+        "health",
+        message=message,
+        name=verdict.kind,
+        reasons=() if reason is None else (reason,),
         cameras=verdict.subjects if verdict.kind in MOVED else (),
-    )  # fmt: skip
+    )
 
 
 def diagnosis_reason(verdict: ModelDiagnosis) -> Reason | None:

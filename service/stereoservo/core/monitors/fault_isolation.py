@@ -56,9 +56,13 @@ may have been pushed themselves.
 @lru_cache(maxsize=64)
 def _thresholds(rate_hz: float, cameras: int, markers: int, joints: int) -> Thresholds:
     return alarm_thresholds(
-        false_alarms_per_hour=FALSE_ALARMS_PER_HOUR, decisions_per_hour=3600.0 * rate_hz, cameras=cameras,
-        markers=markers, joints=joints, least_px=LEAST_PX,
-    )  # fmt: skip
+        false_alarms_per_hour=FALSE_ALARMS_PER_HOUR,
+        decisions_per_hour=3600.0 * rate_hz,
+        cameras=cameras,
+        markers=markers,
+        joints=joints,
+        least_px=LEAST_PX,
+    )
 
 
 def thresholds_of(settings: CoreSettings, markers: int, cameras: int) -> Thresholds:
@@ -86,10 +90,11 @@ def diagnosed(bench: Bench) -> ModelDiagnosis:
         return _each_by_itself(bench) or _unclear(found, other)
     if cause.kind == "joints" and other is None:
         return ModelDiagnosis(
-            "unclear", moved_px=cause.effect_px,
+            "unclear",
+            moved_px=cause.effect_px,
             text=f"the arm, or the marker body on it, stands elsewhere than its joints say ({cause.effect_px:.3g} px "
             "rms): was the body mounted anew, was the arm pushed? Calibrate anew",
-        )  # fmt: skip
+        )
     return _told(bench, cause, words)
 
 
@@ -100,9 +105,14 @@ class Bench:
     """
 
     def __init__(
-        self, arrays: ModelArrays, settings: CoreSettings, known: list[int], q: FloatArray,
-        innovation: FloatArray, weights: FloatArray,
-    ) -> None:  # fmt: skip
+        self,
+        arrays: ModelArrays,
+        settings: CoreSettings,
+        known: list[int],
+        q: FloatArray,
+        innovation: FloatArray,
+        weights: FloatArray,
+    ) -> None:
         self.arrays, self.settings, self.known, self.q = arrays, settings, known, q
         H, self.operators = chain_at(arrays, q)
         self.points = transform_points(H, arrays.marker_points)
@@ -237,9 +247,12 @@ def _unclear(found: ChangeDiagnosis, other: IsolatedChange | None) -> ModelDiagn
     chi2 = found.chi2 / max(found.measurements, 1)
     why = "two causes explain the images equally well" if other is not None else "no single cause explains the images"
     return ModelDiagnosis(
-        "unclear", size=chi2, unit="of the expected variance", moved_px=size,
+        "unclear",
+        size=chi2,
+        unit="of the expected variance",
+        moved_px=size,
         text=f"{why} (chi-square {chi2:.3g} times what noise gives): check the cell with calibrate --check",
-    )  # fmt: skip
+    )
 
 
 def _told(bench: Bench, cause: IsolatedChange, words: str) -> ModelDiagnosis:

@@ -47,10 +47,15 @@ def not_following(joint: int, missing: float, limit: float, delay_s: float, sett
     name, unit = settings.joint_names[joint], settings.joint_unit(joint)
     known = f", {delay_s:.2f} s of delay apart" if delay_s > 0.0 else ""
     return Reason(
-        "JOINT_NOT_FOLLOWING", "fault", name, abs(missing), limit, unit,
+        "JOINT_NOT_FOLLOWING",
+        "fault",
+        name,
+        abs(missing),
+        limit,
+        unit,
         f"joint {name} lacks {missing:+.3f} {unit} of the travel it was sent (up to {limit:.3f} is lag{known}): check "
         "its encoder, brake and drive; then reset and enable",
-    )  # fmt: skip
+    )
 
 
 def silent(joint: int, sent: float, since_s: float, settings: CoreSettings) -> Reason:
@@ -61,10 +66,15 @@ def silent(joint: int, sent: float, since_s: float, settings: CoreSettings) -> R
         PLAY[settings.joint_kinds[joint]],
     )
     return Reason(
-        "JOINT_NOT_FOLLOWING", "fault", name, abs(sent), limit, unit,
+        "JOINT_NOT_FOLLOWING",
+        "fault",
+        name,
+        abs(sent),
+        limit,
+        unit,
         f"the reading of joint {name} stood still for {since_s:.2f} s while it was sent {sent:+.3f} {unit} of travel "
         f"(up to {limit:g} may be play): check its encoder, brake and drive; then reset and enable",
-    )  # fmt: skip
+    )
 
 
 @kernel
@@ -135,11 +145,16 @@ def delays_of(block: Record) -> DriveDelays:
     memory = block[0]
     n, past = memory.joints, memory.past
     return DriveDelays(
-        memory.delay_s[:n], memory.delay_samples[: DELAY_SAMPLES * n].reshape((DELAY_SAMPLES, n)),
-        memory.delay_onset[: 7 * n].reshape((7, n)), memory.delay_sent[:n],
-        memory.delay_past[: past * n].reshape((past, n)), memory.delay_velocity[:n], memory.delay_under_way[:n],
-        memory.delay_accounted[:n], memory.delay_missing[:n],
-    )  # fmt: skip
+        memory.delay_s[:n],
+        memory.delay_samples[: DELAY_SAMPLES * n].reshape((DELAY_SAMPLES, n)),
+        memory.delay_onset[: 7 * n].reshape((7, n)),
+        memory.delay_sent[:n],
+        memory.delay_past[: past * n].reshape((past, n)),
+        memory.delay_velocity[:n],
+        memory.delay_under_way[:n],
+        memory.delay_accounted[:n],
+        memory.delay_missing[:n],
+    )
 
 
 @kernel

@@ -98,10 +98,11 @@ def start(
     names = ", ".join(camera.name for camera in settings.cameras if camera.mobile)
     if names and not metric:
         emit(
-            "warning", name=names,
+            "warning",
+            name=names,
             message=f"mobile: {names} cannot be adjusted while it moves, for the model is not metric: it is treated "
             "like a camera that stands, and found anew at rest",
-        )  # fmt: skip
+        )
 
 
 def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...]) -> CellModel:
@@ -155,9 +156,8 @@ def see(
 
 
 def _known(
-    state: CoreState, arrays: ModelArrays, camera: int, sights: FrameResiduals, prediction: Prediction,
-    q: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    state: CoreState, arrays: ModelArrays, camera: int, sights: FrameResiduals, prediction: Prediction, q: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points (k, 4) at the positions given by the corrected joints ``q``, with the static ones; the pixels at which the
     camera saw them (k, 2) and their weights (k,) [1/px].
     """
@@ -192,9 +192,7 @@ def _follow(mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: Fra
     mobile.moved_px = apart(P, moved_matrix(P, way), points, used)
 
 
-def _static_moved(
-    P: FloatArray, way: FloatArray, points: FloatArray, weights: FloatArray, markers: int
-) -> bool:  # fmt: skip
+def _static_moved(P: FloatArray, way: FloatArray, points: FloatArray, weights: FloatArray, markers: int) -> bool:
     """Whether enough static points, after the ``markers`` in ``points``, moved in the image with the camera."""
     static = weights > 0.0
     static[:markers] = False
@@ -203,7 +201,7 @@ def _static_moved(
 
 def _sets_out(
     state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, found: Adjusted | None, seen: int
-) -> bool:  # fmt: skip
+) -> bool:
     """Whether a frame shows that a static camera starts to move: a displacement above the noise explains it, or nothing
     does, and the previous frames were rejected, too.
     """
@@ -328,11 +326,15 @@ def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
     estimate.seen_ns[:] = 0
     estimate.innovation[:] = 0.0
     context.emit(
-        "camera_adjusted", id=goal_of(state.source), name=name, cameras=(name,), matrix=matrices[c].copy(),
+        "camera_adjusted",
+        id=goal_of(state.source),
+        name=name,
+        cameras=(name,),
+        matrix=matrices[c].copy(),
         epoch=model.epoch,
         message=f"camera {name} stands again, {(context.now_ns - mobile.since_ns) * 1e-9:.1f} s after it set out: "
         f"turned by {math.degrees(angle(way)):.3g} degrees, its picture moved by {mobile.moved_px:.3g} px",
-    )  # fmt: skip
+    )
     prediction = predict(new, context.q)
     weights = context.weights.copy()
     weights[c] = 0.0
@@ -499,7 +501,7 @@ class Adjusted:
 
 def adjust(
     P: FloatArray, points: FloatArray, observed: FloatArray, weights: FloatArray, basis: FloatArray, gate: float
-) -> Adjusted | None:  # fmt: skip
+) -> Adjusted | None:
     """The displacement of camera ``P`` (3, 4) that explains its observations; None if there is none.
 
     Outliers beyond the gate may be left out one by one, the worst first.

@@ -80,9 +80,12 @@ def _move(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
     if at_target(trials, context):
         if trials.phase == "finish":
             context.emit(
-                "calibration_finished", id=trials.id, message="trial motions done", progress=1.0,
+                "calibration_finished",
+                id=trials.id,
+                message="trial motions done",
+                progress=1.0,
                 loads=learnt_loads(trials.id, context.state),
-            )  # fmt: skip
+            )
             return _rest(context, finished=True)
         if trials.phase == "return":
             return _next(trials, context, settings)
@@ -111,9 +114,14 @@ def _stop_done(
     trial = settings.spread_joint if trials.joint < 0 and trials.turn >= 0 else trials.joint
     trial = -1 if _combining(trials) else trial
     context.emit(
-        "calibration_sample", id=trials.id, joints=mean, samples=samples, trial=trial,
-        progress=_progress(trials, settings), way=_way_record(trials),
-    )  # fmt: skip
+        "calibration_sample",
+        id=trials.id,
+        joints=mean,
+        samples=samples,
+        trial=trial,
+        progress=_progress(trials, settings),
+        way=_way_record(trials),
+    )
     if not _combining(trials):
         _remember(trials, context, settings, samples, mean)
     trials.seen_turns += 1
@@ -138,10 +146,12 @@ def _record_way(trials: CalibrationMotion, context: StepContext) -> None:
             chosen = slice(None, None, max(1, -(-observation.ids.size // WAY_MARKERS)))
             trials.way_frames.append(
                 WayFrame(
-                    cameras.index(observation.camera), observation.t_shutter_ns,
-                    np.asarray(observation.ids[chosen], dtype=np.int64), np.array(observation.pixels[chosen]),
+                    cameras.index(observation.camera),
+                    observation.t_shutter_ns,
+                    np.asarray(observation.ids[chosen], dtype=np.int64),
+                    np.array(observation.pixels[chosen]),
                 )
-            )  # fmt: skip
+            )
     now_ns = context.state.block.numbers.last_joints_ns
     due = not trials.way_ns or now_ns - trials.way_ns[-1] >= WAY_APART_NS
     if due and len(trials.way_ns) < WAY_JOINTS:
@@ -241,9 +251,10 @@ def _turn_done(
     if lost and turns:
         name = context.settings.joint_names[settings.spread_joint]
         context.emit(
-            "warning", id=trials.id,
+            "warning",
+            id=trials.id,
             message=f"calibration: position {trials.turn + 1} of joint {name} loses the markers {lost}; left out",
-        )  # fmt: skip
+        )
     if trials.turn + 1 < turns:
         _turn_to(trials, context, settings, trials.turn + 1)
         enter(trials, "move", context)
@@ -383,9 +394,10 @@ def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSetting
     if why:
         name = context.settings.joint_names[trials.joint]
         context.emit(
-            "warning", id=trials.id,
+            "warning",
+            id=trials.id,
             message=f"calibration: joint {name} does not go to {target[trials.joint]:+.3f} {why}; its stops end there",
-        )  # fmt: skip
+        )
         return False
     trials.target = target
     trials.before, trials.before_at = trials.last, trials.last_at
@@ -438,9 +450,10 @@ def _back_off(trials: CalibrationMotion, context: StepContext, settings: TrialSe
     """Reverse the last step; this side ends there, or continues with smaller steps if it has only started."""
     name = context.settings.joint_names[trials.joint]
     context.emit(
-        "warning", id=trials.id,
+        "warning",
+        id=trials.id,
         message=f"calibration: joint {name} loses the markers {where} at {context.q[trials.joint]:+.3f}; backing off",
-    )  # fmt: skip
+    )
     trials.target = settings.base.copy()
     if trials.step == 0.0:
         _probe_failed(trials)
@@ -461,9 +474,14 @@ def _poor(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
     j = trials.joint
     visited = float(trials.highest[j] - trials.lowest[j])
     return too_little(
-        j, int(trials.stops[j]) + 1, visited, float(trials.motion_sigmas[j]), trials.sigma_px, context.settings,
+        j,
+        int(trials.stops[j]) + 1,
+        visited,
+        float(trials.motion_sigmas[j]),
+        trials.sigma_px,
+        context.settings,
         settings,
-    )  # fmt: skip
+    )
 
 
 def _abort(trials: CalibrationMotion, context: StepContext, reason: Reason) -> SourceOutput:
@@ -604,9 +622,8 @@ def extrapolated(last: FloatArray, last_at: float, before: FloatArray, before_at
 
 
 def plan_sides(
-    base: FloatArray, probe: FloatArray, offset: float, reach: FloatArray, core: CoreSettings,
-    settings: TrialSettings,
-) -> tuple[FloatArray, FloatArray, tuple[int, int]]:  # fmt: skip
+    base: FloatArray, probe: FloatArray, offset: float, reach: FloatArray, core: CoreSettings, settings: TrialSettings
+) -> tuple[FloatArray, FloatArray, tuple[int, int]]:
     """Plan both sides from a probe's pixels (p, c, m, 2) at ``offset``; returns the ranges (2,) up and down, steps
     (2,), and numbers of stops.
 
@@ -616,14 +633,17 @@ def plan_sides(
     rates = (probe - base) / offset
     found = np.array(
         [
-            min([float(reach[i])] + [
-                _way(base[p, c], sign * rates[p, c], camera.width, camera.height, settings)
-                for p in np.flatnonzero(np.isfinite(probe - base).any(axis=(1, 2, 3)))
-                for c, camera in enumerate(core.cameras)
-            ])
+            min(
+                [float(reach[i])]
+                + [
+                    _way(base[p, c], sign * rates[p, c], camera.width, camera.height, settings)
+                    for p in np.flatnonzero(np.isfinite(probe - base).any(axis=(1, 2, 3)))
+                    for c, camera in enumerate(core.cameras)
+                ]
+            )
             for i, sign in enumerate((1.0, -1.0))
         ]
-    )  # fmt: skip
+    )
     found[found < 2.0 * abs(offset)] = 0.0
     total = settings.stops - 1
     if found.sum() == 0.0:
@@ -654,9 +674,8 @@ def _way(pixels: FloatArray, rates: FloatArray, width: int, height: int, setting
 
 
 def too_little(
-    joint: int, stops: int, visited: float, motion: float, sigma_px: float, core: CoreSettings,
-    settings: TrialSettings,
-) -> Reason | None:  # fmt: skip
+    joint: int, stops: int, visited: float, motion: float, sigma_px: float, core: CoreSettings, settings: TrialSettings
+) -> Reason | None:
     """Why a joint's trial cannot identify it, and the remedy: too few stops, too small a range, or too little motion in
     the images (``motion`` in sigmas of ``sigma_px``); None if it can.
     """
@@ -669,16 +688,26 @@ def too_little(
     )
     if stops < MIN_STOPS or visited < settings.min_range:
         return Reason(
-            "TRIAL_TOO_SMALL", "hold", name, visited, settings.min_range, "rad or m",
+            "TRIAL_TOO_SMALL",
+            "hold",
+            name,
+            visited,
+            settings.min_range,
+            "rad or m",
             f"joint {name} was seen at {stops} stops over {visited:.3f}; at least {MIN_STOPS} stops over "
             f"{settings.min_range} are needed: change calibration.base so that the markers stay in view, or {wider}",
-        )  # fmt: skip
+        )
     if motion < MIN_MOTION_SIGMAS:
         more = MIN_MOTION_SIGMAS / max(motion, 0.1)
         return Reason(
-            "TRIAL_TOO_SMALL", "hold", name, motion, MIN_MOTION_SIGMAS, "sigmas",
+            "TRIAL_TOO_SMALL",
+            "hold",
+            name,
+            motion,
+            MIN_MOTION_SIGMAS,
+            "sigmas",
             f"joint {name} moved the markers by {motion:.1f} sigmas of {sigma_px:.3g} px over {visited:.3f}; at least "
             f"{MIN_MOTION_SIGMAS:g} are needed to see its axis: {wider} ({more:.1f} times as much), put the markers "
             "farther from its axis, or lower the noise (light, larger dots, calibration.frames)",
-        )  # fmt: skip
+        )
     return None

@@ -65,10 +65,14 @@ def start_check(goal_id: str, context: StepContext, model: CellModel, reset_zero
     targets = check_targets(context.settings, model)
     fields = first_visit(targets[0], context.q, context.now_ns, context.settings)
     return CheckMotion(
-        id=goal_id, lease_s=None, lease_until_ns=0, targets=targets, index=0,
+        id=goal_id,
+        lease_s=None,
+        lease_until_ns=0,
+        targets=targets,
+        index=0,
         reset_zeros=reset_zeros,
         **fields,  # type: ignore[arg-type]
-    )  # fmt: skip
+    )
 
 
 def check_step(checking: CheckMotion, context: StepContext) -> SourceOutput:
@@ -86,16 +90,22 @@ def check_step(checking: CheckMotion, context: StepContext) -> SourceOutput:
         if poorest is None:
             checking.seen += 1
         context.emit(
-            "calibration_sample", id=checking.id, joints=mean_joints(checking), samples=samples,
+            "calibration_sample",
+            id=checking.id,
+            joints=mean_joints(checking),
+            samples=samples,
             progress=(checking.index + 1.0) / (last + 1.0),
-        )  # fmt: skip
+        )
         return _next(checking, context)
     if at_target(checking, context):
         if checking.index == last:
             context.emit(
-                "check_finished", id=checking.id, message="check motion done", progress=1.0,
+                "check_finished",
+                id=checking.id,
+                message="check motion done",
+                progress=1.0,
                 name=RESET_ZEROS if checking.reset_zeros else "",
-            )  # fmt: skip
+            )
             return SourceOutput(rest.velocity, finished=True)
         enter(checking, "settle", context)
         return rest

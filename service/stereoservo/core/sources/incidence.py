@@ -62,9 +62,12 @@ def start_incidence(goal: Goal, target: IncidenceTarget, context: StepContext, p
     assert model is not None
     if len(context.settings.cameras) < 2:
         raise RefusalError(
-            "TOO_FEW_CAMERAS", "distances in space need the images of two cameras; the cell has one",
-            value=1.0, threshold=2.0, unit="cameras",
-        )  # fmt: skip
+            "TOO_FEW_CAMERAS",
+            "distances in space need the images of two cameras; the cell has one",
+            value=1.0,
+            threshold=2.0,
+            unit="cameras",
+        )
     of_this_model(target.model_epoch, model.epoch)
     if goal.follow_markers:
         require_followable(goal, True, "incidence", True, context)
@@ -120,8 +123,10 @@ def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> li
             "FEATURE_UNCLEAR",
             f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} different markers, got "
             f"{list(feature.markers)}",
-            value=float(len(set(own))), threshold=float(dimension + 1), unit="markers",
-        )  # fmt: skip
+            value=float(len(set(own))),
+            threshold=float(dimension + 1),
+            unit="markers",
+        )
     pixels, _ = project_points(place.arrays.matrices, np.ascontiguousarray(place.points[own]))
     width = 0.0
     for image in pixels:
@@ -136,8 +141,10 @@ def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> li
         raise RefusalError(
             "COLLINEAR_MARKERS" if dimension == 2 else "FEATURE_UNCLEAR",
             f"{name}: markers {list(feature.markers)} span no {FEATURES[dimension]}: {width:.1f} px apart",
-            value=width, threshold=SPAN_PX, unit="px",
-        )  # fmt: skip
+            value=width,
+            threshold=SPAN_PX,
+            unit="px",
+        )
     return own
 
 
@@ -163,8 +170,10 @@ def _fixed(feature: Feature, dimension: int, name: str, place: BodyState, model_
         raise RefusalError(
             "FEATURE_UNCLEAR",
             f"{name}: a {FEATURES[dimension]} is spanned by {dimension + 1} points, got {len(points)}",
-            value=float(len(points)), threshold=float(dimension + 1), unit="points",
-        )  # fmt: skip
+            value=float(len(points)),
+            threshold=float(dimension + 1),
+            unit="points",
+        )
     try:
         return feature_form(points, dimension, place.arrays.plane_at_infinity, name)
     except GeometryError as error:
@@ -213,9 +222,14 @@ def _drivable(source: IncidenceGoal, context: StepContext, place: BodyState) -> 
     if bad:
         first = bad[0]
         raise RefusalError(
-            first.code, f"{first.subject}: {first.hint}", subject=first.subject, value=first.value,
-            threshold=first.threshold, unit=first.unit, further=bad[1:],
-        )  # fmt: skip
+            first.code,
+            f"{first.subject}: {first.hint}",
+            subject=first.subject,
+            value=first.value,
+            threshold=first.threshold,
+            unit=first.unit,
+            further=bad[1:],
+        )
 
 
 def _has_freedoms(source: IncidenceGoal, scene: Scene, place: BodyState) -> None:
@@ -228,9 +242,8 @@ def _has_freedoms(source: IncidenceGoal, scene: Scene, place: BodyState) -> None
     for name, freedom in zip(source.names, lacking, strict=True):
         if freedom is not None:
             raise RefusalError(
-                "INCIDENCE_NOT_DRIVABLE", f"{name}: the arm lacks a freedom that it needs: {freedom.name}",
-                subject=name,
-            )  # fmt: skip
+                "INCIDENCE_NOT_DRIVABLE", f"{name}: the arm lacks a freedom that it needs: {freedom.name}", subject=name
+            )
 
 
 def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutput:
@@ -250,9 +263,12 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
     error_px = float(step.error_px.max())
     resting = bool((np.abs(step.velocity) < SECOND_AT_REST).all())
     ended = run_ended(
-        source, context, error_px if isfinite(error_px) else None, int((usable.max(axis=0) > 0.0).sum()),
+        source,
+        context,
+        error_px if isfinite(error_px) else None,
+        int((usable.max(axis=0) > 0.0).sum()),
         may_end=may_end(source, context) and (len(second.rates) == 0 or resting),
-    )  # fmt: skip
+    )
     if ended is not None:
         return ended
     still = bool((step.status == int(IncidenceStatus.NOT_FINITE)).any())
@@ -262,10 +278,13 @@ def incidence_motion(source: IncidenceGoal, context: StepContext) -> SourceOutpu
         expected = step.velocity - standing.velocity
     velocity = np.zeros_like(context.q) if still else damp(source, context, step.velocity, expected)
     return SourceOutput(
-        velocity, True, source.goal.speed_scale,
-        error_px=error_px if isfinite(error_px) else None, task_error=step.error_px,
+        velocity,
+        True,
+        source.goal.speed_scale,
+        error_px=error_px if isfinite(error_px) else None,
+        task_error=step.error_px,
         reasons=incidence_reasons(step, task, source.names),
-    )  # fmt: skip
+    )
 
 
 def _task(source: IncidenceGoal) -> IncidenceTask:

@@ -66,9 +66,11 @@ def _inside_limits(target: FloatArray, context: StepContext) -> None:
             raise RefusalError(
                 "JOINT_LIMIT",
                 f"joint {name}: {target[i]:.4f} is outside {low:.4f} … {high:.4f} (limits less the margin)",
-                subject=name, value=float(target[i]), threshold=float(high if target[i] > high else low),
+                subject=name,
+                value=float(target[i]),
+                threshold=float(high if target[i] > high else low),
                 unit="rad or m",
-            )  # fmt: skip
+            )
 
 
 def joint_report(move: JointMove, context: StepContext) -> PlanReport:
@@ -82,8 +84,11 @@ def joint_report(move: JointMove, context: StepContext) -> PlanReport:
                 "KEEP_OUT",
                 f"the straight way in joint space meets keep-out {name!r} at {100.0 * share:.0f} % of it: go by a goal "
                 "beside it",
-                subject=name, value=share, threshold=1.0, unit="of the way",
-            )  # fmt: skip
+                subject=name,
+                value=share,
+                threshold=1.0,
+                unit="of the way",
+            )
     arrays = context.arrays
     count = reported_samples(arrays)
     shares = tuple(k / (count - 1.0) for k in range(count))
@@ -141,9 +146,14 @@ def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
     value = float((move.target if at_end else context.q)[joint])
     upper = high[joint] - value < value - low[joint]
     return Approach(
-        "JOINT_LIMIT", context.settings.joint_names[joint], value, float((high if upper else low)[joint]),
-        float(rooms[joint]), "rad or m", 1.0 if at_end else 0.0,
-    )  # fmt: skip
+        "JOINT_LIMIT",
+        context.settings.joint_names[joint],
+        value,
+        float((high if upper else low)[joint]),
+        float(rooms[joint]),
+        "rad or m",
+        1.0 if at_end else 0.0,
+    )
 
 
 # -- every step -----------------------------------------------------------------------------------------------
@@ -201,10 +211,15 @@ def joint_move_step(move: JointMove, context: StepContext) -> SourceOutput:
     if elapsed_s > move.time_limit_s:
         name = context.settings.joint_names[worst]
         reason = Reason(
-            "TIME_LIMIT", "hold", name, elapsed_s, move.time_limit_s, "s",
+            "TIME_LIMIT",
+            "hold",
+            name,
+            elapsed_s,
+            move.time_limit_s,
+            "s",
             f"joint {name} is {abs(move.target[worst] - context.q[worst]):.4f} from its target "
             f"({context.settings.arrival_origin(worst)}): is it blocked, or at a limit?",
-        )  # fmt: skip
+        )
         context.emit("goal_aborted", id=move.id, message="joint move not finished in time", reasons=(reason,))
         return SourceOutput(np.zeros_like(context.q), finished=True)
     return SourceOutput(

@@ -50,9 +50,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
-AIM = (
-    "used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target",
-)  # fmt: skip
+AIM = ("used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target")
 """Arrays of a goal that are copied to the workspace for a law's kernel."""
 SELF_MOTION_RATE = 0.5
 """Rate [1/s], relative to a joint's half range, at which self-motion moves a joint away from a limit."""
@@ -106,9 +104,8 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     if len(velocity) > RIGID_FREEDOMS and source.plan is None:  # a plan has already avoided the limits
         velocity = velocity + away_from_limits(context)
     return SourceOutput(
-        velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error,
-        reasons=law.reasons(step),
-    )  # fmt: skip
+        velocity, True, source.goal.speed_scale, error_px=error_px, task_error=step.error, reasons=law.reasons(step)
+    )
 
 
 def wait_for_target(source: Follower, context: StepContext) -> SourceOutput | None:
@@ -313,9 +310,11 @@ def follow_goal(block: Record, room: Record) -> bool:
     n, c, m = work.joints, work.cameras, work.markers
     aim = Aim(work.used[:c], work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2)))
     measured, error_px, work.seen = _measure(
-        work.weights[: c * m].reshape((c, m)), work.pixels[: 2 * c * m].reshape((c, m, 2)), aim,
+        work.weights[: c * m].reshape((c, m)),
+        work.pixels[: 2 * c * m].reshape((c, m, 2)),
+        aim,
         work.usable[: c * m].reshape((c, m)),
-    )  # fmt: skip
+    )
     work.measured, work.error_px = int(measured), error_px
     arm, points = arm_of(room), work.body[: 4 * m].reshape((m, 4))
     joints = work.q[:n] + memory.correction[:n]
@@ -352,9 +351,14 @@ def away_from_limits(context: StepContext) -> FloatArray:
 
 
 def run_ended(
-    source: LawRun, context: StepContext, error_px: float | None, seen: int, wanted: FloatArray | None = None, *,
+    source: LawRun,
+    context: StepContext,
+    error_px: float | None,
+    seen: int,
+    wanted: FloatArray | None = None,
+    *,
     may_end: bool = True,
-) -> SourceOutput | None:  # fmt: skip
+) -> SourceOutput | None:
     """The output of a law's step that is out of time, sees too few markers, or has reached the goal; None if the goal
     stays active.
 
@@ -364,9 +368,13 @@ def run_ended(
     needed = MIN_MARKERS if seen >= MIN_MARKERS or wanted is None else markers_needed(wanted)
     terms = RunTerms(source.tolerance_px, source.hold_frames, source.time_limit_s)
     found = account_run(
-        context.state.block.record, error_px is not None, math.nan if error_px is None else error_px, seen >= needed,
-        context.dt_s, terms,
-    )  # fmt: skip
+        context.state.block.record,
+        error_px is not None,
+        math.nan if error_px is None else error_px,
+        seen >= needed,
+        context.dt_s,
+        terms,
+    )
     return _ended(source, context, Found(found, error_px, seen, needed), wanted, may_end=may_end)
 
 
@@ -392,9 +400,14 @@ def _ended(
         return _out_of_time(source, context, error_px)
     if seen < needed:
         reason = Reason(
-            "TOO_FEW_MARKERS", "hold", "", float(seen), float(needed), "markers",
+            "TOO_FEW_MARKERS",
+            "hold",
+            "",
+            float(seen),
+            float(needed),
+            "markers",
             "bring the goal's markers back into view",
-        )  # fmt: skip
+        )
         return SourceOutput(np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(reason,))
     if run == SETTLED and may_end:
         frames = context.state.block.numbers.run.last_frames
@@ -517,12 +530,17 @@ def velocity_of(step: LawStep, joints: int) -> FloatArray:
 
 def _law_failed(source: ServoGoal, context: StepContext, error_px: float | None, error: Exception) -> SourceOutput:
     reason = Reason(
-        "LAW_FAILED", "hold", source.law, None, None, "",
+        "LAW_FAILED",
+        "hold",
+        source.law,
+        None,
+        None,
+        "",
         f"its step raised {type(error).__name__}: {error}; take another law, and tell the author of this one",
-    )  # fmt: skip
+    )
     context.emit(
         "goal_aborted", id=source.goal.id, message=f"law {source.law!r} failed", error_px=error_px, reasons=(reason,)
-    )  # fmt: skip
+    )
     return SourceOutput(np.zeros_like(context.q), finished=True, error_px=error_px)
 
 
@@ -537,9 +555,12 @@ def _out_of_time(source: LawRun, context: StepContext, error_px: float | None) -
         hint = f"the error is still {error_px:.3f} px (tolerance {source.tolerance_px} px)"
     reason = Reason("TIME_LIMIT", "hold", "", run.moved_s, source.time_limit_s, "s", hint)
     context.emit(
-        "goal_aborted", id=source.goal.id, message="not reached in time", error_px=error_px,
+        "goal_aborted",
+        id=source.goal.id,
+        message="not reached in time",
+        error_px=error_px,
         reasons=(reason, *held, *source.reasons),
-    )  # fmt: skip
+    )
     return SourceOutput(np.zeros_like(context.q), finished=True, error_px=error_px)
 
 
@@ -566,9 +587,13 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
     ahead, _ = _planned_set_points(source, scene)
     joints = planned_joints(plan, begin_s, source.plan_s, context.dt_s, context.q)
     return task._replace(
-        set_points=set_points, wanted=wanted, rates=(ahead - set_points) / context.dt_s, joint_rates=joints.rates,
-        joint_error=joints.error, joint_weight=joints.weight,
-    )  # fmt: skip
+        set_points=set_points,
+        wanted=wanted,
+        rates=(ahead - set_points) / context.dt_s,
+        joint_rates=joints.rates,
+        joint_error=joints.error,
+        joint_weight=joints.weight,
+    )
 
 
 def _planned_set_points(source: ServoGoal, scene: Scene) -> tuple[FloatArray, float]:

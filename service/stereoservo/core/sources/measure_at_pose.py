@@ -173,10 +173,15 @@ def too_slow(visit: PoseMeasurement, context: StepContext, trial: TrialSettings)
     joint = farthest(context.q, visit.target, context.settings)
     name = context.settings.joint_names[joint]
     return Reason(
-        "STOP_NOT_REACHED", "hold", name, float(context.q[joint]), float(visit.target[joint]), "rad or m",
+        "STOP_NOT_REACHED",
+        "hold",
+        name,
+        float(context.q[joint]),
+        float(visit.target[joint]),
+        "rad or m",
         f"joint {name} did not reach its stop within {limit_s:.0f} s ({context.settings.arrival_origin(joint)}): a "
         "limit, a keep-out, or a blocked joint",
-    )  # fmt: skip
+    )
 
 
 def _of_body(ids: IntArray, static: tuple[int, ...]) -> int:
@@ -244,20 +249,35 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...
     seen = _of_body(poorest.ids, static)
     if poorest.frames == 0:
         return Reason(
-            "CAMERA_SILENT", "hold", poorest.camera, 0.0, float(trial.frames), "frames",
+            "CAMERA_SILENT",
+            "hold",
+            poorest.camera,
+            0.0,
+            float(trial.frames),
+            "frames",
             f"camera {poorest.camera} delivers no frames: is it connected? See the daemon's log",
-        )  # fmt: skip
+        )
     if seen >= trial.min_markers:
         return Reason(
-            "CAMERA_SILENT", "hold", poorest.camera, float(poorest.frames), float(trial.frames), "frames",
+            "CAMERA_SILENT",
+            "hold",
+            poorest.camera,
+            float(poorest.frames),
+            float(trial.frames),
+            "frames",
             f"camera {poorest.camera} delivered {poorest.frames} of {trial.frames} frames at the base in "
             f"{trial.wait_s:g} s: a slow or interrupted camera; see the daemon's log, or raise calibration.wait_s",
-        )  # fmt: skip
+        )
     return Reason(
-        "MARKERS_NOT_SEEN", "hold", poorest.camera, float(seen), float(trial.min_markers), "markers",
+        "MARKERS_NOT_SEEN",
+        "hold",
+        poorest.camera,
+        float(seen),
+        float(trial.min_markers),
+        "markers",
         f"camera {poorest.camera} shows {seen} markers in {poorest.frames} frames at the base: "
         "check light, focus, and that the base configuration shows the marker body to every camera",
-    )  # fmt: skip
+    )
 
 
 def blocked(target: FloatArray, moving: list[int], context: StepContext, back: FloatArray | None = None) -> str:

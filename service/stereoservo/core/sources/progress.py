@@ -391,17 +391,22 @@ def model_parameters(model: CellModel, cameras: tuple[str, ...]) -> ModelParamet
                 kept.append(index >= 0)
     used = np.flatnonzero(kept)
     return ModelParameters(
-        np.array(directions).reshape(-1, 16)[used], np.array(parts, np.int64)[used],
-        np.array(indices, np.int64)[used], np.ascontiguousarray(given.covariance[np.ix_(used, used)]),
-    )  # fmt: skip
+        np.array(directions).reshape(-1, 16)[used],
+        np.array(parts, np.int64)[used],
+        np.array(indices, np.int64)[used],
+        np.ascontiguousarray(given.covariance[np.ix_(used, used)]),
+    )
 
 
 @kernel
 def pixel_slopes(
     parameters: tuple[FloatArray, IntArray, IntArray, FloatArray],
-    chain: tuple[FloatArray, KindArray, FloatArray, bool], q: FloatArray, marker_points: FloatArray,
-    cameras: tuple[FloatArray, FloatArray], sights_of: tuple[IntArray, IntArray],
-) -> FloatArray:  # fmt: skip
+    chain: tuple[FloatArray, KindArray, FloatArray, bool],
+    q: FloatArray,
+    marker_points: FloatArray,
+    cameras: tuple[FloatArray, FloatArray],
+    sights_of: tuple[IntArray, IntArray],
+) -> FloatArray:
     """Derivatives (2 k, p) of the innovations of k observations, in ideal pixels, by the ``parameters`` of a model,
     with the joints at ``q`` (n,).
 
@@ -536,9 +541,13 @@ def explained(d: FloatArray, C: FloatArray, columns: FloatArray, first: int, las
 
 @kernel
 def compare_causes(
-    d: FloatArray, C: FloatArray, displaced: FloatArray, jacobian: FloatArray, begins: IntArray,
+    d: FloatArray,
+    C: FloatArray,
+    displaced: FloatArray,
+    jacobian: FloatArray,
+    begins: IntArray,
     found: tuple[FloatArray, FloatArray],
-) -> bool:  # fmt: skip
+) -> bool:
     """Reduction of the chi-square of ``d`` (2 k,) under each hypothesis. Writes to the gains (c + 1,) of ``found`` the
     reduction if each camera was displaced, and if the joints deviate from their readings; to its effects (c,) the rms
     displacement of each camera's pixels in that case [px].
@@ -678,9 +687,13 @@ def _moment(
     jacobian = image_jacobian(operators, arrays.matrices, points)[cameras, markers].reshape(len(d), -1)
     C = np.diag(np.repeat(block.settled_variance[cameras, markers] / count**2 + BIAS_PX**2, 2))
     slopes = pixel_slopes(
-        (directions, part, index, covariance), (arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first), q,
-        arrays.marker_points, (arrays.matrices, arrays.lenses), (cameras, markers),
-    )  # fmt: skip
+        (directions, part, index, covariance),
+        (arrays.generators, arrays.kinds, arrays.zero, arrays.tip_first),
+        q,
+        arrays.marker_points,
+        (arrays.matrices, arrays.lenses),
+        (cameras, markers),
+    )
     added_covariance(C, slopes, covariance)
     if arrays.joint_accuracy is not None:
         deviations = arrays.joint_accuracy.deviations((q - arrays.zero)[None])[0]
@@ -710,17 +723,27 @@ def _affine_motions(
 def _reason(names: tuple[str, ...], effect_px: float, limit_px: float, tolerance_px: float, found: int) -> Reason:
     if found == DOUBTFUL:
         return Reason(
-            "CAMERAS_COMPARED", "slow", ", ".join(names), effect_px, limit_px, "px",
+            "CAMERAS_COMPARED",
+            "slow",
+            ", ".join(names),
+            effect_px,
+            limit_px,
+            "px",
             f"camera {' or '.join(names)} may be off by {effect_px:.3g} px rms (limit {limit_px:.3g} px): more frames "
             "are averaged before the goal counts as reached",
-        )  # fmt: skip
+        )
     words = named(names) if found == DISPLACED else f"camera {' or '.join(names)}"
     causes = f"{words} crept or was moved"
     if found == UNDECIDED:
         causes = f"either {words} crept or was moved, or a joint's zero is off, or the marker body slipped on the arm"
     return Reason(
-        "CAMERAS_DISAGREE", "hold", ", ".join(names), effect_px, limit_px, "px",
+        "CAMERAS_DISAGREE",
+        "hold",
+        ", ".join(names),
+        effect_px,
+        limit_px,
+        "px",
         f"the error is within its tolerance of {tolerance_px:g} px, but {words} is off by {effect_px:.3g} px rms "
         f"beside what the joints and the other cameras show (limit {limit_px:.3g} px): {causes}. Run calibrate "
         "--check; put back what moved, or calibrate",
-    )  # fmt: skip
+    )

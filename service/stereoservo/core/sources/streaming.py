@@ -70,8 +70,10 @@ def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: 
         raise RefusalError(
             "TOO_FEW_MARKERS",
             f"the moved target shows {shown} of the goal's markers; at least {MIN_MARKERS} are needed",
-            value=float(shown), threshold=float(MIN_MARKERS), unit="markers",
-        )  # fmt: skip
+            value=float(shown),
+            threshold=float(MIN_MARKERS),
+            unit="markers",
+        )
     stream = source.stream or Stream(
         empty_track(len(source.wanted), source.wanted.shape[1]),
         ClientClock(),
@@ -111,8 +113,10 @@ def _stamp(command: UpdateGoal, stream: Stream, context: StepContext) -> float:
             "STAMP_NOT_LATER",
             f"stamp_s {command.stamp_s} is not later than the one before, {stream.track.stamp_s}: stamps of one stream "
             "increase",
-            value=command.stamp_s if isfinite(command.stamp_s) else None, threshold=stream.track.stamp_s, unit="s",
-        )  # fmt: skip
+            value=command.stamp_s if isfinite(command.stamp_s) else None,
+            threshold=stream.track.stamp_s,
+            unit="s",
+        )
     return command.stamp_s
 
 
@@ -128,8 +132,11 @@ def _no_jump(source: ServoGoal, set_points: FloatArray, wanted: FloatArray, cont
             "TARGET_JUMP",
             f"marker {marker} would jump by {largest:.1f} px; a streamed target moves by at most {limit:.0f} px a "
             "message: send a new goal for another place",
-            subject=str(marker), value=largest, threshold=limit, unit="px",
-        )  # fmt: skip
+            subject=str(marker),
+            value=largest,
+            threshold=limit,
+            unit="px",
+        )
 
 
 def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, wanted: FloatArray) -> None:
@@ -146,9 +153,11 @@ def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, wante
             "NOT_RIGID",
             f"no displacement of the marker body explains the moved target: marker {pose.worst_marker} is off by "
             f"{pose.worst_px:.2f} px (up to {MAX_GOAL_RESIDUAL_PX} px is accepted)",
-            subject=str(pose.worst_marker), value=pose.worst_px if isfinite(pose.worst_px) else None,
-            threshold=MAX_GOAL_RESIDUAL_PX, unit="px",
-        )  # fmt: skip
+            subject=str(pose.worst_marker),
+            value=pose.worst_px if isfinite(pose.worst_px) else None,
+            threshold=MAX_GOAL_RESIDUAL_PX,
+            unit="px",
+        )
 
 
 def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool:
@@ -167,9 +176,14 @@ def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool
     source.rates = rates if moving else np.zeros_like(rates)
     if source.pose_known:
         pose, _ = refined_pose(
-            arrays, displacement_basis(arrays, prediction.operators), source.target_points, _identity(),
-            source.set_points, given, 1 if arrays.sights > PIXELS_AT_ONCE else FOLLOWING_REFINEMENTS,
-        )  # fmt: skip
+            arrays,
+            displacement_basis(arrays, prediction.operators),
+            source.target_points,
+            _identity(),
+            source.set_points,
+            given,
+            1 if arrays.sights > PIXELS_AT_ONCE else FOLLOWING_REFINEMENTS,
+        )
         source.target_points = pose.points
         source.centre_target = transform_points(pose.displacement, source.centre_target[None])[0]
     if not moving:
@@ -183,9 +197,11 @@ def feed_forward(source: ServoGoal, context: StepContext, active: FloatArray) ->
     assert prediction is not None
     n = prediction.operators.shape[0]
     velocity, _ = damped_least_squares(
-        np.ascontiguousarray(prediction.jacobian).reshape(-1, n), source.rates.reshape(-1),
-        np.repeat(active.reshape(-1), 2), FEED_FORWARD_DAMPING,
-    )  # fmt: skip
+        np.ascontiguousarray(prediction.jacobian).reshape(-1, n),
+        source.rates.reshape(-1),
+        np.repeat(active.reshape(-1), 2),
+        FEED_FORWARD_DAMPING,
+    )
     return velocity
 
 

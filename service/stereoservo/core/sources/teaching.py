@@ -61,21 +61,29 @@ def teach_step(context: StepContext) -> None:
     if bool((teaching.frames >= teaching.frames_wanted).all()):
         state.teaching = None
         context.emit(
-            "taught", request=teaching.request, name=teaching.name, joints=context.q,
-            samples=averages(teaching, settings), message=f"goal {teaching.name!r} taught",
-        )  # fmt: skip
+            "taught",
+            request=teaching.request,
+            name=teaching.name,
+            joints=context.q,
+            samples=averages(teaching, settings),
+            message=f"goal {teaching.name!r} taught",
+        )
     elif (context.now_ns - teaching.started_ns) * 1e-9 > TEACH_TIMEOUT_S:
         slow = settings.cameras[int(teaching.frames.argmin())].name
         _give_up(
-            teaching, context,
+            teaching,
+            context,
             f"camera {slow} gave {int(teaching.frames.min())} of {teaching.frames_wanted} frames in "
             f"{TEACH_TIMEOUT_S:.0f} s",
-        )  # fmt: skip
+        )
 
 
 def _give_up(teaching: TeachingState, context: StepContext, why: str) -> None:
     context.state.teaching = None
     context.emit(
-        "warning", request=teaching.request, accepted=False, name=teaching.name,
+        "warning",
+        request=teaching.request,
+        accepted=False,
+        name=teaching.name,
         message=f"teaching {teaching.name!r} failed: {why}",
-    )  # fmt: skip
+    )

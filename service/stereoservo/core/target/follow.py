@@ -73,13 +73,15 @@ def require_followable(goal: Goal, follows_streams: bool, law: str, pose_known: 
             f"marker {', '.join(own)} is on the body that the arm carries; markers of the target are others, which "
             "both cameras see",
             subject=own[0],
-        )  # fmt: skip
+        )
     if len(ids) < FEWEST_TO_FIND and not goal.follow_seen:
         raise RefusalError(
             "TOO_FEW_MARKERS",
             f"{len(ids)} markers of the target are named; at least {FEWEST_TO_FIND} are needed",
-            value=float(len(ids)), threshold=float(FEWEST_TO_FIND), unit="markers",
-        )  # fmt: skip
+            value=float(len(ids)),
+            threshold=float(FEWEST_TO_FIND),
+            unit="markers",
+        )
     if goal.follow_seen:
         _stated(goal, context, arrays)
 
@@ -110,8 +112,10 @@ def _stated(
             "TOO_FEW_MARKERS",
             f"{int(there.sum())} of the target's markers are shown by two cameras where the goal holds; at least "
             f"{FEWEST} are needed: teach it with the target in view",
-            value=float(there.sum()), threshold=float(FEWEST), unit="markers",
-        )  # fmt: skip
+            value=float(there.sum()),
+            threshold=float(FEWEST),
+            unit="markers",
+        )
     return ids[there], np.ascontiguousarray(points[there]), sights[:, there].copy(), seen[:, there].copy()
 
 
@@ -141,9 +145,11 @@ def start_following(source: Follower, context: StepContext) -> None:
         source.followed = FollowedFeatures(reference=reference, fixed=source.fixed.copy(), drift=np.zeros((4, 4)))
         return
     source.followed = Followed(
-        reference=reference, set_points=source.set_points.copy(), target_points=source.target_points.copy(),
+        reference=reference,
+        set_points=source.set_points.copy(),
+        target_points=source.target_points.copy(),
         centre_target=source.centre_target.copy(),
-    )  # fmt: skip
+    )
 
 
 def follow_target(source: Follower, context: StepContext) -> Reason | None:
@@ -178,7 +184,7 @@ def _missed(context: StepContext) -> bool:
 
 def _tell(
     kind: Literal["target_seen", "target_unseen", "target_met"], message: str, source: Follower, context: StepContext
-) -> None:  # fmt: skip
+) -> None:
     assert source.followed is not None
     source.followed.told = kind
     ids = ", ".join(str(marker) for marker in source.goal.follow_markers)

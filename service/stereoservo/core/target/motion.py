@@ -381,9 +381,13 @@ def gate_sights(
 
 @kernel
 def fold_frame(
-    D: FloatArray, basis: FloatArray, motion: Motion, compared: tuple[FloatArray, FloatArray], variances: FloatArray,
+    D: FloatArray,
+    basis: FloatArray,
+    motion: Motion,
+    compared: tuple[FloatArray, FloatArray],
+    variances: FloatArray,
     used: FloatArray,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Correct the pose ``D`` and its ``motion`` by a frame, in place; returns the twist (6,) of the correction.
 
     ``compared``: residuals (k, 2) and Jacobian, from `compare`.
@@ -463,9 +467,8 @@ def find_stated(
 
 @kernel
 def find_pose(
-    basis: FloatArray, matrices: FloatArray, start: FloatArray, points: FloatArray, sights: FloatArray,
-    seen: FloatArray,
-) -> tuple[FloatArray, float]:  # fmt: skip
+    basis: FloatArray, matrices: FloatArray, start: FloatArray, points: FloatArray, sights: FloatArray, seen: FloatArray
+) -> tuple[FloatArray, float]:
     """The displacement (4, 4) of ``points`` (k, 4) that explains ``sights`` (c, k, 2), where ``seen`` (c, k), from a
     ``start`` (4, 4), and its residual [px] rms.
 

@@ -110,9 +110,12 @@ def _frame_of(
     arrays = context.derived.arrays
     assert arrays is not None
     sights, variances, seen = target_sights(
-        body.ids, observation.ids.astype(np.int64), np.array(observation.pixels, np.float64, order="C"),
-        np.array(observation.covariances, np.float64, order="C"), arrays.lenses[camera],
-    )  # fmt: skip
+        body.ids,
+        observation.ids.astype(np.int64),
+        np.array(observation.pixels, np.float64, order="C"),
+        np.array(observation.covariances, np.float64, order="C"),
+        arrays.lenses[camera],
+    )
     return sights, variances, seen * (1.0 - context.state.watching.masked) if body.carried else seen
 
 
@@ -184,9 +187,14 @@ def displacements_of(arrays: ModelArrays) -> FloatArray | None:
 
 
 def _find(
-    body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray, carrier: FloatArray,
+    body: TargetBody,
+    camera: int,
+    t_ns: int,
+    sights: FloatArray,
+    seen: FloatArray,
+    carrier: FloatArray,
     arrays: ModelArrays,
-) -> None:  # fmt: skip
+) -> None:
     """Find the target from this frame, and the previous ones of the other cameras."""
     basis, metric = displacements_of(arrays), arrays.metric_basis is not None
     if basis is None:
@@ -273,9 +281,10 @@ def tell_untrackable(context: StepContext) -> None:
     if model is None or context.state.target is not None or not context.settings.body_moves:
         return
     reason = Reason(
-        "TARGET_NOT_TRACKABLE", "slow",
+        "TARGET_NOT_TRACKABLE",
+        "slow",
         hint="calibrate with a body by which the model becomes metric, or with an arm of six joints",
-    )  # fmt: skip
+    )
     context.emit(
         "warning",
         message=f"[scene] moves, but the model is {model.stratum}, and the {len(model.joint_names)} joints do not make "
@@ -288,9 +297,13 @@ def tell_untrackable(context: StepContext) -> None:
 
 
 def _follow(
-    body: TargetBody, camera: int, t_ns: int, frame: tuple[FloatArray, FloatArray, FloatArray], carrier: FloatArray,
+    body: TargetBody,
+    camera: int,
+    t_ns: int,
+    frame: tuple[FloatArray, FloatArray, FloatArray],
+    carrier: FloatArray,
     context: StepContext,
-) -> None:  # fmt: skip
+) -> None:
     sights, variances, seen = frame
     state, arrays = context.state, context.derived.arrays
     assert arrays is not None
@@ -336,9 +349,8 @@ def _follow(
 
 
 def _fold(
-    body: TargetBody, left: FloatArray, J: FloatArray,
-    view: View, variances: FloatArray, used: FloatArray, rounds: int,
-) -> None:  # fmt: skip
+    body: TargetBody, left: FloatArray, J: FloatArray, view: View, variances: FloatArray, used: FloatArray, rounds: int
+) -> None:
     """Correct the state by a frame, as in `fold_frame`, with repeated linearisation about the result (Bell and Cathey
     1993):
     one large step from far away leaves unexplained residuals, which would be attributed to a joint.

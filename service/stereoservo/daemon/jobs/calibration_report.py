@@ -469,7 +469,11 @@ def draw_vectors(model: CellModel, rest: Residuals) -> Figure:
         _view(axes, f"{camera.name}, magnified {gain:.3g} times", camera.width, camera.height)
         if mine.any():
             axes.quiver(
-                *rest.data.pixels[mine].T, *(gain * rest.pixels[mine]).T, angles="xy", scale_units="xy", scale=1.0,
+                *rest.data.pixels[mine].T,
+                *(gain * rest.pixels[mine]).T,
+                angles="xy",
+                scale_units="xy",
+                scale=1.0,
                 width=0.002,
-            )  # fmt: skip
+            )
     return figure

@@ -85,9 +85,8 @@ def main() -> int:
     arguments = child_arguments(parser)
     try:
         examined, report = check_and_remember(
-            load_trials(arguments.check), arguments.model, arguments.history, arguments.limit_px,
-            arguments.body_moves,
-        )  # fmt: skip
+            load_trials(arguments.check), arguments.model, arguments.history, arguments.limit_px, arguments.body_moves
+        )
         print_line({"check": msgspec.to_builtins(report)})
         if arguments.reset_to is not None:
             reset = reset_and_save(examined, report, arguments.reset_to, arguments.epoch)

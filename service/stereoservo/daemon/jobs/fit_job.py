@@ -103,10 +103,14 @@ def report_fit(
     from stereoservo.daemon.jobs.calibration_report import write_report
 
     return write_report(
-        report_folder(model_path), trials, assessment, trials_path=trials_path,
-        model=None if result is None else result.model, report=None if result is None else result.report,
+        report_folder(model_path),
+        trials,
+        assessment,
+        trials_path=trials_path,
+        model=None if result is None else result.model,
+        report=None if result is None else result.report,
         known_length=known_length,
-    )  # fmt: skip
+    )
 
 
 def main() -> int:

@@ -141,7 +141,7 @@ def main() -> int:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         model, report = refine_model(
             load_model(arguments.base), load_trials(arguments.poses), used=load_model(arguments.used), created=created
-        )  # fmt: skip
+        )
         save_model(model, arguments.new)
     except (CalibrationError, ModelFileError, OSError) as error:
         print_line(error_line(error))

@@ -74,9 +74,14 @@ def postures(
         )
     structure = recognise(model) if recognition is None else recognition
     found = inverse_kinematics(
-        seen.chain, points=model.marker_points[known], targets=targets[known], seed=seed, limits=limits,
-        tolerance=TOLERANCE, recognition=structure,
-    )  # fmt: skip
+        seen.chain,
+        points=model.marker_points[known],
+        targets=targets[known],
+        seed=seed,
+        limits=limits,
+        tolerance=TOLERANCE,
+        recognition=structure,
+    )
     images = refined_on_images(seen, found, model.marker_points, pixels, sigma, limits=limits)
     zero = seen.chain.zero
 

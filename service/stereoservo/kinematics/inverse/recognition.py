@@ -182,8 +182,9 @@ def structure(arm: ProjectiveChain | CellModel) -> tuple[Evidence, ...]:
     pairs = list(pairwise(turning))
     parallel = [examined(arm, "parallel", pair) for pair in pairs]
     alike = {told.joints for told in parallel if told.holds}
-    triples = [three for three in zip(turning, turning[1:], turning[2:], strict=False)
-               if not {three[:2], three[1:]} & alike]  # fmt: skip
+    triples = [
+        three for three in zip(turning, turning[1:], turning[2:], strict=False) if not {three[:2], three[1:]} & alike
+    ]
     through = [told for three in triples if (told := examined(arm, "common_point", three)).holds]
     told_of = {pair for told in through for pair in pairwise(told.joints)}
     met = [examined(arm, "common_point", pair) for pair in pairs if pair not in alike | told_of]

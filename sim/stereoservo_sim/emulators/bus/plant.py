@@ -87,9 +87,7 @@ class _Body:
         now = self.command = self.read()
         if now.brake_closed and not before.brake_closed:
             self.braking = abs(self.velocity) / self.settings.brake_s
-        return (now.powered, now.brake_closed, now.blocked) != (
-            before.powered, before.brake_closed, before.blocked,
-        )  # fmt: skip
+        return (now.powered, now.brake_closed, now.blocked) != (before.powered, before.brake_closed, before.blocked)
 
     def resting(self) -> bool:
         """Whether neither the joint nor its set-point moves."""

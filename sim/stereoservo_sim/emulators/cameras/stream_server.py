@@ -499,10 +499,13 @@ def serve_cameras(
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     gc.freeze()  # what was imported is not looked through again
     printer.say(
-        "ready", f"listening on {server.url}: {', '.join(server.streams.values())}", channel=server.url,
-        streams={name: server.url + path for name, path in server.streams.items()}, t_ns=emulator.start_ns,
+        "ready",
+        f"listening on {server.url}: {', '.join(server.streams.values())}",
+        channel=server.url,
+        streams={name: server.url + path for name, path in server.streams.items()},
+        t_ns=emulator.start_ns,
         pid=os.getpid(),
-    )  # fmt: skip
+    )
     try:
         server.run(ended)
     finally:

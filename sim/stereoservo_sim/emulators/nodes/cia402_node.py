@@ -385,8 +385,13 @@ SUPPORTED_MODES = sum(1 << mode - 1 for mode in MODES)
 SAVE, LOAD = 0x65766173, 0x64616F6C
 """Signatures of 0x1010 and 0x1011: "save", "load"."""
 OPTION_CODES = {
-    0x6007: range(4), 0x605A: range(9), 0x605B: range(2), 0x605C: range(2), 0x605D: range(1, 5), 0x605E: range(5),
-}  # fmt: skip
+    0x6007: range(4),
+    0x605A: range(9),
+    0x605B: range(2),
+    0x605C: range(2),
+    0x605D: range(1, 5),
+    0x605E: range(5),
+}
 """What this drive offers of each."""
 
 

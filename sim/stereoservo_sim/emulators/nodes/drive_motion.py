@@ -54,10 +54,15 @@ class Ramp(IntEnum):
 
 
 STATUS = {
-    Cia402State.NOT_READY: 0x00, Cia402State.SWITCH_ON_DISABLED: 0x40, Cia402State.READY: 0x21,
-    Cia402State.SWITCHED_ON: 0x23, Cia402State.ENABLED: 0x27, Cia402State.QUICK_STOP: 0x07,
-    Cia402State.FAULT_REACTION: 0x0F, Cia402State.FAULT: 0x08,
-}  # fmt: skip
+    Cia402State.NOT_READY: 0x00,
+    Cia402State.SWITCH_ON_DISABLED: 0x40,
+    Cia402State.READY: 0x21,
+    Cia402State.SWITCHED_ON: 0x23,
+    Cia402State.ENABLED: 0x27,
+    Cia402State.QUICK_STOP: 0x07,
+    Cia402State.FAULT_REACTION: 0x0F,
+    Cia402State.FAULT: 0x08,
+}
 """Bits 0 to 3, 5 and 6 of the status word (0x6041)."""
 FAULT_RESET = 0x80
 HALT = 0x100

@@ -109,9 +109,11 @@ def laid_out(robot: Robot, place: ArmPlace, mount: Mount, base: FloatArray) -> S
         facing = rotation("y", 6.0) @ rotation("x", 180.0) @ rotation("z", -85.0)
         stand = flange @ flange_to_rig @ translation(0.0, 0.0, distance) @ facing @ translation(*-middle)
         rig = stereo_rig(
-            inverse_pose(flange_to_rig), baseline=place.baseline_m, focal=place.focal_px or 500.0,
+            inverse_pose(flange_to_rig),
+            baseline=place.baseline_m,
+            focal=place.focal_px or 500.0,
             vergence=2.0 * float(np.arctan(0.5 * place.baseline_m / distance)),
-        )  # fmt: skip
+        )
         return SimulatedCell(robot, body, rig, base, stand)
     distance = place.distance_m or 1.4
     body = roof_body(roll=float(np.deg2rad(-95.0)), stand_off=0.0)
@@ -120,9 +122,11 @@ def laid_out(robot: Robot, place: ArmPlace, mount: Mount, base: FloatArray) -> S
     ahead = (flange @ carried)[:3, 2]
     up = np.array([0.0, 0.0, 1.0]) if abs(ahead[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     rig = stereo_rig(
-        look_at(target + distance * ahead, target, up), baseline=place.baseline_m, focal=place.focal_px or 800.0,
+        look_at(target + distance * ahead, target, up),
+        baseline=place.baseline_m,
+        focal=place.focal_px or 800.0,
         vergence=2.4 * float(np.arctan(0.5 * place.baseline_m / distance)),
-    )  # fmt: skip
+    )
     return SimulatedCell(robot, body, rig, base)
 
 

@@ -22,9 +22,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName, JointSpec
 from stereoservo_sim.world.robots import Capsule, Robot
 
-MOVING: dict[str, JointKindName] = {
-    "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
-}  # fmt: skip
+MOVING: dict[str, JointKindName] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 LARGEST = 1e6
 """Beyond, a number is a damaged one [m, kg, rad]; but for limits, where large ones mean none."""
 NO_LIMIT = 1e39
