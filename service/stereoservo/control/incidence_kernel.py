@@ -3,8 +3,8 @@ planes, damped least-squares joint velocity, second task in the null space.
 
 A moving point X of the body and a fixed point, line or plane, ``base + Σ s_k d_k`` with ``base`` of height 1 and
 directions of height 0, are compared in the images: ``A`` (2c, 4), the gradient of X's pixels in all cameras, converts
-differences of points of height 1 into pixels. The residual is the part of ``A (X - base)`` outside the span of ``A
-d_k``: three, two or one conditions on X, whatever the number of cameras.
+differences of points of height 1 into pixels. The residual is the part of ``A (X - base)`` outside the span of
+``A d_k``: three, two or one conditions on X, whatever the number of cameras.
 """
 
 from __future__ import annotations

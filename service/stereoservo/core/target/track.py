@@ -352,8 +352,7 @@ def _fold(
     body: TargetBody, left: FloatArray, J: FloatArray, view: View, variances: FloatArray, used: FloatArray, rounds: int
 ) -> None:
     """Correct the state by a frame, as in `fold_frame`, with repeated linearisation about the result (Bell and Cathey
-    1993):
-    one large step from far away leaves unexplained residuals, which would be attributed to a joint.
+    1993): one large step from far away leaves unexplained residuals, which would be attributed to a joint.
     """
     for _ in range(rounds - 1):
         D, motion = body.displacement.copy(), (body.twist.copy(), body.rate.copy(), body.covariance.copy())
