@@ -135,7 +135,8 @@ def _telling() -> Iterator[DemonstrationProgress]:
     """Reporter of progress: a bar on a terminal, plain lines elsewhere; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield DemonstrationProgress(tell=_line(console), progress=lambda _: None)
+        tell_line = _line(console)
+        yield DemonstrationProgress(tell=tell_line, progress=tenths(tell_line))
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
@@ -146,6 +147,23 @@ def _telling() -> Iterator[DemonstrationProgress]:
             bar.update(task, description=text[:60])
 
         yield DemonstrationProgress(tell=tell, progress=lambda fraction: bar.update(task, completed=fraction))
+
+
+def tenths(tell: Callable[[str], None]) -> Callable[[float], None]:
+    """Callback for the completed fraction of a task: ``tell`` gets a line at each tenth, and again where one task ends
+    and the next begins.
+    """
+    reported = 0
+
+    def progress(fraction: float) -> None:
+        nonlocal reported
+        tenth = int(10.0 * fraction + 1e-9)
+        if tenth != reported:
+            reported = tenth
+            if tenth:
+                tell(f"  {10 * tenth} %")
+
+    return progress
 
 
 def _line(console: Console) -> Callable[[str], None]:
