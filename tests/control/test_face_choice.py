@@ -19,9 +19,9 @@ from stereoservo.control.faces import (
     choose_triangle,
     kept_faces,
     law_scene,
-    sights_along,
     spread_in_images,
     triangle_sight,
+    visibility_along,
 )
 from stereoservo.control.law import Options
 from stereoservo.control.law_registry import LAWS
@@ -112,7 +112,7 @@ def test_sights_along_a_way_are_those_of_the_truth(virtual):
     points = world.hidden(body.at(T))
     poses = [upright(virtual, turn) for turn in np.linspace(10, -200, 43)]
     steps = np.array([world.frame @ P @ np.linalg.inv(T) @ np.linalg.inv(world.frame) for P in poses])
-    sights = sights_along(faces, points, steps, world.camera_centres)
+    sights = visibility_along(faces, points, steps, world.camera_centres)
     for fronts, pose in zip(sights.fronts, poses, strict=True):
         truth = body.seen(pose, 0.0)
         for f, members in enumerate(faces.markers()):

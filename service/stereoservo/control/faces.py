@@ -109,7 +109,7 @@ def select_faces(groups: MarkerGroups, points: FloatArray, camera_centres: Float
     return Faces(triples, members, sided, points)
 
 
-class Sights(NamedTuple):
+class FaceVisibility(NamedTuple):
     """Visible faces along a path of K samples: ``fronts`` (K, f, c) 1 where a camera sees a face's front.
 
     ``lead`` (K,): the face seen by most cameras; the previous one is kept as long as it is equally good; -1 where no
@@ -122,7 +122,9 @@ class Sights(NamedTuple):
     cameras: IntArray
 
 
-def sights_along(faces: Faces, points: FloatArray, displacements: FloatArray, camera_centres: FloatArray) -> Sights:
+def visibility_along(
+    faces: Faces, points: FloatArray, displacements: FloatArray, camera_centres: FloatArray
+) -> FaceVisibility:
     """Which faces of the body at ``points`` (m, 4) the cameras see along its ``displacements`` (K, 4, 4).
 
     Samples without a lead, or with fewer cameras than a law needs, are sections that are controlled by kinematics
@@ -145,7 +147,7 @@ def sights_along(faces: Faces, points: FloatArray, displacements: FloatArray, ca
             lead[s], cameras[s] = held, count[held]
         else:
             held = -1
-    return Sights(fronts, lead, cameras)
+    return FaceVisibility(fronts, lead, cameras)
 
 
 class FaceChoice(NamedTuple):
@@ -347,7 +349,7 @@ def kept_faces(
 
     The face that a law will use comes first, because it determines the path; the order of two equivalent faces in the
     model is arbitrary. Empty if the body rotates so far that no face remains visible: then the path has to change faces
-    (`sights_along`). Faces with unknown side impose no constraint.
+    (`visibility_along`). Faces with unknown side impose no constraint.
 
     ``points``, ``targets`` (m, 4), ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4): contiguous arrays.
     """

@@ -220,9 +220,9 @@ def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
     state, room, arrays = context.state, context.derived.room, context.derived.arrays
     if state.mobile[camera] is None or arrays is None:
         return
-    sights = room.residuals(t_ns)
-    sights.seen[:] = moving_camera.see(
-        state, context.settings, arrays, camera, sights, room.of_frame, room.frame_q, context.emit
+    residuals = room.residuals(t_ns)
+    residuals.seen[:] = moving_camera.see(
+        state, context.settings, arrays, camera, residuals, room.of_frame, room.frame_q, context.emit
     ).seen
 
 
@@ -371,7 +371,7 @@ def see_frame(block: Record, room: Record, k: int) -> int:
     standing = 2 * rows * camera
     _compare(
         room,
-        Sights(row, pixels, covariances),
+        Observations(row, pixels, covariances),
         predicted[0],
         work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)),
         jacobian[0],
@@ -581,7 +581,7 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
                 common[i, a] += jacobian[i, a, j] * (deviations[j] * step[j])
 
 
-class Sights(NamedTuple):
+class Observations(NamedTuple):
     """k observations: their ``rows`` (k,) among the model's markers and static points (-1: none); ideal ``pixels`` (k,
     2) and ``covariances`` (k, 2, 2) [px²].
     """
@@ -594,7 +594,7 @@ class Sights(NamedTuple):
 @kernel
 def _compare(
     room: Record,
-    sights: Sights,
+    observations: Observations,
     predicted: FloatArray,
     standing: FloatArray,
     jacobian: FloatArray,
@@ -607,7 +607,7 @@ def _compare(
     adds to the covariance by them.
     """
     work, markers, n = room[0], jacobian.shape[0], jacobian.shape[2]
-    rows, pixels, covariances = sights
+    rows, pixels, covariances = observations
     count = markers + standing.shape[0]
     innovation, spread = (
         work.frame_innovation[: 2 * count].reshape((count, 2)),

@@ -40,7 +40,7 @@ from stereoservo.core.monitors.diagnosis import (
     mask_marker,
     unmask_returned,
 )
-from stereoservo.core.monitors.fault_isolation import bench_now, diagnosed_beside_joint_errors
+from stereoservo.core.monitors.fault_isolation import diagnosed_beside_joint_errors, present_problem
 from stereoservo.core.monitors.following import (
     LAG_S,
     SILENCE_S,
@@ -514,8 +514,8 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
         return None
     verdict = NOISE
     if odd and not _all_late(_cameras(odd), watching, context.settings):
-        bench = bench_now(state, _cameras(looked_at), arrays, context.settings)
-        found = diagnosed_beside_joint_errors(bench, proven=state.reanchoring is not None)
+        problem = present_problem(state, _cameras(looked_at), arrays, context.settings)
+        found = diagnosed_beside_joint_errors(problem, proven=state.reanchoring is not None)
         verdict = beside_target(found, state)
     watching.last = [*watching.last[1 - OF :], verdict]
     if masked:

@@ -234,7 +234,7 @@ class Pace(NamedTuple):
     translation_rate: float
 
 
-class Sight(NamedTuple):
+class VisibilityLimits(NamedTuple):
     """Limits by visibility: the ``share`` of the translation and the ``turn`` of the rotation; whether the hinge is
     made first, in place of one rotation, and the ``whole`` angle of this rotation.
     """
@@ -287,8 +287,8 @@ def cartesian_step(
             if singular:
                 freedoms = Freedoms(rigid, np.eye(FREEDOMS))
     parts = decompose(freedoms, task)
-    sight = _kept_in_view(freedoms, task, FacePlanes(face, target_face), camera_centres, single, parts)
-    steps = _paced(parts, sight, pace, errors, allowed, shown)
+    visibility = _kept_in_view(freedoms, task, FacePlanes(face, target_face), camera_centres, single, parts)
+    steps = _paced(parts, visibility, pace, errors, allowed, shown)
     if singular:
         wanted = np.zeros((4, 4))
         for i in range(count):
@@ -302,8 +302,8 @@ def cartesian_step(
                 velocity[j] *= share
     else:
         _exact_into(PresentArm(operators, composition), task, parts, steps, dt_s, velocity)
-    if sight.hinge_first:
-        errors[1] = sight.whole
+    if visibility.hinge_first:
+        errors[1] = visibility.whole
         shown[1] = WAITS
     return velocity, errors, allowed, shown
 
@@ -449,7 +449,7 @@ def _kept_in_view(
     camera_centres: FloatArray,
     single: bool,
     parts: Components,
-) -> Sight:
+) -> VisibilityLimits:
     """Limits of the components that keep the face in view; writes the rotation, with its direction, to ``parts``."""
     face, target_face = planes
     centre, centre_target = task.centre, task.centre_target
@@ -492,18 +492,23 @@ def _kept_in_view(
         scale_primitive(screws[1], generators[1], -1.0)
     if single or status[1] == MOVES:
         amount[1] = abs(angle)
-    return Sight(share, turn, hinge_first, whole)
+    return VisibilityLimits(share, turn, hinge_first, whole)
 
 
 @kernel
 def _paced(
-    parts: Components, sight: Sight, pace: Pace, errors: FloatArray, allowed: FloatArray, shown: IntArray
+    parts: Components,
+    visibility: VisibilityLimits,
+    pace: Pace,
+    errors: FloatArray,
+    allowed: FloatArray,
+    shown: IntArray,
 ) -> FloatArray:
     """Motion of each component in this step (k,), or its rate if ``dt_s`` is 0; writes errors, allowed parts and
     status.
     """
     screws, amount, status = parts.screws, parts.amount, parts.status
-    share, turn, dt_s = sight.share, sight.turn, pace.dt_s
+    share, turn, dt_s = visibility.share, visibility.turn, pace.dt_s
     count, n = errors.shape[0], screws.shape[1]
     steps = np.zeros(count)
     for i in range(count):

@@ -21,8 +21,8 @@ from stereoservo.control.faces import (
     Faces,
     find_faces,
     select_faces,
-    sights_along,
     spread_in_images,
+    visibility_along,
 )
 from stereoservo.control.laws.cartesian3 import cartesian3_step
 from stereoservo.control.marker_groups import FLAT_PX
@@ -455,7 +455,7 @@ def turned_to(place: BodyState, displacement: FloatArray) -> FloatArray:
     found = np.ones((len(place.arrays.camera_centres), len(place.points)))
     if not bool((faces.sided > 0.0).any()):
         return found
-    fronts = sights_along(faces, place.points, displacement[None], place.arrays.camera_centres).fronts[0]
+    fronts = visibility_along(faces, place.points, displacement[None], place.arrays.camera_centres).fronts[0]
     told = faces.members[faces.sided > 0.0].max(axis=0) > 0.0
     for c in range(len(found)):
         turned = (faces.members * fronts[:, c : c + 1]).max(axis=0) > 0.0

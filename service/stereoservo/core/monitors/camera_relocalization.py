@@ -23,7 +23,7 @@ from stereoservo.core.goals.marker_body import MIN_MARKERS, BodyState, place_now
 from stereoservo.core.goals.resolve import aim_at
 from stereoservo.core.model_arrays import ModelArrays, model_arrays, with_unit_height
 from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
-from stereoservo.core.monitors.fault_isolation import LEAST_PX, bench_now, doubt, named
+from stereoservo.core.monitors.fault_isolation import LEAST_PX, doubt, named, present_problem
 from stereoservo.core.move import goal_of
 from stereoservo.core.prediction import joints_at
 from stereoservo.core.settings import CoreSettings
@@ -359,7 +359,7 @@ def _unproven(run: Relocalization, context: StepContext) -> bool:
     moved = _moved(run, context)
     usable = [c for c in looked if (mobile := state.mobile[c]) is None or not mobile.moving]
     run.doubt = (
-        doubt(bench_now(state, usable, context.arrays, settings), moved, run.moved_px)
+        doubt(present_problem(state, usable, context.arrays, settings), moved, run.moved_px)
         if usable
         else f"no camera has shown anything at rest, so {named(run.cameras)} may have moved, or the arm"
     )

@@ -17,7 +17,7 @@ from stereoservo.core.monitor_state import (
     nothing_sighted,
 )
 from stereoservo.core.monitors import camera_relocalization
-from stereoservo.core.monitors.fault_isolation import LEAST_PX, bench_now, without_joint_errors
+from stereoservo.core.monitors.fault_isolation import LEAST_PX, present_problem, without_joint_errors
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.prediction import MODEL_SIGMA_PX, camera_chi2, improbable
 from stereoservo.core.settings import CoreSettings
@@ -124,9 +124,9 @@ def unmask_returned(watching: ModelMonitor, known: list[int], context: StepConte
     masked = np.flatnonzero(watching.masked > 0.0)
     if not masked.size:
         return
-    bench = bench_now(context.state, known, arrays, context.settings)
-    found = without_joint_errors(bench, bench.weights)
-    innovation = bench.innovation if found is None else found[0]
+    problem = present_problem(context.state, known, arrays, context.settings)
+    found = without_joint_errors(problem, problem.weights)
+    innovation = problem.innovation if found is None else found[0]
     for i in masked:
         seen = [
             (watching.sightings[c].spread, innovation[row])

@@ -71,9 +71,9 @@ def thresholds_of(settings: CoreSettings, markers: int, cameras: int) -> Thresho
     return _thresholds(rate_hz, cameras, markers, len(settings.joint_names))
 
 
-def diagnosed(bench: Bench) -> ModelDiagnosis:
+def diagnosed(problem: LinearisedProblem) -> ModelDiagnosis:
     """The diagnosis of the innovations of one moment."""
-    found = bench.diagnose()
+    found = problem.diagnose()
     cause, other = found.cause, found.runner_up
     if found.kind == "nothing":
         return ModelDiagnosis()
@@ -87,7 +87,7 @@ def diagnosed(bench: Bench) -> ModelDiagnosis:
     else:
         words = " moved together" if cause is not None and cause.kind == "cameras" else " moved"
     if found.kind == "unexplained" or cause is None or other is not None:
-        return _each_by_itself(bench) or _unclear(found, other)
+        return _each_by_itself(problem) or _unclear(found, other)
     if cause.kind == "joints" and other is None:
         return ModelDiagnosis(
             "unclear",
@@ -95,10 +95,10 @@ def diagnosed(bench: Bench) -> ModelDiagnosis:
             text=f"the arm, or the marker body on it, stands elsewhere than its joints say ({cause.effect_px:.3g} px "
             "rms): was the body mounted anew, was the arm pushed? Calibrate anew",
         )
-    return _told(bench, cause, words)
+    return _described(problem, cause, words)
 
 
-class Bench:
+class LinearisedProblem:
     """The observations of one moment, with the arm at ``q`` (n,), in the cameras ``known``, prepared for several tests.
 
     ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `prediction.FrameResiduals`.
@@ -118,7 +118,7 @@ class Bench:
         self.points = transform_points(H, arrays.marker_points)
         self.innovation, self.weights = innovation, weights
 
-    def with_innovation(self, innovation: FloatArray) -> Bench:
+    def with_innovation(self, innovation: FloatArray) -> LinearisedProblem:
         """The same moment with other innovations (c, k, 2) [px]."""
         other = copy(self)
         other.innovation = innovation
@@ -150,15 +150,15 @@ class Bench:
         )  # fmt: skip
 
 
-def doubt(bench: Bench, moved: list[int], px: float) -> str:
+def doubt(problem: LinearisedProblem, moved: list[int], px: float) -> str:
     """Why it is not proven that the cameras ``moved``, and not the arm, have moved; empty if it is proven.
 
     Proof is another camera that sees the arm where its joint readings predict it or, in the image of each moved camera,
     static points that moved by the camera's own displacement together with the arm. ``px``: rms disagreement.
     """
-    if any(camera not in moved and _confirms_the_arm(bench, row) for row, camera in enumerate(bench.known)):
+    if any(camera not in moved and _confirms_the_arm(problem, row) for row, camera in enumerate(problem.known)):
         return ""
-    found = [(bench.settings.cameras[camera].name, *_static_evidence(bench, camera)) for camera in moved]
+    found = [(problem.settings.cameras[camera].name, *_static_evidence(problem, camera)) for camera in moved]
     wanting = [(name, kind, count) for name, kind, count in found if kind != "moved"]
     if not wanting:
         return ""
@@ -186,23 +186,25 @@ def doubt(bench: Bench, moved: list[int], px: float) -> str:
     )
 
 
-def _confirms_the_arm(bench: Bench, row: int) -> bool:
+def _confirms_the_arm(problem: LinearisedProblem, row: int) -> bool:
     """Whether a camera sees enough of the arm, and all of it where the joint readings predict it."""
-    seen = int((bench.weights[row, : len(bench.points)] > 0.0).sum())
-    return seen >= FEWEST_ON_ARM and bench.diagnose(row).kind == "nothing"
+    seen = int((problem.weights[row, : len(problem.points)] > 0.0).sum())
+    return seen >= FEWEST_ON_ARM and problem.diagnose(row).kind == "nothing"
 
 
-def _static_evidence(bench: Bench, camera: int) -> tuple[Literal["moved", "stand", "few", "unexplained"], int]:
+def _static_evidence(
+    problem: LinearisedProblem, camera: int
+) -> tuple[Literal["moved", "stand", "few", "unexplained"], int]:
     """What the static points in a camera's image prove about the camera, and how many it sees."""
-    if camera not in bench.known:
+    if camera not in problem.known:
         return "few", 0
-    row = bench.known.index(camera)
-    count = int((bench.weights[row, len(bench.points) :] > 0.0).sum())
+    row = problem.known.index(camera)
+    count = int((problem.weights[row, len(problem.points) :] > 0.0).sum())
     if count < FEWEST_STATIC:
         return "few", count
-    if bench.diagnose(row, static_alone=True).kind == "nothing":
+    if problem.diagnose(row, static_alone=True).kind == "nothing":
         return "stand", count
-    return ("moved" if bench.diagnose(row).kind == "camera" else "unexplained"), count
+    return ("moved" if problem.diagnose(row).kind == "camera" else "unexplained"), count
 
 
 def named(cameras: tuple[str, ...]) -> str:
@@ -210,22 +212,22 @@ def named(cameras: tuple[str, ...]) -> str:
     return f"camera{'s' if len(cameras) > 1 else ''} {', '.join(cameras)}"
 
 
-def _proven(verdict: ModelDiagnosis, bench: Bench) -> ModelDiagnosis:
+def _proven(verdict: ModelDiagnosis, problem: LinearisedProblem) -> ModelDiagnosis:
     """The diagnosis that cameras have moved; ``cameras_or_arm`` if a motion of the arm explains the same."""
-    moved = [c for c, camera in enumerate(bench.settings.cameras) if camera.name in verdict.subjects]
-    why = doubt(bench, moved, verdict.moved_px)
+    moved = [c for c, camera in enumerate(problem.settings.cameras) if camera.name in verdict.subjects]
+    why = doubt(problem, moved, verdict.moved_px)
     if not why:
         return verdict
     return ModelDiagnosis("cameras_or_arm", verdict.subjects, moved_px=verdict.moved_px, text=why)
 
 
-def _each_by_itself(bench: Bench) -> ModelDiagnosis | None:
+def _each_by_itself(problem: LinearisedProblem) -> ModelDiagnosis | None:
     """The diagnosis that two or more cameras moved independently: a displacement of its own explains each one's frame.
     None if it does not apply.
     """
     moved, effects = [], []
-    for row, camera in enumerate(bench.known):
-        alone = bench.diagnose(row)
+    for row, camera in enumerate(problem.known):
+        alone = problem.diagnose(row)
         causes = [cause for cause in (alone.cause, alone.runner_up) if cause is not None]
         of_camera = [cause for cause in causes if cause.kind == "camera"]
         if alone.kind == "nothing":
@@ -236,10 +238,10 @@ def _each_by_itself(bench: Bench) -> ModelDiagnosis | None:
         effects.append(of_camera[0].effect_px)
     if len(moved) < 2:
         return None
-    names = tuple(bench.settings.cameras[c].name for c in moved)
+    names = tuple(problem.settings.cameras[c].name for c in moved)
     size = max(effects)
     text = f"{named(names)} moved, each by itself"
-    return _proven(ModelDiagnosis("camera_moved", names, moved_px=size, text=text), bench)
+    return _proven(ModelDiagnosis("camera_moved", names, moved_px=size, text=text), problem)
 
 
 def _unclear(found: ChangeDiagnosis, other: IsolatedChange | None) -> ModelDiagnosis:
@@ -255,8 +257,8 @@ def _unclear(found: ChangeDiagnosis, other: IsolatedChange | None) -> ModelDiagn
     )
 
 
-def _told(bench: Bench, cause: IsolatedChange, words: str) -> ModelDiagnosis:
-    arrays, settings, known, px = bench.arrays, bench.settings, bench.known, cause.effect_px
+def _described(problem: LinearisedProblem, cause: IsolatedChange, words: str) -> ModelDiagnosis:
+    arrays, settings, known, px = problem.arrays, problem.settings, problem.known, cause.effect_px
     by = f"by {px:.3g} px rms"
     if cause.kind in ("camera", "cameras"):
         names = tuple(settings.cameras[c].name for c in (known if cause.kind == "cameras" else [known[cause.index]]))
@@ -264,13 +266,13 @@ def _told(bench: Bench, cause: IsolatedChange, words: str) -> ModelDiagnosis:
         turned = f", turned by {degrees:.3g} degrees" if math.isfinite(cause.amount) else ""
         kind: VerdictKind = "cameras_moved_together" if cause.kind == "cameras" and len(names) > 1 else "camera_moved"
         text = f"{named(names)}{words} {by}{turned}"
-        return _proven(ModelDiagnosis(kind, names, degrees, 0.0, "degrees", px, text), bench)
+        return _proven(ModelDiagnosis(kind, names, degrees, 0.0, "degrees", px, text), problem)
     if cause.kind == "marker":
         marker = arrays.marker_ids[cause.index]
         text = f"marker {marker} has slipped {by}: fix it where it was, or calibrate anew"
         return ModelDiagnosis("marker_slipped", (str(marker),), px, 0.0, "px", px, text)
     joint = settings.joint_names[cause.index]
-    deviation = _joint_deviation(bench, cause.index)
+    deviation = _joint_deviation(problem, cause.index)
     if settings.joint_kinds[cause.index] == "revolute":
         size, spread, unit = math.degrees(cause.amount), math.degrees(deviation), "degrees"
     else:
@@ -282,36 +284,36 @@ def _told(bench: Bench, cause: IsolatedChange, words: str) -> ModelDiagnosis:
     return ModelDiagnosis("joint_zero", (joint,), size, spread, unit, px, text)
 
 
-def _joint_deviation(bench: Bench, joint: int) -> float:
+def _joint_deviation(problem: LinearisedProblem, joint: int) -> float:
     """Standard deviation [rad or m] of a joint's zero, estimated alone."""
-    jacobian = image_jacobian(bench.operators, bench.arrays.matrices[bench.known], bench.points)
-    weights = bench.weights[:, : len(bench.points)]
+    jacobian = image_jacobian(problem.operators, problem.arrays.matrices[problem.known], problem.points)
+    weights = problem.weights[:, : len(problem.points)]
     information = float((weights[..., None] ** 2 * jacobian[..., joint] ** 2).sum())
     return 1.0 / math.sqrt(information) if information > 0.0 else 0.0
 
 
-def without_joint_errors(bench: Bench, believed: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+def without_joint_errors(problem: LinearisedProblem, believed: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Innovations (c, k, 2) [px] without the part explained by errors of joint readings, and these errors (n,) relative
     to the standard deviations that the model states; None if it states none.
 
     The most probable joint positions are estimated from the observations of weight ``believed`` (c, k) [1/px].
     """
-    arrays = bench.arrays
+    arrays = problem.arrays
     if arrays.joint_accuracy is None:
         return None
-    n, m = len(bench.q), len(bench.points)
-    deviations = arrays.joint_accuracy.deviations((bench.q - arrays.zero)[None])[0]
-    J = np.zeros((*bench.innovation.shape, n))
-    J[:, :m] = image_jacobian(bench.operators, arrays.matrices[bench.known], bench.points) * deviations
+    n, m = len(problem.q), len(problem.points)
+    deviations = arrays.joint_accuracy.deviations((problem.q - arrays.zero)[None])[0]
+    J = np.zeros((*problem.innovation.shape, n))
+    J[:, :m] = image_jacobian(problem.operators, arrays.matrices[problem.known], problem.points) * deviations
     J = np.where(np.isfinite(J), J, 0.0)
     weights = np.concatenate([np.repeat(believed.reshape(-1), 2), np.ones(n)])
     rows = np.concatenate([J.reshape(-1, n), np.eye(n)])
-    errors = np.concatenate([bench.innovation.reshape(-1), np.zeros(n)])
+    errors = np.concatenate([problem.innovation.reshape(-1), np.zeros(n)])
     found, _ = damped_least_squares(rows, errors, weights, 0.0)
-    return bench.innovation - (J * found).sum(axis=-1), found
+    return problem.innovation - (J * found).sum(axis=-1), found
 
 
-def diagnosed_beside_joint_errors(bench: Bench, *, proven: bool) -> ModelDiagnosis:
+def diagnosed_beside_joint_errors(problem: LinearisedProblem, *, proven: bool) -> ModelDiagnosis:
     """The diagnosis of the innovations of one moment for an arm whose joint readings may have errors; no diagnosis if
     these explain the innovations.
     ``proven``: a camera is known to have moved; then errors of the joints alone do not revoke it.
@@ -320,20 +322,20 @@ def diagnosed_beside_joint_errors(bench: Bench, *, proven: bool) -> ModelDiagnos
     each of the markers that fit them worst, in turn. The one left out is named if it alone has changed, and no other
     candidate has the same effect.
     """
-    fitted = without_joint_errors(bench, bench.weights)
+    fitted = without_joint_errors(problem, problem.weights)
     if fitted is None:
-        return diagnosed(bench)
-    if not proven and _likely_errors(fitted[1]) and bench.with_innovation(fitted[0]).explained(bench.weights):
+        return diagnosed(problem)
+    if not proven and _likely_errors(fitted[1]) and problem.with_innovation(fitted[0]).explained(problem.weights):
         return ModelDiagnosis()
-    plain = diagnosed(bench)
+    plain = diagnosed(problem)
     if plain.kind in ("camera_moved", "marker_slipped", "joint_zero"):
         return plain
     named_by: dict[tuple[str, tuple[str, ...]], ModelDiagnosis] = {}
-    for believed in _with_one_left_out(bench, fitted[0]):
-        found = without_joint_errors(bench, believed)
+    for believed in _with_one_left_out(problem, fitted[0]):
+        found = without_joint_errors(problem, believed)
         if found is None or not _likely_errors(found[1]):
             continue
-        cleared = bench.with_innovation(found[0])
+        cleared = problem.with_innovation(found[0])
         if not cleared.explained(believed):
             continue
         again = diagnosed(cleared)
@@ -342,14 +344,14 @@ def diagnosed_beside_joint_errors(bench: Bench, *, proven: bool) -> ModelDiagnos
     return next(iter(named_by.values())) if len(named_by) == 1 else plain
 
 
-def _with_one_left_out(bench: Bench, left: FloatArray) -> list[FloatArray]:
+def _with_one_left_out(problem: LinearisedProblem, left: FloatArray) -> list[FloatArray]:
     """Weights (c, k) without each camera, if there are others, and without each of the markers that fit the joints
     worst, by their residuals ``left`` (c, k, 2) [px].
     """
-    weights = bench.weights
-    cameras, markers = np.arange(len(bench.known)), np.arange(weights.shape[1])
+    weights = problem.weights
+    cameras, markers = np.arange(len(problem.known)), np.arange(weights.shape[1])
     found = [weights * (cameras != row)[:, None] for row in cameras] if len(cameras) > 1 else []
-    distance = ((left * weights[..., None]) ** 2).sum(axis=(0, 2))[: len(bench.points)]
+    distance = ((left * weights[..., None]) ** 2).sum(axis=(0, 2))[: len(problem.points)]
     worst = np.argsort(-distance, kind="stable")[:SUSPECT_MARKERS]
     return found + [weights * (markers != marker) for marker in worst]
 
@@ -359,7 +361,9 @@ def _likely_errors(found: FloatArray) -> bool:
     return float((found * found).sum()) <= improbable(float(found.size))
 
 
-def bench_now(state: CoreState, known: list[int], arrays: ModelArrays, settings: CoreSettings) -> Bench:
+def present_problem(
+    state: CoreState, known: list[int], arrays: ModelArrays, settings: CoreSettings
+) -> LinearisedProblem:
     """The newest frames of the cameras ``known``; the uncertainty of a body that moves on its own is added to their
     noise.
     """
@@ -372,4 +376,4 @@ def bench_now(state: CoreState, known: list[int], arrays: ModelArrays, settings:
         weights[row] = used_rows(watching, sighting) / np.sqrt(variance)
         innovation[row] = sighting.innovation
     newest = max(known, key=lambda c: watching.sightings[c].t_ns)
-    return Bench(arrays, settings, known, watching.sightings[newest].q, innovation, weights)
+    return LinearisedProblem(arrays, settings, known, watching.sightings[newest].q, innovation, weights)
