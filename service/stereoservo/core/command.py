@@ -61,8 +61,8 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
         raw, work.outermost[:n], work.previous[:n], work.paused != 0, work.dt_s,
         (work.now_ns - memory.last_joints_ns) * 1e-9, feature_age_s, work.needs_features != 0, work.speed_scale,
     )  # fmt: skip
-    told, found = limit_velocity(wanted, limits, sent, work.acted[:n])
-    work.limited, work.finite = int(told), int(found.finite)
+    reported, found = limit_velocity(wanted, limits, sent, work.acted[:n])
+    work.limited, work.finite = int(reported), int(found.finite)
     work.allowed_scale, work.scale, work.share = found.speed_scale, found.scale, found.share
     work.scaled_by, work.shared_by = found.scaled_by, found.shared_by
     if work.active == 0:
@@ -667,11 +667,11 @@ def limit_velocity(wanted: Wanted, by: Bounds, limited: FloatArray, acted: Float
     table, bounds, keep_outs = by
     margin, timeout, fresh, coast = bounds[MARGIN], bounds[TIMEOUT], bounds[FRESH], bounds[COAST]
     limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)
-    told, sample_age = brake, joint_age
+    reported, sample_age = brake, joint_age
     if not 0.0 <= joint_age <= timeout:
         brake, sample_age = True, timeout
     if needs_features and not 0.0 <= feature_age <= fresh:
-        told, brake = True, brake or not 0.0 <= feature_age <= coast
+        reported, brake = True, brake or not 0.0 <= feature_age <= coast
     speed_scale = min(max(speed_scale, 0.0), 1.0) if math.isfinite(speed_scale) else 0.0
     velocity_max, acceleration_max = limits.velocity_max, limits.acceleration_max
     n = raw.shape[0]
@@ -722,7 +722,7 @@ def limit_velocity(wanted: Wanted, by: Bounds, limited: FloatArray, acted: Float
         elif limited[j] < low[j]:
             limited[j] = max(limited[j], min(low[j], before[j] + step))
             acted[j] = low_by[j] + 2
-    told = told or brake or scaled_by >= 0 or shared_by >= 0
+    reported = reported or brake or scaled_by >= 0 or shared_by >= 0
     for j in range(n):
-        told = told or acted[j] != 0.0
-    return told, LimitsFound(finite, speed_scale, scale, scaled_by, share, shared_by)
+        reported = reported or acted[j] != 0.0
+    return reported, LimitsFound(finite, speed_scale, scale, scaled_by, share, shared_by)

@@ -137,10 +137,10 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
 
 
 @kernel
-def take_sample(block: Record, room: Record, told: bool) -> bool:
+def take_sample(block: Record, room: Record, complete: bool) -> bool:
     """Store the joint sample in the workspace ``room`` as the newest one of the ``block`` if it is plausible, and
     filter the velocities since the last one; returns whether it is plausible. Returns True if there is no sample
-    (``told`` is False).
+    (``complete`` is False).
 
     ``q`` (n,) of the workspace is set to the newest positions, zero before the first sample. The history restarts if
     the positions of an arm that is not driven jump: an encoder was set.
@@ -149,7 +149,7 @@ def take_sample(block: Record, room: Record, told: bool) -> bool:
     n, q = memory.joints, work.q
     kept = memory.history_positions[: HISTORY * n].reshape((HISTORY, n))
     sound = True
-    if told:
+    if complete:
         values, elapsed_s = (
             work.sample[: 4 * n].reshape((4, n)),
             (work.joints_ns - memory.last_joints_ns) * 1e-9,

@@ -415,11 +415,11 @@ def account_following(block: Record, room: Record) -> int:
     measure_delays(command, q, answers, dt_s, delays)
     if memory.followed == 0:
         last[:], missing_late[:], delays.accounted[:] = q, 0.0, delays.sent
-    told = memory.last_joints_ns != memory.last_followed_ns
-    account_travel(block, room, command, told, delays)
+    fresh = memory.last_joints_ns != memory.last_followed_ns
+    account_travel(block, room, command, fresh, delays)
     memory.delay_steps += 1
     account_silence(block, room)
-    if not told:
+    if not fresh:
         return FOLLOWS
     memory.last_followed_ns, memory.followed = memory.last_joints_ns, 1
     last[:] = q

@@ -49,8 +49,8 @@ def finish_step(context: StepContext, limits: SafetyLimits) -> None:
     source = state.source
     examine = MOTION_SOURCES[type(source)].examine
     if examine is not None:
-        told = tuple(_reasons_before(context, limited_command(context, limits)))
-        source.reasons = examine(source, context, told)  # type: ignore[union-attr]
+        earlier = tuple(_reasons_before(context, limited_command(context, limits)))
+        source.reasons = examine(source, context, earlier)  # type: ignore[union-attr]
 
 
 def status_of(context: StepContext, limits: SafetyLimits) -> Status:
@@ -181,9 +181,9 @@ def _health(context: StepContext, diagnosis: ModelDiagnosis, masked: tuple[int, 
         (s.chi2, s.rms_px, s.worst, s.worst_px, s.timing.product, s.timing.square) for s in state.watching.sightings
     ]
     places = None if not any(state.mobile) else ["" if m is None else m.place for m in state.mobile]
-    told = (model.epoch, diagnosis, masked, reanchoring, facts, places)
-    if derived.health is None or derived.health[0] != told:
-        derived.health = told, _health_now(context, diagnosis, masked, reanchoring)
+    facts_now = (model.epoch, diagnosis, masked, reanchoring, facts, places)
+    if derived.health is None or derived.health[0] != facts_now:
+        derived.health = facts_now, _health_now(context, diagnosis, masked, reanchoring)
     return derived.health[1]
 
 
@@ -191,7 +191,7 @@ def _health_now(context: StepContext, verdict: ModelDiagnosis, masked: tuple[int
     state = context.state
     assert state.model is not None
     ids = (*state.model.marker_ids, *state.model.scene_ids)
-    told = zip(context.settings.cameras, state.watching.sightings, state.mobile, strict=True)
+    monitored = zip(context.settings.cameras, state.watching.sightings, state.mobile, strict=True)
     cameras = {
         camera.name: CameraHealth(
             seen.chi2,
@@ -201,7 +201,7 @@ def _health_now(context: StepContext, verdict: ModelDiagnosis, masked: tuple[int
             "" if moves is None else moves.place,
             advice(seen.timing),
         )
-        for camera, seen, moves in told
+        for camera, seen, moves in monitored
     }
     return Health(
         verdict.kind, verdict.subjects, verdict.size, verdict.deviation, verdict.unit, verdict.text, cameras, masked,

@@ -209,11 +209,11 @@ def _median(samples: FloatArray) -> float:
 
 
 @kernel
-def account_travel(block: Record, room: Record, command: FloatArray, told: bool, delays: DriveDelays) -> None:
+def account_travel(block: Record, room: Record, command: FloatArray, fresh: bool, delays: DriveDelays) -> None:
     """Update the travel by the time since the last step at the velocities ``command`` (n,): without delay in the
     ``block``'s untold and missing travel, with delay in ``delays``.
 
-    ``told``: whether the readings are new. If a joint in steady motion has moved farther than its delay allows, its
+    ``fresh``: whether the readings are new. If a joint in steady motion has moved farther than its delay allows, its
     delay is shorter; the shorter one is added to the samples.
     """
     memory, work = block[0], room[0]
@@ -232,7 +232,7 @@ def account_travel(block: Record, room: Record, command: FloatArray, told: bool,
             velocity[j] = command[j]
         elif dt_s > 0.0:
             velocity[j] = (arrived - past[(step - back - 1) % rows, j]) / dt_s
-        if not told:
+        if not fresh:
             missing[j] *= forgotten
             missing_late[j] *= forgotten
             continue

@@ -640,14 +640,14 @@ def run_progress(source: LawRun, context: StepContext) -> Progress:
     return (done, left_s) if known else (None, None)
 
 
-def examine_servo(source: ServoGoal, context: StepContext, told: tuple[Reason, ...]) -> list[Reason]:
-    """The progress reasons of a goal in set-points, in addition to those already given (``told``) in this step."""
-    return examine_progress(source, context, told, _servo_traits(source, context))
+def examine_servo(source: ServoGoal, context: StepContext, earlier: tuple[Reason, ...]) -> list[Reason]:
+    """The progress reasons of a goal in set-points, in addition to those already given (``earlier``) in this step."""
+    return examine_progress(source, context, earlier, _servo_traits(source, context))
 
 
-def examine_run(source: LawRun, context: StepContext, told: tuple[Reason, ...]) -> list[Reason]:
+def examine_run(source: LawRun, context: StepContext, earlier: tuple[Reason, ...]) -> list[Reason]:
     """The progress reasons of any other law's goal."""
-    return examine_progress(source, context, told, _plain_traits(source, context))
+    return examine_progress(source, context, earlier, _plain_traits(source, context))
 
 
 def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:

@@ -181,14 +181,14 @@ class Traits(NamedTuple):
     local_law: str = ""
 
 
-def examine_progress(source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits) -> list[Reason]:
-    """The progress reasons in addition to those already given (``told``) in this step, the most serious first."""
+def examine_progress(source: LawRun, context: StepContext, earlier: tuple[Reason, ...], traits: Traits) -> list[Reason]:
+    """The progress reasons in addition to those already given (``earlier``) in this step, the most serious first."""
     found = [*_near_limits(context), *_near_singular(source, context), *_few_markers(source, context, traits)]
     tail = _tail(source, context, traits)
     if tail is not None:
         found.append(tail)
     if not traits.moves:
-        stuck = _stall_reason(source, context, (*told, *found), traits)
+        stuck = _stall_reason(source, context, (*earlier, *found), traits)
         if stuck is not None:
             found.insert(0, stuck)
     return found
@@ -260,12 +260,12 @@ def _tail(source: LawRun, context: StepContext, traits: Traits) -> Reason | None
     return Reason("LOW_GAIN", "info", "", left_s, TAIL_S, "s", hint)
 
 
-def _stall_reason(source: LawRun, context: StepContext, told: tuple[Reason, ...], traits: Traits) -> Reason | None:
+def _stall_reason(source: LawRun, context: StepContext, earlier: tuple[Reason, ...], traits: Traits) -> Reason | None:
     run = context.state.block.numbers.run
     error, since_s = error_of_run(context.state.block), run.moved_s - run.least_s
     if error is None or error <= source.tolerance_px or since_s < STUCK_S:
         return None
-    codes = {reason.code: reason for reason in reversed(told)}
+    codes = {reason.code: reason for reason in reversed(earlier)}
     cause = next((codes[code] for code in CAUSES if code in codes), None)
     noise = _noise_px(source, context)
     if error <= NOISE_SIGMAS * noise:
