@@ -484,7 +484,7 @@ def _unit(columns: FloatArray) -> FloatArray:
 
 
 def _mean_squares(reduced: ReducedRows) -> FloatArray:
-    """Mean squared length (3 n,) of each component's columns: variance that one unit error adds, summed over its rows."""
+    """Mean squared length (3 n,) of each component's columns: variance added by a unit error, summed over its rows."""
     columns, component = reduced.columns()
     counts = np.bincount(component, minlength=3 * reduced.joints)
     sums = np.bincount(component, (columns**2).sum(axis=0), 3 * reduced.joints)
