@@ -149,7 +149,8 @@ PARALLAX_RATIO, PARALLAX_SCATTER = 1.2, 3.0
 """Ratio of variances, homography to F, above which the parallax of n matches is significant: the first plus the second
 over √n. Cameras with one centre give 1.13 to 1.33: F fits its own inliers a little too well."""
 NARROW = 1.0 / 3.0
-"""Second attempt if the search rejects a nearly planar scene: planar to a third of the margin."""
+"""Factor on the sigmas in the second attempt: a nearly planar scene is refused only if planar to a third of the margin.
+"""
 
 
 def initial_reconstruction(trials: TrialData) -> tuple[FloatArray, FloatArray, BoolArray]:

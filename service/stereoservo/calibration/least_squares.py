@@ -292,7 +292,7 @@ def numeric_slopes(
     return slopes
 
 
-# -- what it has determined -------------------------------------------------------------------------------------
+# -- statistics of the determined parameters --------------------------------------------------------------------
 
 
 def chi2_within(chi2: float, freedom: int) -> bool:

@@ -353,12 +353,12 @@ def residuals(rig: RigModel, data: Measurements) -> FloatArray:
 
 
 def projective_rig(model: CellModel) -> RigModel:
-    """The model in its own projective frame, joints counted from the base."""
+    """The model in its own projective frame, joints ordered from the base."""
     return _rig(model, np.eye(4))
 
 
 def stratum_rig(model: CellModel) -> RigModel:
-    """The model in the highest frame of its stratum, joints relative to the base; heights 1 unless projective."""
+    """The model in the highest frame of its stratum, joints ordered from the base; heights 1 unless projective."""
     return _rig(model, stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean))
 
 

@@ -17,7 +17,7 @@ COPLANAR_TAIL = 1e-3
 def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
     """``H`` (4, 4) with ``B_i ~ H A_i`` for points ``(n, 4)``, n >= 5, linear with whitening; ``|det H| = 1``.
 
-    The sign keeps heights: ``H A_i`` has the sign of ``B_i``. Rows with NaN are left out. Raises
+    The sign keeps heights: ``H A_i`` points in the direction of ``B_i``. Rows with NaN are left out. Raises
     GeometryError for fewer than five points or points that leave H undetermined (coplanar): exactly, or, from six
     points on, within the noise that the fit shows. Five points fit exactly and show no noise: for noisy ones use
     `moved_cameras.refuse_coplanar`.

@@ -44,7 +44,7 @@ from stereoservo.geometry.moved_cameras import FrameChange
 from stereoservo.numerics.arrays import FloatArray
 
 EPIPOLAR = 4.0
-"""Factor on the angle that separates a line from an epipolar plane, required so that the line's covariance is valid."""
+"""Factor on the noise in the test for lines in an epipolar plane, so that the covariance of accepted ones is valid."""
 STEP_PX = 1e-3
 """Step of the difference quotients of triangulated lines [px]."""
 DIRECTIONS = 5

@@ -2,8 +2,8 @@
 has changed and by how much, as a report.
 
 Under a valid model the residuals are Gaussian with the stated noise and the model's own uncertainty. A chi-square test
-rejects the model; likelihood ratios, with the decision rule of the on-line monitor (`hypothesis_test`), identify what
-has changed: camera, cameras together, marker body, marker or joint zero.
+rejects the model; likelihood ratios, with the decision rule of the on-line monitor (`hypothesis_test`), identify the
+change: camera, cameras together, marker body, marker or joint zero.
 
 Reset of joint zeros: a new model in which the zeros of drifted joints are moved by the drifts that a check
 estimated.

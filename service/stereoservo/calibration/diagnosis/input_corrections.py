@@ -117,7 +117,7 @@ def views_unrelated(trials: TrialData, k: int) -> bool:
             _, inliers = fundamental_robust(left, right, 2.0 * sigma)
             verdicts.append(float(inliers.mean()) < UNRELATED)
         except GeometryError as error:
-            verdicts.append(error.code != "degenerate")  # coplanar points are related
+            verdicts.append(error.code != "degenerate")  # coplanar points count as related
     return bool(verdicts) and float(np.mean(verdicts)) > 0.5
 
 

@@ -32,7 +32,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 SOUGHT_S, GRID_S = 0.2, 0.02
 """Largest offset that is tried in either direction, and the spacing of the offsets."""
 TOLD_S = 2e-3
-"""Offset below which it is left to the examination, which knows the cameras."""
+"""Smaller offsets are estimated by the examination, which uses the calibrated cameras."""
 MARKERS = 4
 """Number of markers that are used, those seen most often."""
 WEIGHED = 3
