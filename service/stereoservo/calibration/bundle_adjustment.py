@@ -1,7 +1,7 @@
 """Bundle adjustment of joint generators, cameras, lenses and markers in any stratum (projective, affine, metric) by
-Levenberg-Marquardt (thesis 5.53, 5.55 to 5.57), and statistics of what it predicts.
+Levenberg-Marquardt (thesis 5.53, 5.55 to 5.57), and statistics of its predictions.
 
-The model and its residuals are in `rig_model`, its rows in `normal_equations`, the fit's core in `least_squares`.
+The model and its residuals are in `rig_model`, its rows in `normal_equations`, the solver in `least_squares`.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ from stereoservo.numerics.arrays import FloatArray
 class Solution:
     """Result of a bundle adjustment of ``data``, with the minimal ``charts`` at its ``rig``.
 
-    ``cost``: sum of squared weighted residuals, those of lens priors and errors of joints included; ``residuals``
-    (2 k,) of the pixels alone. ``data`` includes the estimated errors of the joints, where these have noise.
-    ``stated_factor``: of the parameters' covariance, where it is not that of the rows.
+    ``cost``: sum of squared weighted residuals, including lens priors and errors of joints; ``residuals``
+    (2 k,) of the pixels alone. ``data`` includes the estimated joint errors, if the joints have noise.
+    ``stated_factor``: factor of the parameters' covariance, if it is not that of the rows.
     """
 
     rig: RigModel
@@ -76,14 +76,14 @@ class Solution:
 
     @cached_property
     def lens_factor(self) -> ArrowFactor | StopFactor:
-        """Orthogonal factor of the Jacobian in which at least the radial parameters of the lenses are free."""
+        """Orthogonal factor of the Jacobian with at least the radial parameters of the lenses free."""
         lenses: LensModel = "radial" if self.lenses == "none" else self.lenses
         free = full_charts(self.rig, self.stratum, cameras=False, points=False, lenses=lenses).lenses
         return orthogonal_factor(self.rig, replace(self.charts, lenses=free), self.data)
 
     @cached_property
     def factor(self) -> ArrowFactor | StopFactor:
-        """Orthogonal factor of the Jacobian by the parameters, or the one stated."""
+        """Orthogonal factor of the Jacobian by the parameters, or the stated one."""
         if self.stated_factor is not None:
             return self.stated_factor
         fixed = len(self.rig.lenses) if self.lenses == "none" else 0
@@ -91,14 +91,12 @@ class Solution:
 
     @cached_property
     def determined(self) -> Determined:
-        """What the data determined of the parameters."""
+        """Statistics of the fit: degrees of freedom, variance, rank and covariance of the parameters."""
         return Determined(self.cost, self.rows, self.charts.size, lambda: self.factor.dense()[:-1, :-1])
 
 
 def with_joint_errors_stated(solution: Solution, noise: JointNoise) -> Solution:
-    """The solution, of exact joint readings, with the covariance that its parameters have where the readings have this
-    ``noise``.
-    """
+    """The solution (fitted with exact joint readings) with the covariance of its parameters under joint ``noise``."""
     data = solution.data.with_joint_noise(noise)
     factor = exact_fit_factor(solution.rig, solution.charts, data, solution.determined.triangle)
     return replace(solution, stated_factor=factor)
@@ -119,8 +117,8 @@ def jacobian(rig: RigModel, charts: Charts, x: FloatArray, data: Measurements) -
 
 
 class _State:
-    """A rig under estimation, sorted measurements with the errors of their joints, the charts at the rig, and those
-    from which a step has led to it.
+    """State of the fit: a rig, sorted measurements with the errors of their joints, the charts at the rig, and the
+    charts from which the last step was made.
     """
 
     def __init__(self, bundle: _Bundle, rig: RigModel, data: Measurements, before: Charts) -> None:
@@ -133,7 +131,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Bundle:
-    """The bundle as a fit: which parts are free, and their loss."""
+    """The bundle as a `Fit`: its free parts and its loss."""
 
     stratum: Stratum
     generators: bool
@@ -159,7 +157,7 @@ class _Bundle:
         return make(state.rig, state.charts, state.data, weights)
 
     def moved(self, state: _State, x: FloatArray) -> _State:
-        """Behind the charts' parameters are the errors that stops have in common, and each stop's own."""
+        """The parameters of the charts are followed by the shared errors of stops, and each stop's own."""
         p, data = state.charts.size, state.data
         if data.joint_noise is not None:
             own = p + data.joint_noise.common
@@ -183,10 +181,10 @@ def solve(
     """Least-squares bundle over the minimal charts of ``stratum`` by Levenberg-Marquardt, re-linearised at every
     step.
 
-    Columns are scaled to unit length. ``loss``: None for plain least squares. ``tolerance``: decrease, relative to the
-    cost, below which nothing is left to gain. Raises LinAlgError where the start has no finite residuals. Never raises
-    on a bad fit: look at ``converged`` and ``cost``. Where the joints have noise, their errors are estimated with the
-    parameters, from ``data``'s on.
+    Columns are scaled to unit length. ``loss``: None for plain least squares. ``tolerance``: relative decrease of the
+    cost at which the fit has converged. Raises LinAlgError if the residuals at the start are not finite. Never raises
+    on a bad fit: check ``converged`` and ``cost``. If the joints have noise, their errors are estimated with the
+    parameters, starting from those in ``data``.
     """
     bundle = _Bundle(stratum, generators, cameras, points, lenses, loss)
     start = _State(bundle, rig, by_stop(data)[0], bundle.charts_at(rig))
@@ -210,8 +208,8 @@ def _cost_of_errors(data: Measurements) -> float:
 
 
 def prediction_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
-    """Variance (c, s, m) [px², of both coordinates together] of pixels predicted at ``offsets`` (s, n), ``J Cov Jᵀ``
-    at the stated sigmas; NaN where the lens images nothing.
+    """Variance (c, s, m) [px², sum of both coordinates] of pixels predicted at ``offsets`` (s, n), ``J Cov Jᵀ``
+    at the stated sigmas; NaN where the lens has no image of the point.
     """
     c, s, m = len(solution.rig.cameras), len(offsets), len(solution.rig.points)
     grid = _grid(solution, offsets)
@@ -229,8 +227,8 @@ def _grid(solution: Solution, offsets: FloatArray) -> Measurements:
 
 
 def joint_variances(solution: Solution, offsets: FloatArray) -> FloatArray:
-    """Variance (c, s, m, n) [px², of both coordinates together] that a unit variance of each joint's reading gives
-    pixels predicted at ``offsets`` (s, n); NaN where the lens images nothing.
+    """Variance (c, s, m, n) [px², sum of both coordinates] of pixels predicted at ``offsets`` (s, n) for a unit
+    variance of each joint's reading; NaN where the lens has no image of the point.
     """
     grid = _grid(solution, offsets)
     slopes = joint_columns(solution.rig, grid).reshape(len(grid.camera), 2, -1)
@@ -245,8 +243,8 @@ def residual_expectations(solution: Solution) -> FloatArray:
 
 
 class GroupRms(NamedTuple):
-    """Residual rms [px] of some pixels, its expected value ``σ √(1 - trace(H_g)/n_g)`` at the stated sigmas, and its
-    standard error about that.
+    """Residual rms [px] of some pixels, its expected value ``σ √(1 - trace(H_g)/n_g)`` at the stated sigmas, and the
+    standard error of the rms about it.
     """
 
     rms_px: float
@@ -263,14 +261,14 @@ def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) ->
         return GroupRms(0.0, 0.0, 0.0)
     left = np.maximum(2.0 - variances / sigmas**2, 0.0)
     expected = float((sigmas**2 * left).sum()) / n
-    # Of Gaussian residuals r = (I - H) e: var(rᵀr) <= 2 σ⁴ trace(I - H_g).
+    # For Gaussian residuals r = (I - H) e: var(rᵀr) <= 2 σ⁴ trace(I - H_g).
     deviation = float(np.sqrt(2.0 * (sigmas**4 * left).sum())) / n
     error = 0.5 * deviation / np.sqrt(expected) if expected > 0.0 else 0.0
     return GroupRms(float(np.sqrt(squares.mean())), float(np.sqrt(expected)), float(error))
 
 
 def generator_noise(solution: Solution) -> FloatArray:
-    """Standard deviation (n,) of the entries of each generator, rms, from the bundle's covariance."""
+    """Rms standard deviation (n,) of the entries of each generator, from the bundle's covariance."""
     root = column_root(solution.determined.triangle, bounded=True)
     at, result = 0, []
     for generator, basis in zip(solution.rig.generators, solution.charts.generators, strict=True):

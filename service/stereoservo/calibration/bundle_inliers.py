@@ -1,5 +1,5 @@
-"""Bundles on their inliers: a robust start, then gating and solving in turn; and refusal of bundles: too many outliers,
-residuals above the noise, directions that the trials leave open.
+"""Bundle adjustment with outlier rejection: a robust start, then alternating gating and solving; and rejection of bad
+bundles: too many outliers, residuals above the noise, directions that the trials leave undetermined.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from stereoservo.kinematics.parameterization import LensModel
 from stereoservo.numerics.arrays import BoolArray
 
 FEW_OUTLIERS = 0.05
-"""Share of outliers that may still change in a bundle that has not converged."""
+"""Share of outliers that may still change in an unconverged bundle."""
 LIKELY = 5.0
-"""Deviations up to which an error of a joint may explain a stop."""
+"""Largest error of a joint, in its standard deviations, that may explain a stop's outliers."""
 
 
 def projective_bundle(
@@ -34,10 +34,10 @@ def projective_bundle(
     options: FitOptions,
     decided: bool,
 ) -> tuple[Solution, BoolArray]:
-    """Projective bundle on its inliers; unless ``decided``, with the lenses that the data require."""
+    """Projective bundle on its inliers; unless ``decided``, with the lens model that the data require."""
     robust = solve(rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4)
     for _ in range(2 if options.lens == "auto" else 0):
-        # Before anything is called an outlier: distortion makes many of them.
+        # Before any outlier is rejected: distortion makes many of them.
         here = every.corrected(robust.data.joint_errors)
         inside = here.select(inlier_mask(robust.rig, here, options))
         wanted = lens_wanted(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
@@ -45,8 +45,8 @@ def projective_bundle(
             break
         lenses = wanted
         robust = solve(robust.rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4)
-    # A flat target may leave the projective bundle with open directions that the metric one closes: no need
-    # to walk such a valley to its end here.
+    # With a planar target the projective bundle may have undetermined directions that the metric one determines:
+    # no need to iterate along them here.
     every = every.corrected(robust.data.joint_errors)
     solution, inliers = refine_to_convergence(robust.rig, every, "projective", options, lenses, 1e-6)
     if decided or lens_test(solution).distorted == (lenses != "none"):
@@ -65,11 +65,10 @@ def refine_to_convergence(
     tolerance: float = 1e-10,
     inliers: BoolArray | None = None,
 ) -> tuple[Solution, BoolArray]:
-    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same, from
-    ``inliers`` on, or those of ``rig``.
+    """Least-squares bundle and its inliers (k,): gating and solving alternate until the inliers stay the same, starting
+    from ``inliers``, or those of ``rig``.
 
-    Whether the last solution has converged is for the caller to judge. Raises CalibrationError
-    (``no_convergence``).
+    The caller must check whether the last solution has converged. Raises CalibrationError (``no_convergence``).
     """
     if inliers is None:
         inliers = inlier_mask(rig, every, options)
@@ -83,8 +82,8 @@ def refine_to_convergence(
         inliers = again
     else:
         if not solution.converged and float((~inliers).mean()) <= FEW_OUTLIERS:
-            # A projective bundle that still moves along an undetermined direction: a higher stratum may close it.
-            # Whether the last solution has converged is asked at the end.
+            # A projective bundle that still moves along an undetermined direction: a higher stratum may determine it.
+            # Convergence of the last solution is checked at the end.
             return solution, inliers
         raise CalibrationError(
             "no_convergence",
@@ -97,15 +96,15 @@ def refine_to_convergence(
 
 
 def with_whole_stops(every: Measurements, inliers: BoolArray) -> BoolArray:
-    """Inliers (k,) with the pixels of those stops of which most were left out: errors of the joints, once these are
-    better known, may explain them.
+    """Inliers (k,), with all pixels of those stops of which most were left out: errors of the joints, once they are
+    estimated better, may explain them.
     """
     lost = np.bincount(every.stop, weights=~inliers) > 0.5 * np.bincount(every.stop)
     return np.asarray(inliers | lost[every.stop])
 
 
 def _joint_errors(solution: Solution, every: Measurements, inliers: BoolArray) -> JointErrors | None:
-    """Errors of the joints as in a solution, and as likely ones as explain stops that are outliers as a whole."""
+    """Joint errors of a solution, extended by likely ones that explain stops whose pixels are all outliers."""
     noise, errors = every.joint_noise, solution.data.joint_errors
     left = np.setdiff1d(every.stop, every.stop[inliers])
     if noise is None or errors is None or not len(left):
@@ -122,9 +121,7 @@ def _joint_errors(solution: Solution, every: Measurements, inliers: BoolArray) -
 
 
 def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> BoolArray:
-    """Mask (k,) of the pixels that fit the rig, by their squared distance, with the noise estimated from the
-    median.
-    """
+    """Mask (k,) of the pixels that fit the rig, by squared distance, with the noise estimated from the median."""
     squares = (residuals(rig, every).reshape(-1, 2) ** 2).sum(axis=1)
     # The median of a chi-square with two degrees of freedom is ln 4.
     factor = max(1.0, float(np.median(squares)) / np.log(4.0))
@@ -133,13 +130,13 @@ def inlier_mask(rig: RigModel, every: Measurements, options: FitOptions) -> Bool
 
 
 VALLEY_VARIANCE = 1.5
-"""Variance factor up to which an unconverged bundle lies in a flat valley of its cost: a direction is undetermined."""
+"""Variance factor up to which an unconverged bundle has a flat cost: a direction is undetermined."""
 
 
 def refuse_poor_fit(
     trials: TrialData, solution: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
 ) -> None:
-    """Raise CalibrationError for a bundle that leaves out too many pixels, or more than their noise explains."""
+    """Raise CalibrationError for a bundle with too many outliers, or with residuals above the noise of the pixels."""
     share = float((~inliers).mean())
     if share > options.max_outliers:
         raise CalibrationError(
@@ -191,7 +188,7 @@ def refuse_poor_fit(
 
 
 def refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
-    """Raise CalibrationError for a final bundle that has undetermined directions, or has not converged."""
+    """Raise CalibrationError for a final bundle that has undetermined directions or has not converged."""
     rank = solution.determined.rank
     because = f" ({'; '.join(notes)})" if notes else ""
     if rank < solution.charts.size:

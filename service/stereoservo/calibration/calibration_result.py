@@ -68,11 +68,11 @@ class CameraReport(msgspec.Struct, frozen=True):
 
 
 class LensReport(msgspec.Struct, frozen=True):
-    """The lens model that was selected, ``none``, ``radial_centre`` or ``brown``, and the test of it.
+    """Selected lens model, ``none``, ``radial_centre`` or ``brown``, and its test.
 
-    ``chi2``: what the parameters of all lenses but their centres (``freedom`` of them) are worth against zero: the gain
-    that freeing them would bring (score test) where they are not free, their own significance (Wald) where they are.
-    Above ``limit`` a lens distorts; pinholes get there once in ten thousand fits.
+    ``chi2``: of the parameters of all lenses except their centres (``freedom`` of them) against zero: the gain
+    from freeing them if they are fixed (score test), their own significance if they are free (Wald test).
+    Above ``limit`` a lens distorts; pinholes exceed it once in ten thousand fits.
     """
 
     model: LensModel
@@ -83,7 +83,7 @@ class LensReport(msgspec.Struct, frozen=True):
 
 class JointErrorReport(msgspec.Struct, frozen=True):
     """Errors of a joint's readings as standard deviations [rad or m], ``random``, ``repeatable`` and by ``posture``,
-    each with its own standard deviation; ``pixels``: by how much they move the markers in the images, rms [px].
+    each with its own standard deviation; ``pixels``: resulting motion of the markers in the images, rms [px].
     """
 
     name: str
@@ -98,7 +98,7 @@ class JointErrorReport(msgspec.Struct, frozen=True):
 
 
 class Outlier(msgspec.Struct, frozen=True):
-    """A pixel that was left out, and how far it lies from the model [px]."""
+    """A rejected pixel and its distance from the prediction [px]."""
 
     camera: str
     stop: int
@@ -107,18 +107,18 @@ class Outlier(msgspec.Struct, frozen=True):
 
 
 class CalibrationReport(msgspec.Struct, frozen=True):
-    """Statistics of a fit beside those that the model itself carries.
+    """Statistics of a fit that are not part of the model.
 
     ``sigma_factor``: estimated over stated standard deviation of the pixels (square root of the variance
-    factor). ``prediction_rms_px``, ``prediction_max_px``: standard deviation of the predicted pixels a
-    coordinate, ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of
+    factor). ``prediction_rms_px``, ``prediction_max_px``: standard deviation per coordinate of the predicted pixels,
+    ``J Cov Jᵀ``, over all cameras, stops and markers, seen or not. ``left_intrinsics_std``: of
     fx, skew, fy, u0, v0 [px]. ``projective_chi2``, ``projective_degrees_of_freedom``: of the projective
-    bundle, which the stratum's is nested in. ``lens``: the lens model and its test.
-    ``untested``: what the model takes as stated because the trials do not determine it. ``joints``: errors of the joint
-    readings; empty where the data show none. Chi-square, residuals and deviations are then those of a model with both
-    noises, residuals what is left of the pixels beside the joints' errors. ``exact_joints_chance``: above 0 where the
-    errors are likely only, the probability, at most, with which exact readings show as much; deviations contain them,
-    chi-square and residuals are those of a model with exact readings.
+    bundle, in which the stratum's is nested. ``lens``: the lens model and its test.
+    ``untested``: inputs used as stated because the trials do not determine them. ``joints``: errors of the joint
+    readings; empty if the data show none. Chi-square, residuals and deviations then belong to a model with both
+    noises; residuals are those that remain beside the joints' errors. ``exact_joints_chance``: above 0 if errors are
+    only likely: upper bound of the probability that exact readings show as much; deviations then include the errors,
+    chi-square and residuals belong to a model with exact readings.
     """
 
     stratum: Stratum
@@ -150,8 +150,8 @@ class CalibrationFit(msgspec.Struct, frozen=True, eq=False):
 
 
 class ModelFrame(NamedTuple):
-    """Joint positions ``zero`` (n,) at which the generators stand, and ``plane`` (4,) at infinity in the projective
-    frame.
+    """Joint positions ``zero`` (n,) at which the generators are defined, and the ``plane`` (4,) at infinity in the
+    projective frame.
     """
 
     zero: FloatArray
@@ -159,7 +159,7 @@ class ModelFrame(NamedTuple):
 
 
 class FitHistory(NamedTuple):
-    """What preceded a final bundle: cost and degrees of freedom of the ``projective`` one, notes, markers left out."""
+    """Results before a final bundle: cost and degrees of freedom of the ``projective`` one, notes, markers left out."""
 
     projective: tuple[float, int]
     notes: tuple[str, ...]
@@ -179,8 +179,9 @@ def build_fit(
     components: VarianceComponents | None = None,
     exact_joints_chance: float = 0.0,
 ) -> CalibrationFit:
-    """Model and report of a solved bundle; ``components``: of its joint noise, or where readings are exact with some
-    chance of the noise stated beside them. Raises CalibrationError.
+    """Model and report of a solved bundle. Raises CalibrationError.
+
+    ``components``: of its joint noise; with ``exact_joints_chance`` > 0, likely noise beside exact readings.
     """
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
@@ -252,7 +253,7 @@ def _accuracy(components: VarianceComponents) -> JointAccuracy:
 def _joint_errors(
     trials: TrialData, components: VarianceComponents, by_joint: FloatArray
 ) -> tuple[JointErrorReport, ...]:
-    """Errors of each joint; ``by_joint`` (c, s, m, n) as from `joint_variances`."""
+    """Errors of each joint; ``by_joint`` (c, s, m, n) from `joint_variances`."""
     slopes = np.sqrt(np.nanmean(by_joint, axis=(0, 1, 2)) / 2)
     found, spreads = components.deviations, components.deviations_of_deviations
     return tuple(
@@ -302,7 +303,7 @@ def _camera_report(
 
 
 def completed(result: CalibrationFit, trials: TrialData) -> CalibrationFit:
-    """The fit with static points, loads and shutter offsets of the trials."""
+    """The fit extended by static points, loads and shutter offsets from the trials."""
     model, of_scene = with_static_points(result.model, trials.static)
     report = msgspec.structs.replace(result.report, notes=(*result.report.notes, *of_scene))
     model = msgspec.structs.replace(model, loads=trials.loads)
@@ -364,18 +365,18 @@ def build_model(
 
 
 def _lens_size(solution: Solution) -> int:
-    """How many numbers the model's lenses have: 7 with second radial and tangential terms, else 4."""
+    """Number of parameters of each lens: 7 with second radial and tangential terms, else 4."""
     return 7 if solution.lenses == "brown" else 4
 
 
 def _covariance(
     solution: Solution, frame: FloatArray, back: FloatArray, cameras: FloatArray, points: FloatArray
 ) -> ModelCovariance:
-    """The bundle's covariance with its directions brought into the model's ``frame`` (4, 4), whose ``cameras`` and
-    ``points`` are scaled as they are there.
+    """The bundle's covariance with its directions transformed into the model's ``frame`` (4, 4), whose ``cameras`` and
+    ``points`` define the scales.
     """
     rig, charts = solution.rig, solution.charts
-    # Matrices and points are scaled as a whole: their directions with them.
+    # Matrices and points are scaled as a whole, and their directions with them.
     matrices = rig.cameras @ back
     camera_scales = (cameras * matrices).sum(axis=(1, 2)) / (matrices**2).sum(axis=(1, 2))
     brought = rig.points @ frame.T

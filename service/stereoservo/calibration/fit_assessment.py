@@ -1,4 +1,4 @@
-"""Assessment of a calibration for people: grade, reasons and advice, of a fitted model or of a failure."""
+"""Assessment of a calibration for the operator: grade, reasons and advice, for a fitted model or a failure."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 Grade = Literal["good", "usable", "not usable"]
 
 NOTABLE_NOISE = 1.1
-"""Residuals over stated noise up to which a fit that fails its chi-square is not reported."""
+"""Ratio of residuals to stated noise up to which a failed chi-square test is not reported."""
 NOTABLE_OUTLIERS = 0.02
-"""Share of pixels left out that is reported."""
+"""Share of rejected pixels from which it is reported."""
 NOTABLE_JOINT = 1.3
-"""Residual of one joint over that of all that is reported."""
+"""Ratio of one joint's residual to the overall one from which it is reported."""
 SHORT_DEG, SHORT_M = 5.0, 0.02
-"""Trial motions so small that a poor deviation is put down to them."""
+"""Trial motions [°, m] below which a large standard deviation is attributed to them."""
 NOTABLE_SHARE = 0.1
-"""Errors of a joint's readings over the largest, in the images, that are reported."""
+"""Errors of a joint's readings, relative to the largest one in the images, from which they are reported."""
 SEEN = 2.0
-"""Errors of a joint's readings over their own deviation from which they are named."""
+"""Errors of a joint's readings, in their own standard deviation, from which they are named."""
 NOTABLE_DEVIATION_PX = 0.5
-"""Deviation of predicted pixels that is reported."""
+"""Standard deviation of predicted pixels from which it is reported."""
 NOTABLE_DEPTH_DEVIATION = 0.05
-"""Relative deviation of depths that is reported."""
+"""Relative standard deviation of depths from which it is reported."""
 
 STRATA: dict[Stratum, str] = {
     "metric": "metric: angles, ratios of lengths and the cameras' intrinsics are known; every law works",
@@ -101,7 +101,7 @@ REMEDIES = {
     "not_observable": "take a calibration.base where the axes of the joints named are different lines, put the markers "
     "farther from them, or calibrate anew",
 }
-"""What to do about each cause of a failed calibration, by the code of its CalibrationError."""
+"""Advice for each cause of a failed calibration, by the code of its CalibrationError."""
 
 
 JOINT_ERRORS = (
@@ -110,7 +110,7 @@ JOINT_ERRORS = (
     "encoder's step, friction, play whose flank changes. Those by posture change slowly with the positions of all "
     "joints: sag under the arm's weight, a joint that turns with another. The deviations that are stated contain them"
 )
-"""What the report's errors of joint readings are."""
+"""Explanation of the errors of joint readings in the report."""
 
 
 class Acceptance(msgspec.Struct, frozen=True):
@@ -123,7 +123,7 @@ class Acceptance(msgspec.Struct, frozen=True):
 
 
 def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float | None = None) -> Acceptance:
-    """Assessment of a fitted model. ``depth_spread``: largest relative deviation of a marker's depth, where known."""
+    """Assessment of a fitted model. ``depth_spread``: largest relative deviation of a marker's depth, if known."""
     reasons: list[str] = []
     advice: list[str] = []
     statistics = model.statistics
@@ -184,7 +184,7 @@ def _residuals(model: CellModel, report: CalibrationReport, reasons: list[str], 
 
 
 def _joint_errors(report: CalibrationReport) -> str:
-    """What the joints' readings are off by, largest in the images first, as far as it is seen there."""
+    """Text on the errors of the joints' readings, the largest in the images first, if visible there."""
     seen = sorted(report.joints, key=lambda joint: joint.pixels, reverse=True)
     named = [joint for joint in seen if joint.pixels > NOTABLE_SHARE * seen[0].pixels]
     parts = []
@@ -254,7 +254,7 @@ def _identified(
         reasons.append(f"the data identify the {model.stratum} stratum only")
         why = [note for note in report.notes if "refused" in note]
         if why:
-            # The last attempt at the stratum wanted is the nearest to the truth.
+            # The last attempt at the required stratum is nearest to the truth.
             wanted = why[0].split()[0]
             reasons.append([note for note in why if note.startswith(wanted)][-1])
     if not loose and model.stratum == "metric":

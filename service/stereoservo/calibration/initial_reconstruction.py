@@ -29,20 +29,17 @@ from stereoservo.geometry.strata import euclidean_to_projective, projective_to_e
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 SEPARATION = 10.0
-"""Singular value over its noise above which it counts as not zero."""
+"""Singular value, relative to its noise, above which it counts as nonzero."""
 NOMINAL_FOCALS = (2.0, 3.0, 1.4)
-"""Focal lengths [half image widths] to start from where the linear estimate fails: 53°, 37° and 71°
-across.
-"""
+"""Initial focal lengths [half image widths] if the linear estimate fails: 53°, 37° and 71° field of view."""
 
 
 def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
-    """Candidates (4,) for the plane that all generators (n, 4, 4) leave fixed, ``ker`` of the stack of
-    ``-Ĥᵀ`` (5.59).
+    """Candidates (4,) for the plane that all generators (n, 4, 4) leave fixed, ``ker`` of the stack of ``-Ĥᵀ`` (5.59).
 
     Rows are weighted by ``noise`` (n,), the standard deviation of each generator's entries. First the least
-    singular vector; then, of all that vanish within their noise, the one nearest to (0, 0, 0, 1), which is
-    the infinity of the canonical frame's nominal cameras: where axes are parallel a pencil of planes is left.
+    singular vector; then, of all that vanish within their noise, the one nearest to (0, 0, 0, 1), the plane at
+    infinity of the canonical frame's nominal cameras: parallel axes leave a pencil of planes.
     """
     stack = (-generators.transpose(0, 2, 1) / noise[:, None, None]).reshape(-1, 4)
     _, values, rows = np.linalg.svd(stack)
@@ -52,9 +49,7 @@ def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[Float
 
 
 def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
-    """``plane`` (4,) scaled to mean height 1 over points (m, 4) of depth 1; None when it passes between
-    the points.
-    """
+    """``plane`` (4,) scaled to mean height 1 over points (m, 4) of depth 1; None if it passes between the points."""
     heights = points @ plane / points[:, 2]
     mean = float(heights.mean())
     if mean == 0.0 or (heights / mean).min() <= 0.0:
@@ -64,9 +59,9 @@ def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
 
 
 def affine_rig(rig: RigModel, plane: FloatArray) -> RigModel:
-    """The projective ``rig`` in the affine frame of ``plane`` (4,), generators snapped to it.
+    """The projective ``rig`` in the affine frame of ``plane`` (4,), with generators snapped to it.
 
-    Raises GeometryError where a generator is no rotation there: the plane is far from being left fixed.
+    Raises GeometryError if a generator is no rotation there: the plane is far from fixed.
     """
     moved = _transformed(rig, plane, np.eye(3))
     for j, kind in enumerate(rig.kinds):
@@ -80,12 +75,11 @@ def affine_rig(rig: RigModel, plane: FloatArray) -> RigModel:
 
 
 def metric_rig(rig: RigModel, plane: FloatArray, intrinsics: FloatArray, spans: FloatArray) -> RigModel:
-    """The projective ``rig`` in the Euclidean frame of ``plane`` (4,) and ``K̃`` (3, 3), generators unit
-    twists.
+    """The projective ``rig`` in the Euclidean frame of ``plane`` (4,) and ``K̃`` (3, 3), generators unit twists.
 
-    A revolute joint gets the rigid rotation nearest to what it does to the markers over half of its trial's
-    range ``spans`` (n,) [rad]. That needs no exact frame, and asks nothing of a generator where the markers
-    do not go: off the plane of a flat target that turns in itself, it is unknown.
+    A revolute joint gets the rigid rotation nearest to its effect on the markers over half of its trial's
+    range ``spans`` (n,) [rad]. That needs no exact frame, and uses a generator only where the markers are:
+    off the plane of a planar target that moves within it, the generator is unknown.
     """
     moved = _transformed(rig, plane, intrinsics)
     for j, kind in enumerate(rig.kinds):
@@ -106,9 +100,7 @@ def _transformed(rig: RigModel, plane: FloatArray, intrinsics: FloatArray) -> Ri
 
 
 def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Unit twist (4, 4), without pitch, of the rigid motion that best takes points (m, 3) to others
-    (Kabsch).
-    """
+    """Unit twist (4, 4), without pitch, of the rigid motion that best maps points (m, 3) to others (Kabsch)."""
     centroid, centroid_after = before.mean(axis=0), after.mean(axis=0)
     u, _, vt = np.linalg.svd((after - centroid_after).T @ (before - centroid))
     u[:, 2] *= np.linalg.det(u @ vt)
@@ -128,7 +120,7 @@ def intrinsics_linear(
     """``K̃`` (3, 3) from affine generators (n, 4, 4) by ``A Ω + Ω Aᵀ = 0``, ``Ω = K̃ K̃ᵀ``, linear, weighted
     by ``noise`` (n,).
 
-    None where noise leaves ``Ω`` indefinite. Second, whether ``Ω`` is unique beyond its noise.
+    None if noise leaves ``Ω`` indefinite. Second, whether ``Ω`` is unique beyond its noise.
     """
     blocks = generators[revolute, :3, :3] / noise[revolute, None, None]
     if not len(blocks):
@@ -145,24 +137,19 @@ def intrinsics_linear(
 
 
 def nominal_intrinsics(focal: float) -> FloatArray:
-    """``K̃`` (3, 3) of a camera with square pixels, its principal point in the middle and ``focal`` [half
-    widths].
-    """
+    """``K̃`` (3, 3) of a camera with square pixels, central principal point and ``focal`` length [half widths]."""
     return np.diag([focal, focal, 1.0])
 
 
 MIN_MATCHES = 16
-"""Matches between two cameras below which the epipolar geometry is not worth a robust search."""
+"""Matches between two cameras below which a robust search for the epipolar geometry is not attempted."""
 MIN_AGREEMENT = 0.4
-"""Share of matches that must fit one epipolar geometry; below it the stated sigmas are widened once or
-twice.
-"""
+"""Share of matches that must fit one epipolar geometry; below it the stated sigmas are increased once or twice."""
 PARALLAX_RATIO, PARALLAX_SCATTER = 1.2, 3.0
-"""Ratio of variances, homography to F, above which the parallax of n matches counts: the first plus the second over
-√n. Cameras with one centre leave 1.13 to 1.33: F fits its own inliers a little too well."""
+"""Ratio of variances, homography to F, above which the parallax of n matches is significant: the first plus the second
+over √n. Cameras with one centre give 1.13 to 1.33: F fits its own inliers a little too well."""
 NARROW = 1.0 / 3.0
-"""Second try where the search refuses a scene that is nearly a plane: it must be a plane to a third of the
-margin.
+"""Factor on the sigmas in the second attempt: a nearly planar scene is refused only if planar to a third of the margin.
 """
 
 
@@ -170,7 +157,7 @@ def initial_reconstruction(trials: TrialData) -> tuple[FloatArray, FloatArray, B
     """Projective reconstruction of all stops: cameras (c, 3, 4) in the canonical frame, points (s, m, 4), usable
     pixels (c, s, m).
 
-    Points have depth 1 in the left camera, NaN where they are not usable in two cameras. Raises
+    Points have depth 1 in the left camera, NaN if they are not usable in two cameras. Raises
     CalibrationError (``too_few_markers``, ``views_degenerate``).
     """
     c, s, m = trials.sigmas.shape
@@ -200,7 +187,7 @@ def initial_reconstruction(trials: TrialData) -> tuple[FloatArray, FloatArray, B
         points = triangulate(matrices, np.where(usable[:, :, None], flat, np.nan), sigmas)
     except GeometryError as error:
         raise _degenerate(trials, 1, error) from error
-    # Points behind a camera, or at its focal plane, come from wrong matches.
+    # Points behind a camera or in its focal plane come from wrong matches.
     depths = np.einsum("cj,pj->cp", matrices[:, 2], np.nan_to_num(points))
     common = np.sign(np.median(depths[:, np.isfinite(points).all(axis=1)], axis=1))
     matrices *= common[:, None, None]
@@ -264,7 +251,7 @@ def _weak_parallax(left: FloatArray, right: FloatArray, sigma: float) -> FloatAr
     try:
         F, inliers = fundamental_robust(left, right, sigma, refuse_plane=False)
     except GeometryError:
-        return None  # no geometry at all is reported by the other attempts
+        return None  # an undetermined geometry is reported by the other attempts
     enough = PARALLAX_RATIO + PARALLAX_SCATTER / np.sqrt(float(inliers.sum()))
     return F if parallax_ratio(F, left[inliers], right[inliers]) > enough else None
 

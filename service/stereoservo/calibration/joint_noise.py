@@ -1,8 +1,8 @@
 """Least squares with errors in the joint readings: rows whitened stop by stop by ``J_q S_q J_qᵀ + S_px``, normal
 equations, orthogonal factor and leverages (a linear mixed model; Searle, Casella, McCulloch, 2006, ch. 7).
 
-Errors of a stop's own are eliminated within the stop; errors that stops share are columns beside the parameters. What a
-stop's pixels have in common couples its markers, so that these are no longer eliminated one by one: rows are dense.
+Errors of a single stop are eliminated within the stop; errors that stops share are columns beside the parameters. The
+common error of a stop's pixels couples its markers, so that these are not eliminated one by one: rows are dense.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def joint_columns(rig: RigModel, data: Measurements) -> FloatArray:
 
 
 def error_columns(rig: RigModel, data: Measurements) -> FloatArray:
-    """Derivatives (2 k, e) of the weighted residuals by all errors of the joints of ``data``, which has joint noise, in
-    their standard deviations: the root of what they add to the covariance of the residuals.
+    """Derivatives (2 k, e) of the weighted residuals by all joint errors of ``data``, which has joint noise, in units
+    of their standard deviations: a root of the covariance that they add to the residuals.
     """
     noise, slopes = data.joint_noise, joint_columns(rig, data)
     assert noise is not None
@@ -66,8 +66,9 @@ def error_columns(rig: RigModel, data: Measurements) -> FloatArray:
 
 
 class StopRows(NamedTuple):
-    """Weighted rows of one stop: ``joints`` (2 k, n) by its joints' positions, ``rows`` (2 k, p + 1) by the parameters
-    and the residuals at the reported positions, to first order. ``measurements``: where they are in the sorted data.
+    """Weighted rows of one stop: derivatives ``joints`` (2 k, n) by its joints' positions, ``rows`` (2 k, p + 1) by the
+    parameters, with the residuals at the reported positions, to first order. ``measurements``: their indices in the
+    sorted data.
     """
 
     stop: int
@@ -84,7 +85,7 @@ def stop_rows(rig: RigModel, charts: Charts, data: Measurements, weights: Weight
     end = next(ends, 0)
     rows, joints = np.zeros((0, charts.size + 1)), np.zeros((0, len(rig.kinds)))
     for here, block in chunks(rig, charts, data):
-        # A chunk may end within a stop, whose rest comes with the next one.
+        # A chunk may end within a stop, which the next one continues.
         rows = np.vstack([rows, block.dense(len(rig.points))])
         joints = np.vstack([joints, joint_columns(rig, data.select(np.arange(here.start, here.stop)))])
         while first < end <= here.stop:
@@ -100,9 +101,9 @@ def stop_rows(rig: RigModel, charts: Charts, data: Measurements, weights: Weight
 
 
 class _Whitened(NamedTuple):
-    """A stop's rows (2 k, e + p + 1), by shared errors, parameters and residual, whitened of its own errors; ``basis``
-    (2 k, n) of what these span, ``triangle`` (n, n) their columns in it, ``projected`` (n, e + p + 1) the rows in it
-    before, ``shrink`` (n, n) of the projected rows.
+    """A stop's rows (2 k, e + p + 1), by shared errors, parameters and residual, whitened of the stop's own errors;
+    ``basis`` (2 k, n) of the own errors' span, ``triangle`` (n, n) their columns in it, ``projected`` (n, e + p + 1)
+    the original rows in it, ``shrink`` (n, n) of the projected rows.
     """
 
     rows: FloatArray
@@ -126,9 +127,10 @@ def _whitened(one: StopRows, data: Measurements) -> _Whitened:
 
 @dataclass(frozen=True)
 class StopEquations:
-    """Normal equations of whitened rows: ``marginal`` of the parameters, all errors eliminated. How errors follow from
-    a step: those that stops share by ``common`` (e, e + p + 1), residuals last; of each of the ``stops`` (k,) its own
-    by the ``information`` (k, n, n) on them and ``projected`` (k, n, e + p + 1).
+    """Normal equations of whitened rows: ``marginal`` of the parameters, with all errors eliminated.
+
+    Errors after a step: shared ones by ``common`` (e, e + p + 1), residuals last; those of each of the ``stops`` (k,)
+    by their ``information`` (k, n, n) and ``projected`` (k, n, e + p + 1).
     """
 
     marginal: NormalEquations
@@ -140,25 +142,25 @@ class StopEquations:
 
     @property
     def gradient(self) -> FloatArray:
-        """Gradient (p + 1,) on unit columns; its last entry is what other errors of the joints alone would gain."""
+        """Gradient (p + 1,) on unit columns; its last entry is the gain from changing the joint errors alone."""
         cost = self.marginal.cost
         gain = cost - float(self.marginal.core[-1, -1])
         return np.append(self.marginal.gradient, max(gain, 0.0) / max(cost, 1.0))
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
-        """Damped step (p,) as `NormalEquations.step`, behind it all errors of the joints after the step: those that
-        stops have in common (e,), and each stop's own (s n,).
+        """Damped step as `NormalEquations.step` (p,), followed by all joint errors after the step: those that
+        stops share (e,), and each stop's own (s n,).
         """
         x, expected = self.marginal.step(damping)
         return np.concatenate([x, *self._errors(x)]), expected
 
     def errors(self) -> JointErrors:
-        """Errors of the joints without a step."""
+        """Joint errors at a step of zero."""
         own, common = self._errors(np.zeros(len(self.marginal.sizes)))[::-1]
         return JointErrors(own.reshape(self.data.offsets.shape), common)
 
     def _errors(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Errors that stops have in common (e,), and their own (s n,), after a step ``x`` (p,), to first order."""
+        """Joint errors after a step ``x`` (p,), to first order: those that stops share (e,) and their own (s n,)."""
         e = len(self.common)
         step = np.append(x, 1.0)
         common = -np.linalg.solve(self.common[:, :e], self.common[:, e:] @ step) if e else np.zeros(0)
@@ -171,7 +173,7 @@ class StopEquations:
 def stop_equations(rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None) -> StopEquations:
     """Normal equations of sorted ``data`` with joint noise; ``weights`` as for `normal_equations`.
 
-    Of a stop's rows ``A`` and its own errors' ``U`` they are ``Aᵀ A - Aᵀ U (1 + Uᵀ U)⁻¹ Uᵀ A``.
+    With a stop's rows ``A`` and ``U`` those of its own errors, they are ``Aᵀ A - Aᵀ U (1 + Uᵀ U)⁻¹ Uᵀ A``.
     """
     noise = data.joint_noise
     assert noise is not None
@@ -210,15 +212,15 @@ def stop_equations(rig: RigModel, charts: Charts, data: Measurements, weights: W
 
 
 def estimated_errors(rig: RigModel, charts: Charts, data: Measurements) -> JointErrors:
-    """Errors of the joints that ``data``, which has joint noise, shows at the parameters of ``rig``."""
+    """Estimated joint errors of ``data``, which has joint noise, at the parameters of ``rig``."""
     ordered, _ = by_stop(data)
     return stop_equations(rig, charts, ordered, None).errors()
 
 
 @dataclass(frozen=True)
 class StopFactor:
-    """Orthogonal factor ``triangle`` (p + 1, p + 1) of whitened rows and residuals, the columns of ``markers`` first:
-    the counterpart of `ArrowFactor` where the joints have noise.
+    """Orthogonal factor ``triangle`` (p + 1, p + 1) of whitened rows and residuals, columns of ``markers`` first;
+    the counterpart of `ArrowFactor` for joints with noise.
     """
 
     triangle: FloatArray
@@ -230,7 +232,7 @@ class StopFactor:
         return self.triangle[self.markers :, self.markers :]
 
     def without(self, columns: IntArray) -> StopFactor:
-        """The factor without these ``columns`` of generators, cameras and lenses: with them kept fixed."""
+        """The factor without these ``columns`` of generators, cameras and lenses: they are kept fixed."""
         if not len(columns):
             return self
         kept = np.delete(self.triangle, self.markers + columns, axis=1)
@@ -245,8 +247,8 @@ class StopFactor:
 def orthogonal_factor(
     rig: RigModel, charts: Charts, data: Measurements, more: FloatArray | None = None
 ) -> ArrowFactor | StopFactor:
-    """Orthogonal factor of the Jacobian and residuals, whitened where the joints have noise; ``more`` (2 k, e): columns
-    behind those of the lenses.
+    """Orthogonal factor of the Jacobian and residuals, whitened if the joints have noise; ``more`` (2 k, e): columns
+    after those of the lenses.
     """
     noise = data.joint_noise
     if noise is None:
@@ -267,7 +269,7 @@ def orthogonal_factor(
         pending.append(_whitened(one._replace(rows=rows), data).rows)
         if sum(len(part) for part in pending) > 8 * width:
             pending = [np.asarray(np.linalg.qr(np.vstack(pending), mode="r"))]
-    # Into the order of a factor: shared errors, markers, the others, residuals.
+    # Reorder: shared errors, markers, the other parameters, residuals.
     inner = e + core + extra.shape[1]
     columns = [*range(e), *range(inner, width - 1), *range(e, inner), width - 1]
     whole = np.linalg.qr(np.vstack(pending)[:, columns], mode="r")
@@ -292,8 +294,8 @@ def prediction_leverages(
 
 
 def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
-    """Expected squared residual (k,) of each measurement [sigmas², both coordinates] once parameters and errors of the
-    joints are estimated: the diagonal of ``V⁻¹ - V⁻¹ X (Xᵀ V⁻¹ X)⁻¹ Xᵀ V⁻¹``.
+    """Expected squared residual (k,) of each measurement [sigmas², both coordinates] after estimation of parameters and
+    joint errors: the diagonal of ``V⁻¹ - V⁻¹ X (Xᵀ V⁻¹ X)⁻¹ Xᵀ V⁻¹``.
     """
     noise = data.joint_noise
     assert noise is not None
@@ -308,7 +310,7 @@ def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> Float
     root = column_root(triangle[:-1, :-1])
     out = np.empty(len(order))
     for one, white in stops:
-        # T = I - Q (I - W) Qᵀ whitens; T T is V⁻¹.
+        # T = I - Q (I - W) Qᵀ whitens; T T = V⁻¹.
         twice = 2.0 * white.shrink - white.shrink @ white.shrink
         own = 1.0 - ((white.basis @ twice) * white.basis).sum(axis=1)
         scaled = white.rows[:, :-1] @ root
@@ -319,8 +321,8 @@ def expected_squares(rig: RigModel, charts: Charts, data: Measurements) -> Float
 
 
 def exact_fit_factor(rig: RigModel, charts: Charts, data: Measurements, triangle: FloatArray) -> StopFactor:
-    """Factor whose inverse square is the covariance of parameters that were fitted to ``data``, which has joint noise,
-    as if its readings were exact; ``triangle`` (p, p): root of the normal matrix of that fit.
+    """Factor whose inverse square is the covariance of parameters fitted to ``data``, which has joint noise, as if its
+    readings were exact; ``triangle`` (p, p): root of that fit's normal matrix.
     """
     noise, (ordered, _) = data.joint_noise, by_stop(data)
     assert noise is not None

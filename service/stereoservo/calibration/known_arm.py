@@ -1,8 +1,8 @@
-"""Calibration where the arm is known: cameras, lenses and markers from pixels at known displacements, such as the poses
-that a robot reports of its hand (`free_arm`), with the errors of these estimated.
+"""Calibration with a known arm: cameras, lenses and markers from pixels at known displacements, such as the hand poses
+that a robot reports (`free_arm`); errors of the displacements are estimated.
 
-Known twists fix the frame, metres included, and any motion will do: no joint has to move alone. Each camera is a free
-matrix; nothing of it is assumed.
+Known twists define the frame, including metres, and any motion is sufficient: no joint has to move alone. Each camera
+is a free matrix without assumptions.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ NAMES = ("x", "y", "z", "rz", "ry", "rx")
 """Joints of a free arm, base first."""
 KINDS: tuple[Kind, ...] = ("prismatic", "prismatic", "prismatic", "revolute", "revolute", "revolute")
 RIGID = 1e-6
-"""Largest entry of RᵀR - 1 with which a displacement is taken for a rigid one."""
+"""Largest entry of RᵀR - 1 up to which a displacement counts as rigid."""
 
 
 def free_arm(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Positions (s, 6) [m, rad] and generators (6, 4, 4) of a free arm that makes ``displacements`` (s, 4, 4) [m] of a
-    body, and the displacement (4, 4) at its zero: their middle.
+    body, and the displacement (4, 4) at its zero: their mean.
 
     ``D = E_x E_y E_z E_rz E_ry E_rx D_zero``, with the rotations about the zero's origin. Raises CalibrationError
     (``bad_data``) for a displacement that is not rigid.
@@ -102,8 +102,8 @@ def trials_of_poses(
     pixels: FloatArray,
     sigmas: FloatArray,
 ) -> TrialData:
-    """Trial data of a body with markers at known ``displacements`` (s, 4, 4) [m], as from a robot that reports its
-    hand's poses; ``pixels`` (c, s, m, 2) and ``sigmas`` (c, s, m) as there.
+    """Trial data of a body with markers at known ``displacements`` (s, 4, 4) [m], such as the hand poses that a robot
+    reports; ``pixels`` (c, s, m, 2) and ``sigmas`` (c, s, m) as in `TrialData`.
 
     Raises CalibrationError (``bad_data``).
     """
@@ -123,29 +123,29 @@ def trials_of_poses(
 
 
 LEAST_VIEWS = 6
-"""Stops at which a camera must see markers: it has 11 unknowns, and markers of unknown places close together count
-little more than a point."""
+"""Stops at which a camera must see markers: it has 11 unknowns, and close markers of unknown positions determine
+little more than one point."""
 LEAST_MOTION = 1e-6
-"""Spread of the body's origin [m] below which it has not moved."""
+"""Spread of the body's origin [m] below which it counts as not moved."""
 RADII = (0.5, 1.0, 2.0)
 DIRECTIONS = 12
-"""Guesses of where the markers are from the body's origin: directions on spheres [spreads of the motion]."""
+"""Initial marker positions relative to the body's origin: directions on spheres [spreads of the motion]."""
 ALTERNATIONS, BUNDLES = 4, 4
 AGREEMENT = 1e-4
-"""At most ``BUNDLES`` of the best guesses are bundled; fewer when two end at the same cost."""
+"""At most ``BUNDLES`` of the best guesses are bundled; fewer if two converge to the same cost."""
 MISJUDGED = 1.1
-"""Factor on the stated sigmas above which a note says so."""
+"""Factor on the stated sigmas above which a note reports it."""
 ROUGHLY = 1e-6
-"""Relative decrease of the cost at which bundles before the last one end."""
+"""Relative decrease of the cost at which all bundles but the last one stop."""
 AS_GOOD = 1.1
-"""Variance up to which a bundle of simpler lenses is as good as one whose lenses stay open."""
+"""Ratio of variances up to which a simpler lens model replaces an undetermined one."""
 ROUNDS = 5
-"""Times that the errors of the displacements, and with them the lens model, are estimated again."""
+"""Most rounds of estimating the errors of the displacements, and with them the lens model."""
 
 
 class _ErrorsSeen(NamedTuple):
-    """A bundle, all its measurements, which of them are ``inliers`` (k,), and the errors of the displacements that
-    whiten it, None where there are none to see.
+    """A bundle, all its measurements, mask of their ``inliers`` (k,), and the errors of the displacements that
+    whiten it, None if none are significant.
     """
 
     solution: Solution
@@ -164,10 +164,9 @@ def fit_with_known_arm(
 ) -> CalibrationFit:
     """Metric model of trials with known generators, in the frame of the first camera, and its report.
 
-    Pixels count with the noise that they show beside the errors of the displacements, where it is above the stated one:
-    the report's ``sigma_factor``. ``priors``: of the lenses, by camera. Raises CalibrationError (``bad_data``,
-    ``too_few_stops``, ``too_few_markers``,
-    ``joint_did_not_move``, ``no_convergence``, ``not_identifiable``).
+    Pixels are weighted by the noise that they show beside the errors of the displacements, if it is above the stated
+    one: the report's ``sigma_factor``. ``priors``: of the lenses, by camera. Raises CalibrationError (``bad_data``,
+    ``too_few_stops``, ``too_few_markers``, ``joint_did_not_move``, ``no_convergence``, ``not_identifiable``).
     """
     if any(camera.mount != "eye_to_hand" for camera in trials.cameras):
         raise CalibrationError(
@@ -207,12 +206,12 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
     _check_views(trials)
     every = measurements(trials, trials.visible, trials.positions)
     at = readings(trials.positions)
-    # No two poses are one place of a gear.
+    # No two poses share a repeatable error, unlike equal readings of a joint's gear.
     at = Readings(np.broadcast_to(np.arange(len(trials.positions))[:, None], trials.positions.shape), at.features)
     rig = _start(trials, every)
     lenses: LensModel = "none" if options.lens == "auto" else options.lens
     if priors:
-        # Without: known displacements tell lenses from cameras, and no centre has to be assumed.
+        # Otherwise none: known displacements separate lenses from cameras, and no centre has to be assumed.
         every = replace(every, lens_priors=prior_of_lenses(trials, priors))
         bent, lenses = starting_lenses(trials, options.lens, priors)
         rig = replace(rig, lenses=np.pad(bent, ((0, 0), (0, 7 - bent.shape[1]))))
@@ -230,8 +229,8 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
 
 
 def _with_errors_stated(found: _ErrorsSeen, at: Readings) -> Solution:
-    """The solution with the covariance that its parameters have where the displacements have the errors that are
-    stated: larger than the estimated ones by what few displacements leave open of them.
+    """The solution with the covariance of its parameters under the stated errors of the displacements, which exceed
+    the estimated ones because few displacements determine these poorly.
     """
     solution, components = found.solution, found.components
     assert components is not None
@@ -242,8 +241,8 @@ def _with_errors_stated(found: _ErrorsSeen, at: Readings) -> Solution:
 
 
 def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _ErrorsSeen:
-    """The bundle whitened by the errors of the displacements that it shows, with the lenses that it then asks for,
-    until both stay the same.
+    """The bundle whitened by the estimated errors of the displacements, with the lenses that it then requires,
+    repeated until both stay the same.
     """
     solution, every, inliers, components = found
     stated, total = every.sigmas, 1.0
@@ -272,8 +271,8 @@ def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _Erro
 def _simpler_lenses(
     open_one: Solution, every: Measurements, inliers: BoolArray, options: FitOptions
 ) -> tuple[Solution, BoolArray]:
-    """A bundle of fewer lens terms where those of ``open_one`` stay open and explain next to nothing: the first that
-    converges; ``open_one`` with its ``inliers`` (k,) where there is none.
+    """The first converging bundle with fewer lens terms, if those of ``open_one`` are undetermined and explain next to
+    nothing; else ``open_one`` with its ``inliers`` (k,).
     """
     most = AS_GOOD * open_one.determined.variance
     simpler: tuple[LensModel, ...] = ("radial_centre", "radial", "none")
@@ -310,7 +309,7 @@ def frame_of_known_arm(model: CellModel, generators: FloatArray) -> FloatArray:
     """Rigid ``H`` (4, 4) [m] from the frame of the known ``generators`` (n, 4, 4) to the Euclidean frame of a metric
     ``model`` that was fitted with them, the first camera's.
 
-    Raises CalibrationError (``bad_data``) where the model is not metric, or the generators do not fix the frame.
+    Raises CalibrationError (``bad_data``) if the model is not metric or the generators do not determine the frame.
     """
     upgrade = model.projective_to_euclidean
     if upgrade is None:
@@ -357,8 +356,8 @@ class _Normalised(NamedTuple):
 
 
 def _start(trials: TrialData, every: Measurements) -> RigModel:
-    """Rig in the generators' frame: of several guesses of the markers' place, linear cameras and points in turn, the
-    best few bundled. Raises CalibrationError (``joint_did_not_move``, ``no_convergence``).
+    """Rig in the generators' frame: for several guesses of the markers' position, linear cameras and points in turn,
+    then bundles of the best few. Raises CalibrationError (``joint_did_not_move``, ``no_convergence``).
     """
     assert trials.generators is not None
     n, m, c = len(trials.joint_names), len(trials.marker_ids), len(trials.cameras)
@@ -419,8 +418,8 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
 
 
 def _middle(generators: FloatArray) -> FloatArray:
-    """The point (3,) nearest to all axes of rotation, of a free arm the body's origin at its zero: about it guesses are
-    made.
+    """The point (3,) nearest to all axes of rotation, for a free arm the body's origin at its zero: the centre of the
+    guesses.
     """
     turns = generators[np.abs(generators[:, :3, :3]).any(axis=(1, 2))]
     if not len(turns):
@@ -438,7 +437,7 @@ def _guesses() -> FloatArray:
 
 
 def _linear(data: _Normalised, guess: FloatArray, m: int) -> tuple[float, FloatArray, FloatArray] | None:
-    """Median error [px], cameras (c, 3, 4) and points (m, 3) from all markers at one ``guess`` (3,); None where it is
+    """Median error [px], cameras (c, 3, 4) and points (m, 3) from all markers at one ``guess`` (3,); None if it is
     degenerate.
     """
     points = np.tile(guess, (m, 1))

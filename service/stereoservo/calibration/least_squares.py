@@ -1,9 +1,9 @@
-"""The least-squares core of every fit: what declares one, its Levenberg-Marquardt, normal equations by blocks, and what
-a fit has determined.
+"""Least-squares solver shared by all fits: the interface of a fit, Levenberg-Marquardt, normal equations by blocks, and
+the statistics of the determined parameters.
 
-A fit says what its cost is in a state, how the normal equations look there, and where a step leads (its charts). Of few
-parameters a `DenseFit` says it by residuals and their derivatives; the bundle says it by blocks, in which each point is
-eliminated on its own (Schur complement). Priors are rows that no robust loss weighs down.
+A fit provides its cost in a state, the normal equations there, and the state after a step (its charts). A fit of few
+parameters (`DenseFit`) gives residuals and their derivatives; the bundle gives blocks, in which each point is
+eliminated separately (Schur complement). Priors are rows that no robust loss weights down.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.numerics.arrays import FloatArray
 
 GRADIENT = 1e-6
-"""Largest entry of the gradient on unit columns at which a fit has converged: it moves no parameter by a notable part
-of its deviation."""
+"""Largest entry of the gradient on unit columns at which a fit has converged: no parameter moves by a notable part
+of its standard deviation."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-14, 1e10
-"""Levenberg-Marquardt: added to the diagonal of ones."""
+"""Levenberg-Marquardt damping, added to the unit diagonal."""
 FREE_DAMPING = 1e-2
 """Damping up to which a step's predicted decrease estimates the distance to the minimum."""
 CHI2_TAIL = 0.0005
 """Probability of each tail outside the two-sided 99.9 % interval."""
 OVERSTATED = 1.1
-"""Sigmas that are stated so many times too large are no misfit: deviations are too large by as much, at most."""
+"""Factor by which stated sigmas may be too large without counting as a misfit: deviations are too large by as much."""
 RANK_TOLERANCE = 1e-9
-"""Singular value of the unit columns, relative to the largest, below which a direction is not known."""
+"""Singular value of the unit columns, relative to the largest, below which a direction is undetermined."""
 
 LEAST_KNOWN = 1e-7
-"""Length, over that of its column, of what is taken for known of a direction that the data leave open."""
+"""Length, relative to its column, at which an undetermined direction is bounded."""
 
 S = TypeVar("S")
 
 
 class RobustLoss(NamedTuple):
-    """Loss by iteratively re-weighted least squares, in which residuals beyond ``scale`` [sigmas] count less."""
+    """Loss by iteratively re-weighted least squares: residuals beyond ``scale`` [sigmas] are weighted down."""
 
     kind: Literal["soft_l1", "cauchy"]
     scale: float = 1.0
@@ -68,14 +68,14 @@ class Equations(Protocol):
         """``Jᵀ W r`` (p,) on unit columns."""
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
-        """Damped step (p,), not on unit columns, and the decrease of the cost that it predicts. Raises LinAlgError."""
+        """Damped step (p,), not on unit columns, and its predicted decrease of the cost. Raises LinAlgError."""
 
 
 @dataclass(frozen=True)
 class NormalEquations:
     """``Jᵀ W J`` and ``Jᵀ W r`` by blocks: ``core`` (p_core + 1, p_core + 1) with the residuals as its last row and
-    column, ``cross`` (m, q, p_core + 1), ``square`` (m, q, q) of points that no row shares. Columns are of unit length;
-    ``sizes`` (p,) are their lengths before. ``cost``: present one, above ``core[-1, -1]`` by what was eliminated.
+    column, ``cross`` (m, q, p_core + 1), ``square`` (m, q, q) of points that no rows share. Columns have unit length;
+    ``sizes`` (p,) are their original lengths. ``cost``: current one; exceeds ``core[-1, -1]`` by the eliminated part.
     """
 
     core: FloatArray
@@ -90,9 +90,9 @@ class NormalEquations:
         return np.concatenate([self.core[:-1, -1], self.cross[:, :, -1].ravel()])
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
-        """Damped step ``-(Jᵀ W J + λ I)⁻¹ Jᵀ W r`` (p,), not on unit columns, and the decrease it predicts.
+        """Damped step ``-(Jᵀ W J + λ I)⁻¹ Jᵀ W r`` (p,), not on unit columns, and its predicted decrease of the cost.
 
-        Raises LinAlgError where rounding leaves the matrix indefinite.
+        Raises LinAlgError if rounding leaves the matrix indefinite.
         """
         m, q, width = self.cross.shape
         width -= 1
@@ -114,8 +114,8 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class DenseEquations:
-    """Few parameters: an orthogonal factor ``triangle`` (.., p + 1) of the rows and their residuals, whose condition
-    no product squares; columns of unit length, ``sizes`` (p,) before.
+    """Equations of few parameters: orthogonal factor ``triangle`` (.., p + 1) of the rows and their residuals, which
+    avoids squaring the condition; columns of unit length, ``sizes`` (p,) their original lengths.
     """
 
     triangle: FloatArray
@@ -123,7 +123,7 @@ class DenseEquations:
 
     @classmethod
     def of(cls, rows: FloatArray) -> DenseEquations:
-        """The equations of weighted ``rows`` (k, p + 1), residuals last."""
+        """Equations of weighted ``rows`` (k, p + 1), residuals last."""
         sizes = column_sizes(rows[:, :-1])
         return cls(np.asarray(np.linalg.qr(rows / np.append(sizes, 1.0), mode="r")), sizes)
 
@@ -133,7 +133,7 @@ class DenseEquations:
         return np.asarray(self.triangle[:, :-1].T @ self.triangle[:, -1])
 
     def step(self, damping: float) -> tuple[FloatArray, float]:
-        """Damped step (p,), not on unit columns, and the decrease of the cost that it predicts. Raises LinAlgError."""
+        """Damped step (p,), not on unit columns, and its predicted decrease of the cost. Raises LinAlgError."""
         p = len(self.sizes)
         padded = np.vstack([self.triangle[:, :-1], np.sqrt(damping) * np.eye(p)])
         basis, triangle = np.linalg.qr(padded)
@@ -148,10 +148,10 @@ def column_sizes(rows: FloatArray) -> FloatArray:
 
 
 def column_root(triangle: FloatArray, *, bounded: bool = False) -> FloatArray:
-    """``R⁻¹`` of a root (p, p) of an information matrix, by way of unit columns: ``R⁻¹ R⁻ᵀ`` is the covariance.
+    """``R⁻¹`` of a root (p, p) of an information matrix, computed on unit columns: ``R⁻¹ R⁻ᵀ`` is the covariance.
 
-    ``bounded``: directions that the data leave open get a large finite variance, and the root may have any number of
-    rows. Else raises LinAlgError for them.
+    ``bounded``: undetermined directions get a large finite variance, and the root may have any number of
+    rows. Otherwise raises LinAlgError for them.
     """
     sizes = column_sizes(triangle)
     unit = triangle / sizes
@@ -164,10 +164,10 @@ def column_root(triangle: FloatArray, *, bounded: bool = False) -> FloatArray:
 
 
 class Fit(Protocol[S]):
-    """What declares a fit; a state is the parameters in whatever form the fit has them."""
+    """Interface of a fit; a state is the parameters in any representation of the fit."""
 
     def cost(self, state: S) -> float:
-        """Sum of squares or of a robust loss, priors included; not finite where the state is impossible."""
+        """Sum of squares or of a robust loss, priors included; not finite if the state is impossible."""
 
     def equations(self, state: S) -> Equations:
         """The normal equations at a state."""
@@ -177,8 +177,8 @@ class Fit(Protocol[S]):
 
 
 class Limits(NamedTuple):
-    """When a fit ends: after ``evaluations`` of the cost; converged where a step is predicted to lower the cost by no
-    more than a share ``tolerance`` of it, or by ``settled`` [sigmas²].
+    """Termination of a fit: after ``evaluations`` of the cost; converged if the predicted decrease of the cost by a
+    step is at most a share ``tolerance`` of the cost, or at most ``settled`` [sigmas²].
     """
 
     evaluations: int = 100
@@ -191,7 +191,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Minimum(Generic[S]):
-    """Where a fit has ended."""
+    """Result of a fit: final state, its cost and whether it has converged."""
 
     state: S
     cost: float
@@ -200,9 +200,9 @@ class Minimum(Generic[S]):
 
 
 def minimise(fit: Fit[S], state: S, limits: Limits = LIMITS) -> Minimum[S]:
-    """Least cost from ``state`` on by Levenberg-Marquardt, linearised anew at every step.
+    """Minimum of the cost from ``state`` by Levenberg-Marquardt, linearised again at every step.
 
-    Never raises on a bad fit: look at ``converged``, and at the cost, which is infinite where the start is impossible.
+    Never raises on a bad fit: check ``converged``, and the cost, which is infinite if the start is impossible.
     """
     cost = fit.cost(state)
     if not np.isfinite(cost):
@@ -237,9 +237,9 @@ def minimise(fit: Fit[S], state: S, limits: Limits = LIMITS) -> Minimum[S]:
 
 @dataclass(frozen=True)
 class DenseFit(Generic[S]):
-    """A fit of few parameters: ``residuals`` (k, d) [sigmas] at a state, of which each d weigh together, their
+    """A fit of few parameters: ``residuals`` (k, d) [sigmas] at a state, in groups of d that share a weight, their
     ``slopes`` (k, d, p) by the parameters of the charts, and the state after a ``step`` (p,) of these. ``prior``: rows
-    (r, p + 1) of what is known beforehand, residuals last.
+    (r, p + 1) of prior information, residuals last.
     """
 
     residuals: Callable[[S], FloatArray]
@@ -272,7 +272,7 @@ class DenseFit(Generic[S]):
         return self.step(state, x)
 
     def determined(self, state: S) -> Determined:
-        """What the fit has determined at a state."""
+        """Statistics of the parameters determined at a state."""
         rows = self.rows(state)
         return Determined(
             self.cost(state), len(rows), rows.shape[1] - 1, lambda: np.asarray(np.linalg.qr(rows[:, :-1], mode="r"))
@@ -292,7 +292,7 @@ def numeric_slopes(
     return slopes
 
 
-# -- what it has determined -------------------------------------------------------------------------------------
+# -- statistics of the determined parameters --------------------------------------------------------------------
 
 
 def chi2_within(chi2: float, freedom: int) -> bool:
@@ -306,7 +306,7 @@ def chi2_within(chi2: float, freedom: int) -> bool:
 
 @dataclass(frozen=True)
 class Determined:
-    """What a fit of ``rows`` equations has determined of ``parameters``, net of gauge, at a ``cost``; ``factor`` makes
+    """Statistics of a fit with ``rows`` equations and ``parameters``, net of gauge, at a ``cost``; ``factor`` computes
     a root (.., p) of its information matrix.
     """
 
@@ -327,7 +327,7 @@ class Determined:
 
     @property
     def noise(self) -> float:
-        """Factor on variances: the variance factor where residuals significantly exceed the stated sigmas, else 1."""
+        """Factor on variances: the variance factor if residuals significantly exceed the stated sigmas, else 1."""
         factor = self.variance
         return factor if factor > 1.0 and not chi2_within(self.cost, self.freedom) else 1.0
 
@@ -359,18 +359,18 @@ class Determined:
 
 
 def with_rows(triangle: FloatArray, rows: FloatArray) -> FloatArray:
-    """Root (p, p) of the information with further ``rows`` (k, p), such as those of a motion that is not made yet."""
+    """Root (p, p) of the information with further ``rows`` (k, p), such as those of a planned motion."""
     return np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
 
 
 def deviation_of(triangle: FloatArray, slope: FloatArray) -> float:
-    """Standard deviation, at the stated sigmas, of what changes by ``slope`` (p,) with the parameters."""
+    """Standard deviation, at the stated sigmas, of a quantity with derivative ``slope`` (p,) by the parameters."""
     return float(np.linalg.norm(slope @ column_root(triangle, bounded=True)))
 
 
 class Estimate(NamedTuple):
-    """Parameters beside those of a fit, to first order about it: ``x`` (e,), their ``covariance`` (e, e) at the stated
-    sigmas, and the chi-square that they ``gain``.
+    """Additional parameters beside those of a fit, to first order about it: ``x`` (e,), their ``covariance`` (e, e) at
+    the stated sigmas, and the ``gain`` in chi-square.
     """
 
     x: FloatArray
@@ -379,8 +379,8 @@ class Estimate(NamedTuple):
 
 
 def estimate_beside(triangle: FloatArray) -> Estimate:
-    """Estimate of further parameters by the ``triangle`` (.., e + 1) of their columns and the residuals that a fit's
-    own parameters leave: a hypothesis about a fit is such columns.
+    """Estimate of additional parameters from the ``triangle`` (.., e + 1) of their columns and the residuals, with the
+    fit's own parameters projected out. A hypothesis about a fit is given by such columns.
     """
     moments, rest = triangle[:, :-1], triangle[:, -1]
     sizes = np.maximum(np.linalg.norm(moments, axis=0), 1e-150)

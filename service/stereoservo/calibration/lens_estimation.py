@@ -1,9 +1,9 @@
 """Lens models of the cameras in a calibration: start values from straight lines or epipolar geometry, undistortion,
-priors, significance of what a lens adds to a solved bundle, and plausibility of one that was found.
+priors, significance of a lens for a solved bundle, and plausibility of an estimated lens.
 
-The models are nested: none; a radial parameter with its centre for each camera; second radial and tangential terms
-beside them. Centre and terms are held by weak priors: a small distortion does not determine them, but fixing them would
-underestimate the uncertainty.
+The models are nested: none; a radial parameter with its centre for each camera; additionally second radial and
+tangential terms. Weak priors constrain centre and terms: a small distortion does not determine them, but fixing them
+would underestimate the uncertainty.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
 
 FREE_LENS: LensModel = "radial_centre"
-"""The lens model of cameras that distort."""
+"""Default lens model of cameras with distortion."""
 FULL_LENS: LensModel = "brown"
-"""The lens model of cameras whose distortion a radial parameter with its centre does not follow."""
+"""Lens model of cameras whose distortion is not described by a radial parameter with its centre."""
 LENS_TAIL = 1e-4
-"""Probability with which a lens is taken for one of a richer model than it is."""
+"""Probability with which a lens is assigned a richer model than its own."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ class LensTest:
 
 
 def lens_test(solution: Solution) -> LensTest:
-    """Chi-square of the parameters of all lenses, but centres and reference radii, against zero.
+    """Chi-square of the parameters of all lenses, except centres and reference radii, against zero.
 
-    With pinholes the score test of the radial ones: what freeing them would gain, to first order. With free lenses
-    Wald's: the estimates against their covariance, centres fixed, for without distortion a centre explains nothing.
-    Both relative to the noise left, where that is above the stated one.
+    With pinholes the score test of the radial ones: the gain from freeing them, to first order. With free lenses the
+    Wald test: the estimates against their covariance, with centres fixed, because without distortion a centre has no
+    effect. Both relative to the residual noise, if that is above the stated one.
     """
     c, at = len(solution.rig.lenses), solution.charts.start(2)
     if solution.lenses == "none":
@@ -94,10 +94,10 @@ def terms_test(solution: Solution) -> LensTest:
 
 
 def lens_wanted(solution: Solution) -> LensModel:
-    """The lens model that the bundle's residuals ask for: its own, or a richer one.
+    """The lens model that the bundle's residuals require: its own, or a richer one.
 
-    Terms that a lens lacks are held against scale factors of the joints, which they imitate: of two hypotheses that of
-    the larger likelihood.
+    Terms that a lens lacks are compared with scale factors of the joints, which they imitate: the hypothesis of
+    larger likelihood is selected.
     """
     if solution.lenses == "none" and lens_test(solution).distorted:
         return FREE_LENS
@@ -108,15 +108,15 @@ def lens_wanted(solution: Solution) -> LensModel:
 
 
 def lenses_explain_more(solution: Solution) -> bool:
-    """Whether terms of distortion that the model lacks (second radial, tangential) explain more of its residuals than
-    scale factors of its joints do: of two hypotheses that of the larger likelihood, by Bayes's information criterion.
+    """Whether distortion terms that the model lacks (second radial, tangential) explain more of its residuals than
+    scale factors of its joints do, by likelihood with Bayes's information criterion.
     """
     lenses, scales = _evidence(solution)
     return bool(lenses > max(scales, 0.0))
 
 
 def _evidence(solution: Solution) -> tuple[float, float]:
-    """Bayes's information criterion of terms of distortion, and of scale factors of revolute joints: gain in
+    """Bayes's information criterion of distortion terms, and of scale factors of revolute joints: gain in
     chi-square less the penalty.
     """
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "revolute"]
@@ -128,7 +128,7 @@ def _evidence(solution: Solution) -> tuple[float, float]:
 
 
 def _gain(solution: Solution, columns: FloatArray) -> tuple[float, int]:
-    """Chi-square that ``columns`` (2 k, e) would gain beside the free parameters, to first order, and their number."""
+    """Chi-square gain of ``columns`` (2 k, e) beside the free parameters, to first order, and their number."""
     core = orthogonal_factor(solution.rig, solution.charts, solution.data, columns).core
     return float((core[solution.charts.start(3) : -1, -1] ** 2).sum()), columns.shape[1]
 
@@ -159,9 +159,9 @@ def _distortion_columns(solution: Solution) -> FloatArray:
 
 
 STARTING_BENDS = (-0.1, -0.04, -0.2, 0.04)
-"""Radial parameters at half the image width of all cameras, from which fits start where the search has failed."""
+"""Radial parameters at half the image width of all cameras, from which fits start if the search has failed."""
 MOST_ASPECT = 1.5
-"""Ratio of a pixel's sides beyond which no camera is."""
+"""Largest plausible ratio of a pixel's sides."""
 
 
 def starting_lenses(
@@ -170,11 +170,11 @@ def starting_lenses(
     priors: Mapping[str, LensEstimate],
     bend: float | None = None,
 ) -> tuple[FloatArray, LensModel]:
-    """Lenses (c, 4) to start from, and which of their parameters are free in the first bundle.
+    """Initial lenses (c, 4), and which of their parameters are free in the first bundle.
 
-    Where ``asked`` leaves it to the data, lenses are free at once if priors are given or the epipolar geometry
-    needs them; with ``bend`` they are free and all start from that radial parameter.
-    Raises CalibrationError (``bad_data``) for priors of cameras that are not there.
+    If ``asked`` leaves it to the data, lenses are free immediately if priors are given or the epipolar geometry
+    requires them; with ``bend`` they are free and all start from that radial parameter.
+    Raises CalibrationError (``bad_data``) for priors of cameras that do not exist.
     """
     names = [camera.name for camera in trials.cameras]
     unknown = sorted(set(priors) - set(names))
@@ -202,7 +202,7 @@ def starting_lenses(
 
 
 def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> LensPriors:
-    """Priors of the lenses: the given estimates of (k, cu, cv), elsewhere the centre near the image's middle; terms
+    """Priors of the lenses: the given estimates of (k, cu, cv), otherwise the centre near the image's middle; terms
     near zero.
 
     ``CENTRE_SHARE`` of the width is the centre's standard deviation, ``TERM_SPREADS`` those of the terms.
@@ -221,8 +221,8 @@ def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> Le
 
 
 def implausible_lens(result: CalibrationFit) -> CalibrationError | None:
-    """Error (``lens_implausible``) of a fit whose lens has its centre outside the image, or whose camera has pixels
-    far from square; None where all is plausible.
+    """Error (``lens_implausible``) for a fit whose lens has its centre outside the image, or whose camera has pixels
+    far from square; None if all lenses are plausible.
     """
     for camera, fitted in zip(result.model.cameras, result.report.cameras, strict=True):
         if fitted.lens is not None:
@@ -258,31 +258,31 @@ def straightened(rig: RigModel, data: Measurements) -> RigModel:
 
 
 GRID = (-0.30, -0.24, -0.19, -0.15, -0.12, -0.09, -0.06, -0.03, 0.0, 0.03, 0.06, 0.10, 0.15)
-"""Radial parameters at half the image width that the search begins with."""
+"""Initial grid of the search: radial parameters at half the image width."""
 PINHOLE_AGREEMENT = 0.95
-"""Share of matches within 3.29 sigmas of one epipolar geometry at which no lens is searched for."""
+"""Share of matches within 3.29 sigmas of one epipolar geometry from which no lens is searched for."""
 NOISE_AGREEMENT = 0.99
-"""The share that Gaussian noise leaves to pinholes, 0.999, less what some matches' scatter takes."""
+"""Share expected of pinholes: 0.999 for Gaussian noise, reduced for outlying matches."""
 COARSE_PX = 1.5
-"""Epipolar distance [px] that a grid point may leave to a match, beside its noise."""
+"""Epipolar distance [px], beside its noise, that a match may have at a grid point."""
 MOST_BEND = 0.6
-"""Largest magnitude of the radial parameter of a lens to start from."""
+"""Largest magnitude of an initial radial parameter."""
 WORTH_SHARE = 0.03
-"""By how much a lens must raise the share of matches that fit: misfit that it does not cure is not the lens's."""
+"""Least increase of the share of fitting matches by a lens: other misfit is not due to the lens."""
 CENTRE_SHARE = 0.1
-"""Standard deviation of a lens's centre about the middle of the image, beforehand [image widths]."""
+"""Prior standard deviation of a lens's centre about the middle of the image [image widths]."""
 TERM_SPREADS = (0.2, 0.01, 0.01)
-"""Standard deviations of k2, p1, p2 about zero, beforehand: several times those of lenses that people buy."""
+"""Prior standard deviations of k2, p1, p2 about zero: several times those of commercial lenses."""
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""
 CENTRE_BOUND = 2.0
-"""Largest offset of a centre in the search, in those standard deviations."""
+"""Largest offset of a centre in the search, in units of its prior standard deviation."""
 START_GAIN = 100.0
-"""Epipolar chi-square that a lens must gain to be started from. The bundle sees more and decides on smaller ones."""
+"""Least gain in epipolar chi-square for an initial lens. The bundle sees more data and decides on weaker distortion."""
 SEARCH = Limits(evaluations=60, tolerance=1e-8)
-"""Of a search for a lens."""
+"""Termination of the search for a lens."""
 MOST_MATCHES = 20_000
-"""Matches of two cameras at most, evenly spread, that the search for a lens looks at."""
+"""Most matches of two cameras, evenly spread, that the search for a lens uses."""
 
 
 def straight_lenses(trials: TrialData) -> FloatArray:
@@ -291,9 +291,9 @@ def straight_lenses(trials: TrialData) -> FloatArray:
 
 
 def undistorted(trials: TrialData, lenses: FloatArray) -> TrialData:
-    """The trials with lens distortion removed; sigmas scale with the area that a pixel covers.
+    """The trials with lens distortion removed; sigmas scale with the area of a pixel.
 
-    Pixels that no ideal pixel is imaged to are NaN.
+    Pixels without an ideal pixel are NaN.
     """
     if not lenses[:, 0].any():
         return trials
@@ -312,17 +312,17 @@ def _stretches(lenses: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def epipolar_lenses(trials: TrialData) -> FloatArray:
-    """Lenses (c, 4) from the epipolar geometry of the first camera with each other one; without distortion where
+    """Lenses (c, 4) from the epipolar geometry of the first camera with each other one; without distortion if
     none is needed.
 
-    A lens is believed where it lowers the robust epipolar cost by far more than chance does (``START_GAIN``).
+    A lens is accepted if it lowers the robust epipolar cost by far more than chance does (``START_GAIN``).
     """
     lenses = straight_lenses(trials)
     for k in range(1, len(trials.cameras)):
         match = _matches(trials, k)
         if match is None or _agreement(*match, lenses[[0, k]]) >= PINHOLE_AGREEMENT:
             continue
-        # The first camera's lens is settled by the first pair that asks for one.
+        # The first camera's lens is determined by the first pair that requires one.
         free = (0, 1) if not lenses[0, 0] else (1,)
         found = _pair_lenses(*match, lenses[[0, k]], free)
         if found is not None:
@@ -331,7 +331,7 @@ def epipolar_lenses(trials: TrialData) -> FloatArray:
 
 
 def lenses_may_bend(trials: TrialData) -> bool:
-    """Whether the matches of some pair of cameras leave more to a lens than pinholes do by noise."""
+    """Whether, for some pair of cameras, fewer matches fit than pinholes with noise explain."""
     straight = straight_lenses(trials)
     for k in range(1, len(trials.cameras)):
         match = _matches(trials, k)
@@ -341,7 +341,7 @@ def lenses_may_bend(trials: TrialData) -> bool:
 
 
 def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
-    """Raw matches (2, n, 2) of cameras 0 and k over all stops, and their sigmas (2, n); None where too few."""
+    """Raw matches (2, n, 2) of cameras 0 and k over all stops, and their sigmas (2, n); None if too few."""
     pixels = trials.pixels[[0, k]].reshape(2, -1, 2)
     seen = np.asarray(finite_rows(pixels).all(axis=0))
     if int(seen.sum()) < MIN_MATCHES:
@@ -352,8 +352,8 @@ def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray] | None:
 
 
 def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float:
-    """Share of matches that one epipolar geometry fits after undistortion by ``lenses``; 1 for coplanar points,
-    which determine nothing.
+    """Share of matches that fit one epipolar geometry after undistortion by ``lenses``; 1 for coplanar points,
+    which determine none.
     """
     ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
     known = np.asarray(finite_rows(ideal).all(axis=0))
@@ -368,7 +368,7 @@ def _agreement(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> float
 
 
 def _pair_lenses(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray, free: tuple[int, ...]) -> FloatArray | None:
-    """Lenses (2, 4) of a pair, those of ``free`` fitted; None where distortion does not explain the misfit."""
+    """Lenses (2, 4) of a pair, those of ``free`` fitted; None if distortion does not explain the misfit."""
     best, least, F = 0.0, np.inf, None
     for bend in GRID:
         tried = lenses.copy()
@@ -384,21 +384,21 @@ def _pair_lenses(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray, free: 
     straight = _coarse_fundamental(raw, sigmas, lenses)
     if straight is None:
         return bent
-    # Detectors misjudge their noise: what is left beside the lens counts as noise.
+    # Detectors misjudge their noise: residuals that the lens does not explain count as noise.
     noise = sigmas * max(1.0, typical)
     _, cost, _ = _refined(raw, noise, bent, F, (), bound=max(least, 1.0))
     _, without, _ = _refined(raw, noise, lenses, straight[0], (), bound=max(least, 1.0))
     if not without - cost > START_GAIN or np.abs(bent[:, 0]).max() > MOST_BEND:
         return None
-    # Wrong matches stay wrong behind any lens.
+    # Wrong matches do not fit with any lens.
     return bent if _agreement(raw, noise, bent) > _agreement(raw, noise, lenses) + WORTH_SHARE else None
 
 
 def _coarse_fundamental(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray) -> tuple[FloatArray, float] | None:
-    """F of undistorted matches and the median of their epipolar distances [sigmas]; None where none is found."""
+    """F of undistorted matches and the median of their epipolar distances [sigmas]; None if none is found."""
     ideal = np.array([undistort(lens, pixels) for lens, pixels in zip(lenses, raw, strict=True)])
     known = np.asarray(finite_rows(ideal).all(axis=0))
-    # A parameter at which half of the matches have no ideal pixel is out of the question.
+    # A parameter at which half of the matches have no ideal pixel is excluded.
     if known.mean() < 0.5 or int(known.sum()) < MIN_MATCHES:
         return None
     parameters = cv2.UsacParams()
@@ -410,7 +410,7 @@ def _coarse_fundamental(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray)
     try:
         F, _ = cv2.findFundamentalMat(ideal[0, known], ideal[1, known], parameters)
     except cv2.error:
-        return None  # its search asserts on some hopeless inputs: no F at this grid point
+        return None  # the search asserts on some degenerate inputs: no F at this grid point
     if F is None or np.shape(F) != (3, 3) or not np.isfinite(F).all():
         return None
     distances = np.full(len(known), np.inf)
@@ -427,10 +427,10 @@ def _refined(
     free: tuple[int, ...],
     bound: float,
 ) -> tuple[FloatArray, float, float]:
-    """Lenses of least robust epipolar cost with F free, centres held by a weak prior, that cost [sigmas²], and the
-    noise [sigmas] by the median distance.
+    """Lenses of least robust epipolar cost with F free, centres constrained by a weak prior, that cost [sigmas²], and
+    the noise [sigmas] by the median distance.
 
-    Two passes: Cauchy's loss at ``bound`` sigmas, to get near from where the grid ends, then at three.
+    Two passes with Cauchy's loss: at ``bound`` sigmas, to converge from the grid point, then at three.
     """
     normalisers = [isotropic_normaliser(pixels) for pixels in raw]
     start = np.linalg.inv(normalisers[1]).T @ F @ np.linalg.inv(normalisers[0])
@@ -452,10 +452,10 @@ def _refined(
         fundamental = normalisers[1].T @ (start + np.tensordot(z[:8], tangent, 1)) @ normalisers[0]
         scale = np.sqrt(((sigmas * _stretches(here, ideal)) ** 2).mean(axis=0))
         distances = sampson_distances(fundamental, *ideal) / scale
-        # Matches without ideal pixels count as far off, not as perfect.
+        # Matches without ideal pixels get a large error, not zero.
         return np.where(np.isfinite(distances), distances, 1e3)[:, None]
 
-    # A robust loss forgives a centre far off, so that the prior alone would not hold it.
+    # A robust loss tolerates a distant centre, so that the prior alone would not constrain it.
     limit = np.array([np.inf] * 8 + [np.inf, CENTRE_BOUND, CENTRE_BOUND] * len(free))
     centres = np.isfinite(limit)
 

@@ -1,10 +1,9 @@
 """Camera matrices from known points by robust damped least squares, over rigid motions or free matrices.
 
-A class of changes is a displacement of one camera, or of several together, that keeps the intrinsics; a change of
-frame, where the stratum has no displacements (2.19); or one whole matrix. Pixels are raw ones.
+A change is one of three classes: a displacement of one camera, or of several together, with fixed intrinsics; a change
+of frame, if the stratum has no displacements (2.19); or one free matrix. Pixels are raw ones.
 
-
-What errors of the model, of its static points and of the pixels do to new matrices is propagated to first order.
+Errors of the model, of its static points and of the pixels are propagated to the new matrices to first order.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 WHOLE, SUBSET = Limits(100, 0.0, 1e-8), Limits(20, 0.0, 1e-8)
-"""Of fits to all pixels and to some: a step of 1e-4 standard deviations is the last."""
+"""Termination of fits to all pixels and to subsets: at a step of 1e-4 standard deviations."""
 SUBSETS, OF_SUBSET = 30, 4
-"""Random starts, and ids of each, that are tried where a fit to everything leaves outliers: of 30 % wrong ids one in a
+"""Number of random starts, and of ids in each, if a fit to all pixels leaves outliers: with 30 % wrong ids one in a
 thousand searches finds no clean start."""
 NOISY, FEW = 4.0, 0.25
-"""Variance of the pixels over the stated one, and share of outliers, at which a search for better starts ends."""
+"""Variance of the pixels over the stated one, and share of outliers, at which the search for better starts ends."""
 OUTSTANDING = 25.0
-"""Squared distance, in the noise of the median, above which a pixel is an outlier: two degrees of freedom."""
+"""Squared distance, in units of the median noise, above which a pixel is an outlier: two degrees of freedom."""
 LOSS = RobustLoss("cauchy", 3.0)
 
 
@@ -63,8 +62,8 @@ class Correspondences:
 
 
 class Moved(NamedTuple):
-    """``matrices`` (c, 3, 4) of cameras under estimation, and the ``motion`` D (4, 4) with ``P D`` from those before;
-    None where the matrices are free.
+    """``matrices`` (c, 3, 4) of cameras under estimation, and the ``motion`` D (4, 4) with ``P D`` of the previous
+    matrices P; None if the matrices are free.
     """
 
     matrices: FloatArray
@@ -107,7 +106,7 @@ class RigidMotion:
 
 @dataclass(frozen=True)
 class FreeMatrix:
-    """One camera's matrix but for its scale: 11 parameters."""
+    """One camera's matrix up to scale: 11 parameters."""
 
     size: int = 11
 
@@ -121,7 +120,7 @@ class FreeMatrix:
 
 
 def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
-    """Raw pixels (k, 2) of the points; NaN behind a camera and outside of its lens's image."""
+    """Raw pixels (k, 2) of the points; NaN behind a camera and outside its lens's image."""
     images = np.einsum("kij,kj->ki", matrices[views.camera], views.points)
     ahead = images[:, 2] > 0.0
     ideal = images[:, :2] / np.where(ahead, images[:, 2], np.nan)[:, None]
@@ -173,7 +172,7 @@ def matrix_fit(
     whiten: Callable[[FloatArray], FloatArray],
     loss: RobustLoss | None = None,
 ) -> DenseFit[Moved]:
-    """The fit of matrices; ``whiten`` takes rows (k, 2, q) [px] to sigmas."""
+    """The fit of matrices; ``whiten`` converts rows (k, 2, q) from px to sigmas."""
     return DenseFit(
         lambda moved: whiten((predicted(moved.matrices, lenses, views) - views.pixels)[..., None])[..., 0],
         lambda moved: whiten(parameter_jacobian(family, moved.matrices, lenses, views)),
@@ -186,7 +185,7 @@ def fit_with_outliers(
     family: MatrixChange, starts: list[Moved], lenses: FloatArray, views: Correspondences
 ) -> Minimum[Moved]:
     """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids; its
-    cost is infinite where points lie behind a camera at every start.
+    cost is infinite if every start has points behind a camera.
     """
     fit = matrix_fit(family, lenses, views, by_pixel(views), LOSS)
     best = min((minimise(fit, start, WHOLE) for start in starts), key=lambda one: one.cost)
@@ -210,7 +209,7 @@ def _clean(error: FloatArray) -> bool:
 
 
 def _is_good_enough(error: FloatArray) -> bool:
-    """Whether most whitened errors (k, 2) are about as large as the stated noise, so that no other start can do
+    """Whether most whitened errors (k, 2) are about as large as the stated noise, so that no other start can be
     better.
     """
     squares = (error**2).sum(axis=1)
@@ -232,15 +231,15 @@ def _subsets(views: Correspondences, family: MatrixChange) -> Iterator[BoolArray
 
 
 NEGLIGIBLE = 1e-14
-"""Variance of a direction of a matrix, relative to the largest, below which it has none."""
+"""Variance of a matrix along a direction, relative to the largest, below which it counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraErrors:
     """Errors of the entries of new matrices, 12 for each of ``cameras``, row by row.
 
-    ``model_jacobian`` (12 c, p): derivative by the parameters of the model's covariance; ``covariance`` (12 c, 12 c) of
-    what the new pixels and the static points add.
+    ``model_jacobian`` (12 c, p): derivative by the parameters of the model's covariance; ``covariance`` (12 c, 12 c)
+    due to the new pixels and the static points.
     """
 
     cameras: tuple[int, ...]
@@ -264,7 +263,7 @@ def first_parameters(stated: ModelCovariance) -> tuple[IntArray, IntArray, IntAr
 
 
 def inherited_errors(model: CellModel, group: tuple[int, ...], motion: FloatArray | None) -> FloatArray:
-    """Derivative of the matrices' entries (12 c, p) by the model's parameters for ``P D``; zero where the matrices
+    """Derivative of the matrices' entries (12 c, p) by the model's parameters for ``P D``; zero if the matrices
     are free.
 
     ``motion``: D (4, 4), None for free matrices.
@@ -286,8 +285,8 @@ def model_jacobian(
     views: Correspondences,
     offsets: FloatArray,
 ) -> FloatArray:
-    """Derivative (k, 2, p) of the raw pixels of ``views`` in ``moved`` cameras, which inherit from the model's, by the
-    parameters of its covariance. ``offsets`` (s, n): joints of the poses, less the zero. Static points move with the
+    """Derivative (k, 2, p) of the raw pixels of ``views`` in ``moved`` cameras, which depend on the model's, by the
+    parameters of its covariance. ``offsets`` (s, n): joints of the poses, minus the zero. Static points move with the
     cameras that triangulated them.
     """
     k, stated, order = len(views.camera), model.covariance, list(acting_order(model))
@@ -296,7 +295,7 @@ def model_jacobian(
     if stated is None:
         return found
     starts = first_parameters(stated)
-    # A static point is a marker of its own at a stop where no joint is away from its zero.
+    # A static point is treated as a marker at a stop where all joints are at their zero.
     apart = np.flatnonzero(views.pose < 0)
     index = {marker: i for i, marker in enumerate(model.marker_ids)}
     marker = np.array([index.get(int(i), -1) for i in views.ids], dtype=np.int64)
@@ -347,7 +346,7 @@ def _by_point(by_entries: FloatArray, matrix: FloatArray, point: FloatArray) -> 
 def scene_by_model(model: CellModel, i: int) -> FloatArray:
     """Derivative (4, p) of static point ``i`` by the model's parameters, through the cameras that triangulated it.
 
-    Taken with equal weights, by all cameras in whose image it lies.
+    Computed with equal weights, by all cameras in whose image it lies.
     """
     point = model.scene_points[i]
     every = Correspondences(
@@ -364,7 +363,7 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     views = replace(every.select(np.isin(every.camera, seen)), camera=np.arange(len(seen)))
     matrices = np.array([model.cameras[c].matrix for c in seen])
     lenses = np.array([model.cameras[c].lens for c in seen])
-    # An id of no static point: the point itself is held here.
+    # If no static point has this id, the point itself is fixed here.
     held = model_jacobian(
         model,
         tuple(seen),
@@ -396,7 +395,7 @@ def static_roots(model: CellModel, matrices: FloatArray, lenses: FloatArray, vie
 def with_moved_cameras(
     model: CellModel, errors: list[CameraErrors], matrices: dict[int, FloatArray]
 ) -> ModelCovariance | None:
-    """The model's covariance with cameras of new ``matrices``; None where the model carries none."""
+    """The model's covariance with cameras of new ``matrices``; None if the model has no covariance."""
     stated = model.covariance
     if stated is None:
         return None
@@ -438,9 +437,9 @@ def with_moved_cameras(
 
 
 def predicted_deviation(model: CellModel, errors: list[CameraErrors], joints: FloatArray, points: FloatArray) -> float:
-    """Largest standard deviation [px], an axis, of a marker in the relocalized cameras of ``model``, where they see it.
+    """Largest standard deviation [px], per axis, of a marker in the relocalized cameras of ``model`` that see it.
 
-    ``points`` (w, m, 4): the markers at ``joints`` (w, n). Where no camera sees any of them: infinite.
+    ``points`` (w, m, 4): the markers at ``joints`` (w, n). Infinite if no camera sees any of them.
     """
     worst, w, m = 0.0, len(joints), len(model.marker_ids)
     some = False

@@ -1,10 +1,10 @@
-"""Analytic Jacobian of the calibration's pixels, and from it the normal equations by blocks for the bundle adjustment's
-steps; an orthogonal factor and the leverages of measurements for its statistics.
+"""Analytic Jacobian of the calibration's pixels, the normal equations by blocks for the bundle adjustment's
+steps, and an orthogonal factor and the leverages of measurements for its statistics.
 
-A pixel depends on the generators, one camera, one lens and one marker. Rows of the Jacobian are made chunk by chunk, so
-that memory stays bounded and cost grows linearly with the images; markers, which no pixel shares, are eliminated one by
-one, from the normal equations by blocks (Schur complement), from the factor by reflections: cost grows linearly with
-them, too.
+A pixel depends on the generators, one camera, one lens and one marker. Rows of the Jacobian are computed in chunks, so
+that memory stays bounded and cost grows linearly with the images. Each marker is eliminated separately, since no pixel
+depends on two: from the normal equations by blocks (Schur complement), from the factor by reflections. Cost grows
+linearly with the markers, too.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from stereoservo.numerics.compilation import kernel
 Weights = Callable[[FloatArray], FloatArray]
 
 CHUNK = 1024
-"""Measurements whose rows are in memory at once."""
+"""Number of measurements in a chunk, whose rows are in memory at once."""
 
 
 class Motions(NamedTuple):
-    """Partial products ``before`` and ``after`` each joint, and the ``basis`` (4, 4, p) of the generators' parameters,
-    those of joint j from ``start`` (n + 1,) j on.
+    """Partial products ``before`` and ``after`` each joint, and the ``basis`` (4, 4, p) of the generators' parameters;
+    those of joint j start at index ``start`` (n + 1,) j.
     """
 
     before: FloatArray
@@ -49,7 +49,7 @@ class Motions(NamedTuple):
 def _displacement_derivative(motions: Motions, stop: int, half: FloatArray, change: FloatArray) -> None:
     """Derivative ``change`` (4, 4, p) of the displacement at a stop by the generators; ``half`` (4, 4, p) is scratch.
 
-    ``d exp(qĤ) = [L, exp(qĤ)]``: the joints before it on the left, those behind on the right.
+    ``d exp(qĤ) = [L, exp(qĤ)]``: preceding joints are multiplied on the left, following ones on the right.
     """
     before, after, generator_basis, generator_start = motions
     change[:] = 0.0
@@ -95,7 +95,7 @@ def _point_derivative(H: FloatArray, change: FloatArray, M: FloatArray, world: F
 @kernel
 def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: FloatArray) -> None:
     """Derivative (2, q) of a pixel by the coordinates of its marker along ``basis`` (q, 4), into ``own``; ``outer``
-    (2, 4) is that by the displaced point.
+    (2, 4) is the derivative by the displaced point.
     """
     for a in range(own.shape[1]):
         D4 = basis[a]
@@ -107,7 +107,7 @@ def _marker_columns(H: FloatArray, basis: FloatArray, outer: FloatArray, own: Fl
 
 
 class Projections(NamedTuple):
-    """``cameras`` (c, 3, 4) and ``lenses`` (c, 7), with the bases of their parameters and where each camera's begin."""
+    """``cameras`` (c, 3, 4) and ``lenses`` (c, 7), with the bases of their parameters and each camera's first index."""
 
     cameras: FloatArray
     camera_basis: FloatArray
@@ -142,7 +142,7 @@ def _rows_into(
     first.
 
     ``core`` (2 k, p + 1), zero on entry: derivatives by generators, cameras and lenses, then the residual. ``own``
-    (2 k, 3 or 0): by the coordinates of the measurement's own marker.
+    (2 k, 3 or 0): derivatives by the coordinates of the measurement's own marker.
     """
     after, width = motions.after, motions.basis.shape[2]
     points, point_basis = markers
@@ -251,7 +251,7 @@ class Rows:
 
 
 def by_stop(data: Measurements) -> tuple[Measurements, IntArray]:
-    """Measurements sorted by stop, marker and camera, the order that `Rows` needs, and the permutation (k,)."""
+    """Measurements sorted by stop, marker and camera, the order that `Rows` requires, and the permutation (k,)."""
     order: IntArray = np.lexsort((data.camera, data.marker, data.stop))
     return data.select(order), order
 
@@ -294,7 +294,7 @@ def _starts(bases: tuple[FloatArray, ...]) -> IntArray:
 
 
 def prior_rows(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
-    """Rows (r, p + 1) of the lens priors on those lenses that are free, and of the ties of free cameras to a pinhole's
+    """Rows (r, p + 1) of the priors of free lenses, and of the ties of free cameras to a pinhole's
     form; the last column is the residual.
     """
     out = np.zeros((0, charts.size + 1))
@@ -306,7 +306,7 @@ def prior_rows(rig: RigModel, charts: Charts, data: Measurements) -> FloatArray:
     for lens, basis, mean, information in zip(
         rig.lenses, charts.lenses, data.lens_priors.mean, data.lens_priors.information, strict=True
     ):
-        # Terms that are not free have no prior: it would only count.
+        # Terms that are fixed get no prior: it would only add to the count of rows.
         part = len(mean) if len(basis) and basis[:, 4:].any() else 3
         entries = list(LENS_PARAMETERS[:part])
         values, vectors = np.linalg.eigh(information[:part, :part])
@@ -343,7 +343,7 @@ def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
 
 
 def normal_equations(rig: RigModel, charts: Charts, data: Measurements, weights: Weights | None) -> NormalEquations:
-    """Accumulate the normal equations of sorted ``data``; ``weights`` of squared residuals (2 k,) for robust
+    """Normal equations of sorted ``data``; ``weights`` of squared residuals (2 k,) for robust
     losses. Priors of lenses are never weighted down.
     """
     width = charts.start(3)
@@ -375,8 +375,8 @@ def normal_equations(rig: RigModel, charts: Charts, data: Measurements, weights:
 def _eliminate_markers(
     core: FloatArray, own: FloatArray, order: IntArray, marker: IntArray, blocks: FloatArray
 ) -> None:
-    """Householder reflections that take the columns of each row's own marker out of ``core`` (2 k, p + 1), ``own``
-    (2 k, q), both overwritten, and into ``blocks`` (m, q, q + p + 1), each marker's triangle and its coupling.
+    """Eliminate the columns of each row's own marker from ``core`` (2 k, p + 1) and ``own`` (2 k, q), both overwritten,
+    by Householder reflections into ``blocks`` (m, q, q + p + 1): each marker's triangle and its coupling.
 
     ``order`` (k,) sorts the measurements by ``marker`` (k,).
     """
@@ -395,7 +395,7 @@ def _eliminate_markers(
                     below += own[row, a] * own[row, a]
             if below == 0.0:
                 continue
-            # The reflection that takes (x, y) to (-sign(x) |(x, y)|, 0), by its vector (head, y).
+            # The reflection that maps (x, y) to (-sign(x) |(x, y)|, 0), by its vector (head, y).
             size = np.sqrt(block[a, a] * block[a, a] + below)
             head = block[a, a] + (size if block[a, a] >= 0.0 else -size)
             scale = 2.0 / (head * head + below)
@@ -424,10 +424,10 @@ def _eliminate_markers(
 
 @dataclass(frozen=True)
 class ArrowFactor:
-    """Orthogonal factor ``R`` of ``[J r]``, triangular where markers come first: ``Rᵀ R = [J r]ᵀ [J r]``.
+    """Orthogonal factor ``R`` of ``[J r]``, triangular with the markers first: ``Rᵀ R = [J r]ᵀ [J r]``.
 
     ``own`` (m, q, q): each marker's triangle; ``cross`` (m, q, p_core + 1): its rows by the other parameters and the
-    residuals; ``core`` (p_core + 1, p_core + 1): the triangle of these once the markers are eliminated.
+    residuals; ``core`` (p_core + 1, p_core + 1): the triangle of these with the markers eliminated.
     """
 
     own: FloatArray
@@ -435,7 +435,7 @@ class ArrowFactor:
     core: FloatArray
 
     def without(self, columns: IntArray) -> ArrowFactor:
-        """The factor without these ``columns`` of generators, cameras and lenses: with them kept fixed."""
+        """The factor without these ``columns`` of generators, cameras and lenses: they are kept fixed."""
         if not len(columns):
             return self
         return ArrowFactor(
@@ -457,8 +457,8 @@ class ArrowFactor:
 def arrow_factor(rig: RigModel, charts: Charts, data: Measurements, more: FloatArray | None = None) -> ArrowFactor:
     """Orthogonal factor of the Jacobian and the residuals, priors of lenses included, in chunks.
 
-    To the accuracy of QR on the whole Jacobian, for no product squares its condition; time and memory linear in the
-    markers, for each is eliminated from its own rows. ``more`` (2 k, e): columns behind those of the lenses.
+    As accurate as QR of the whole Jacobian, because its condition is not squared; time and memory are linear in the
+    markers, because each is eliminated from its own rows. ``more`` (2 k, e): columns after those of the lenses.
     """
     sorted_data, order = by_stop(data)
     beside = np.zeros((2 * len(order), 0)) if more is None else more
@@ -488,8 +488,8 @@ def _triangle(rows: FloatArray) -> FloatArray:
 
 
 def leverages(rig: RigModel, charts: Charts, data: Measurements, factor: ArrowFactor) -> FloatArray:
-    """Leverage (k,) of each measurement, ``trace(J_i (Jᵀ J)⁻¹ J_iᵀ)`` in its sigmas: its share of the hat matrix's
-    trace. ``factor``: of the measurements that determine the parameters. Raises LinAlgError where they do not.
+    """Leverage (k,) of each measurement, ``trace(J_i (Jᵀ J)⁻¹ J_iᵀ)`` in its sigmas: its part of the hat matrix's
+    trace. ``factor``: of the measurements that determine the parameters. Raises LinAlgError if they do not.
     """
     sorted_data, order = by_stop(data)
     core_root = column_root(factor.core[:-1, :-1])

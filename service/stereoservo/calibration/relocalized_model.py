@@ -1,9 +1,9 @@
 """Relocalization: new matrices of moved cameras in a cell's model, without recalibration of the arm.
 
 Arm and static points of the model are a known rigid structure in its projective frame: at rest poses the joints
-determine where the arm's markers are. A moved camera is resected in that frame (2.19-2.21), in the metric stratum as a
-displacement of the camera it was, ``P' = P D``: its intrinsics stay. Frame, arm and lenses stay as they are; the
-covariance of the model is extended to the new matrices.
+determine the positions of the arm's markers. A moved camera is resected in that frame (2.19-2.21), in the metric
+stratum as a displacement of the previous camera, ``P' = P D``, with fixed intrinsics. Frame, arm and lenses are
+unchanged; the covariance of the model is extended to the new matrices.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ class MovedCamera:
     """Description of a camera's motion.
 
     ``how``: ``moved`` (a displacement), ``moved_and_refocused`` (its intrinsics have changed, too), ``resected`` (the
-    stratum has no displacements), ``moved_with_rig``. ``turned_deg`` by its own axes; ``shifted_share``:
-    displacement of its centre over its distance from the points; ``shifted_m`` where prismatic joints give the scale;
-    None where the model is not metric. ``moved_px``: rms image motion of the points that it sees. ``text`` in words.
+    stratum has no displacements), ``moved_with_rig``. ``turned_deg``: angle in its own axes; ``shifted_share``:
+    displacement of its centre over its distance from the points; ``shifted_m`` if prismatic joints give the scale;
+    None if the model is not metric. ``moved_px``: rms image motion of the visible points. ``text``: in words.
     """
 
     how: How
@@ -76,7 +76,7 @@ class MovedCamera:
 
 @dataclass(frozen=True)
 class OutlierObservation:
-    """Pixels left out: of which ``camera`` and ``id``, at how many of how many poses, and how far off [px rms]."""
+    """Rejected pixels: their ``camera`` and ``id``, at how many of how many poses, and their error [px rms]."""
 
     camera: str
     id: int
@@ -109,7 +109,7 @@ def describe_moved_camera(
 def _displacement(
     model: CellModel, H: FloatArray, old: FloatArray, new: FloatArray, points: FloatArray
 ) -> tuple[float, float, float | None]:
-    """Angle [deg], displacement of the centre over the distance from the points, and in [m] where a scale is known."""
+    """Angle [deg], displacement of the centre over the distance from the points, and in [m] if a scale is known."""
     back = np.linalg.inv(H)
     turns, centres = [], []
     for matrix in (old, new):
@@ -147,7 +147,7 @@ def too_few(names: list[str], count: int, ids: int, needed: int, what: str) -> C
 
 
 def points_coplanar(names: list[str], count: int, ids: int) -> CalibrationError:
-    """Error text: coplanar points leave a direction open."""
+    """Error text: coplanar points leave a direction undetermined."""
     return CalibrationError(
         "points_coplanar",
         f"{count} pixels of {ids} points do not determine camera {_listed(names)}: the points lie in one plane, or on "
@@ -203,26 +203,26 @@ def _listed(names: list[str]) -> str:
 
 
 OUTLIER_CHI2 = 25.0
-"""Squared distance [sigmas²] of a pixel, two degrees of freedom, above which it is left out: as in a calibration."""
+"""Squared distance [sigmas²] of a pixel, two degrees of freedom, above which it is rejected: as in a calibration."""
 MAX_OUTLIERS = 0.4
-"""Share of the pixels that may be left out."""
+"""Largest share of rejected pixels."""
 TAIL = 1e-4
-"""Chance that residuals as stated are refused."""
+"""Probability with which residuals of the stated size are refused."""
 MAX_SIGMA_FACTOR = 1.5
-"""How many times the residuals of the calibration these may be: a camera alone is fitted here, to a known arm."""
+"""Largest ratio of these residuals to the calibration's: only a camera is fitted here, to a known arm."""
 SPARE = 2
-"""Equations that must be left over: what exactly fits proves nothing."""
+"""Required number of redundant equations: an exact fit proves nothing."""
 RESECTION_POINTS, RIG_POINTS = 6, 5
 ROUNDS, WEIGHED = 6, 2
-"""Times that outliers are told, and that pixels are weighted by what the matrices make of the model's covariance."""
+"""Rounds of outlier rejection, and of weighting the pixels with the model's covariance at the new matrices."""
 FAR_PX = 1e6
-"""Error of a point that is predicted behind its camera."""
+"""Error [px] assigned to a point that is predicted behind its camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
-    """Cameras that were fitted together: new ``matrices`` (c, 3, 4), ``P D`` with ``motion`` D (4, 4) and the
-    model's P where they were displaced rigidly, and the inliers among ``views``.
+    """Cameras that were fitted together: new ``matrices`` (c, 3, 4), with the rigid ``motion`` D (4, 4) such that they
+    are ``P D`` of the model's P, if any, and the inliers among ``views``.
     """
 
     cameras: tuple[int, ...]
@@ -285,7 +285,7 @@ def relocalize_group(
 
 
 def _refocused(displaced: CameraGroup, free: CameraGroup, noise: float) -> bool:
-    """Whether free matrices fit significantly better than a displacement: by likelihood ratio where both keep the
+    """Whether free matrices fit significantly better than a displacement: by likelihood ratio if both keep the
     same pixels, else by chi-square alone.
     """
     if len(displaced.views.camera) == len(free.views.camera):
@@ -313,10 +313,10 @@ def facing(matrices: FloatArray, views: Correspondences) -> FloatArray:
 
 
 def _scaled_like(one: CameraGroup, old: FloatArray, ahead: FloatArray) -> CameraGroup:
-    """The group with the scales and signs of the matrices ``old`` (c, 3, 4); those ``ahead`` have the points in
-    front.
+    """The group with the scales and signs of the matrices ``old`` (c, 3, 4); the matrices ``ahead`` have the points
+    in front.
 
-    They mean nothing in the images, but what is compared with a matrix of before need not know that.
+    Scale and sign do not change the images, but make old and new matrices comparable.
     """
     sides = np.sign(np.einsum("cij,cij->c", old, ahead))
     factors = sides * np.linalg.norm(old, axis=(1, 2)) / np.linalg.norm(one.matrices, axis=(1, 2))
@@ -388,8 +388,8 @@ def _inliers(
     views: Correspondences,
     offsets: FloatArray,
 ) -> BoolArray:
-    """Mask (k,) of pixels that fit, by their own and the model's covariance; ids with mostly outliers are outliers
-    throughout.
+    """Mask (k,) of pixels that fit, by their own and the model's covariance; all pixels of an id with mostly outliers
+    are rejected.
     """
     covariances = views.covariances.copy()
     static = static_roots(model, moved.matrices, lenses, views)
@@ -442,7 +442,7 @@ def _least_squares(
     gain = determined.root @ determined.root.T @ fit.rows(moved)[:, :-1].T @ white
     entries = family.directions(moved.matrices).transpose(0, 2, 3, 1).reshape(12 * len(group), family.size)
     own = entries @ gain
-    # Where the residuals are larger than stated, so was the noise.
+    # Residuals larger than stated indicate that the noise was, too.
     errors = CameraErrors(
         group,
         inherited_errors(model, group, moved.motion) - own @ F,
@@ -468,13 +468,13 @@ def _jointly(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
 
 
 def _resected(views: Correspondences, lenses: FloatArray) -> list[Moved]:
-    """The matrix of a camera by linear resection and refinement, where the points determine it."""
+    """The matrix of a camera by linear resection and refinement, if the points determine it; else empty."""
     ideal = undistort(lenses[0], views.pixels)
     sigma = float(np.sqrt(np.median(np.trace(views.covariances, axis1=1, axis2=2)) / 2.0))
     try:
         return [Moved(resect_moved_camera(views.points, ideal, sigma).P[None], None)]
     except GeometryError:
-        return []  # it may still be near the matrix that the camera had; least squares show if it is determined
+        return []  # the previous matrix may still be near; least squares show whether it is determined
 
 
 def _outliers(
@@ -510,7 +510,7 @@ def _noise(model: CellModel) -> float:
 def _refuse_few(
     model: CellModel, views: Correspondences, group: tuple[int, ...], family: MatrixChange, how: How
 ) -> None:
-    """Raise CalibrationError where the pixels are too few for the parameters."""
+    """Raise CalibrationError if the pixels are too few for the parameters."""
     count, ids = len(views.camera), len(np.unique(views.ids))
     needed, what = -(-(family.size + SPARE) // 2), "more equations than parameters"
     if how == "resected":
@@ -530,9 +530,9 @@ def _refuse_outliers(model: CellModel, views: Correspondences, group: tuple[int,
 
 
 LIMIT_PX = 1.0
-"""Largest standard deviation of a marker's predicted pixel, over the range of the joints, that is taken by default."""
+"""Default limit of a marker's predicted standard deviation [px] over the range of the joints."""
 WORKSPACE = 40
-"""Random joint positions at which predictions are asked for."""
+"""Number of random joint positions at which predictions are evaluated."""
 
 
 class CameraSample(Protocol):
@@ -547,7 +547,7 @@ class CameraSample(Protocol):
 
     @property
     def ids(self) -> IntArray:
-        """Markers of the arm and static points alike; ids that the model does not know are left out."""
+        """Markers of the arm and static points; ids that the model does not contain are left out."""
 
     @property
     def pixels(self) -> FloatArray:
@@ -575,10 +575,10 @@ class RestObservations:
 
 @dataclass(frozen=True, eq=False)
 class RelocalizedModel:
-    """A relocalized ``model`` with its report: what moved, residuals, accuracy.
+    """A relocalized ``model`` with its report: moved cameras, residuals, accuracy.
 
-    ``predicted_px``: largest standard deviation, an axis, of a marker's predicted pixel in the moved cameras, over the
-    range of the joints, where the camera sees it; the model's own uncertainty included where it states one.
+    ``predicted_px``: largest standard deviation, per axis, of a marker's predicted pixel in the moved cameras that see
+    it, over the range of the joints; includes the model's own uncertainty if it states one.
     """
 
     model: CellModel
@@ -603,8 +603,8 @@ def relocalize(
 ) -> RelocalizedModel:
     """The model with new matrices of the cameras ``moved``, in the same frame.
 
-    ``rigid_rig``: they moved as one body. ``workspace`` (w, n): joint positions at which predictions must hold, default
-    the range of the calibration's trials. Raises CalibrationError: ``bad_data``, ``too_few_points``,
+    ``rigid_rig``: they moved as one body. ``workspace`` (w, n): joint positions at which predictions must be accurate,
+    default the range of the calibration's trials. Raises CalibrationError: ``bad_data``, ``too_few_points``,
     ``points_coplanar``, ``not_explained``, ``too_uncertain``.
     """
     which = _indices(model, moved)
@@ -696,7 +696,7 @@ def _check_sample(sample: CameraSample, pose: int) -> None:
 
 
 def _averaged(rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]) -> Correspondences:
-    """One row for each static point and camera: of several poses the mean, with the covariance of the best."""
+    """One row for each static point and camera: the mean over all poses, with the covariance of the best pose."""
     kept = [row for row in rows if row[2] >= 0]
     by_point: dict[tuple[int, int], list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]]] = {}
     for row in rows:
@@ -724,7 +724,7 @@ def _arm_points(model: CellModel, joints: FloatArray) -> FloatArray:
 
 
 def _workspace(model: CellModel, observations: RestObservations, given: FloatArray | None) -> FloatArray:
-    """Joint positions (w, n): those of the observations, and the trials' range, one joint at a time and all at
+    """Joint positions (w, n): those of the observations, and the trials' range, for one joint at a time and for all at
     random.
     """
     here = np.array([pose.joints for pose in observations.poses])

@@ -1,9 +1,9 @@
 """Parametric model of a cell that a calibration estimates (joint generators, cameras, lenses, markers, in any
 stratum), its predicted pixels and residuals, and changes of its frame (thesis 5.53, 5.55 to 5.57).
 
-Raw pixels, behind the lens, carry noise; joint readings are exact unless `JointNoise` states otherwise. Parameters are
+Noise is that of raw (distorted) pixels; joint readings are exact unless `JointNoise` states otherwise. Parameters are
 coordinates of the minimal charts of :mod:`stereoservo.kinematics.parameterization`, so that the Jacobian has full rank
-where the data determine the model.
+if the data determine the model.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class RigModel:
     """A model under estimation: ``generators`` (n, 4, 4), ``cameras`` (c, 3, 4) to ideal pixels, ``points`` (m, 4)
     at joint offset 0, ``lenses`` (c, 7) from ideal to raw pixels; given as (c, 4) without terms, empty for pinholes.
 
-    ``known``: whether the generators are known twists, in the frame that they fix; else the first camera fixes it.
+    ``known``: whether the generators are known twists and their frame is used; else the first camera defines the frame.
     """
 
     kinds: tuple[Kind, ...]
@@ -73,8 +73,8 @@ class LensPriors:
 
 @dataclass(frozen=True)
 class PinholeTies:
-    """Standard deviations [px] of what ties cameras to their lenses and to a pinhole's form, of each camera: ``skew``,
-    ``aspect`` (of fx - fy) and ``centre`` (of the lens centre about the principal point); infinite where it is free.
+    """Standard deviations [px] of the constraints that tie each camera to its lens and to a pinhole's form: ``skew``,
+    ``aspect`` (of fx - fy) and ``centre`` (of the lens centre about the principal point); infinite if free.
     """
 
     skew: float
@@ -86,10 +86,10 @@ class PinholeTies:
 class JointNoise:
     """Standard deviations of the errors of joint readings at s stops, true minus reported position [rad or m].
 
-    ``own`` (s, n): of the part that a joint has at that stop alone. ``shared`` (s, n): index of the error that it has
-    in common with other stops at the same reading, -1 where there is none; ``deviations`` (e,) of those errors.
-    ``posture`` (n,): of the part that changes slowly with the posture, whose course at the stops ``features`` (s, r)
-    span with coefficients of unit variance.
+    ``own`` (s, n): of the error of a joint at that stop alone. ``shared`` (s, n): index of the error that it shares
+    with other stops at the same reading, -1 if there is none; ``deviations`` (e,) of those errors.
+    ``posture`` (n,): of the error that changes slowly with the posture; its values at the stops are spanned by
+    ``features`` (s, r) with coefficients of unit variance.
     """
 
     own: FloatArray
@@ -100,16 +100,16 @@ class JointNoise:
 
     @property
     def giving_way(self) -> IntArray:
-        """Joints that have errors which change with the posture."""
+        """Joints with errors that change with the posture."""
         return np.flatnonzero(self.posture > 0.0)
 
     @property
     def common(self) -> int:
-        """Number of errors that stops have in common."""
+        """Number of errors that stops share."""
         return len(self.deviations) + len(self.giving_way) * int(self.features.shape[1])
 
     def common_factors(self, stops: IntArray) -> FloatArray:
-        """Error (k, n, common) of each joint at ``stops`` (k,) for a unit of each error that stops have in common."""
+        """Derivatives (k, n, common) of each joint's error at ``stops`` (k,) by each shared error."""
         e, r = len(self.deviations), self.features.shape[1]
         factors = np.zeros((len(stops), len(self.posture), self.common))
         at, joint = np.nonzero(self.shared[stops] >= 0)
@@ -120,7 +120,7 @@ class JointNoise:
         return factors
 
     def common_offsets(self, common: FloatArray) -> FloatArray:
-        """Errors (s, n) [rad or m] by those that stops have in common (common,)."""
+        """Errors (s, n) [rad or m] due to the shared ones ``common`` (common,)."""
         e, r = len(self.deviations), self.features.shape[1]
         found = np.append(common[:e] * self.deviations, 0.0)[self.shared]
         for k, joint in enumerate(self.giving_way):
@@ -131,7 +131,7 @@ class JointNoise:
 
 @dataclass(frozen=True)
 class JointErrors:
-    """Estimated errors of joint readings in standard deviations: ``own`` (s, n), and the ``common`` ones of stops."""
+    """Estimated errors of joint readings in standard deviations: ``own`` (s, n), and the ``common`` (shared) ones."""
 
     own: FloatArray
     common: FloatArray
@@ -150,9 +150,9 @@ class JointErrors:
 class Measurements:
     """Raw pixels in a flat list: camera, stop and marker of each (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px].
 
-    ``offsets`` (s, n): joint positions of each stop minus the zero, ``joint_errors`` included. ``lens_priors`` count as
-    measurements of those lenses that are free, ``pinhole_ties`` of a metric rig's cameras that are free.
-    ``joint_noise``: of the readings; None where they are exact.
+    ``offsets`` (s, n): joint positions of each stop minus the zero, ``joint_errors`` included. ``lens_priors`` are used
+    as measurements of the free lenses, ``pinhole_ties`` of a metric rig's free cameras.
+    ``joint_noise``: of the readings; None if they are exact.
     """
 
     offsets: FloatArray
@@ -168,13 +168,13 @@ class Measurements:
 
     @property
     def corrections(self) -> FloatArray:
-        """Estimated errors (s, n) [rad or m] that ``offsets`` include."""
+        """Estimated errors (s, n) [rad or m] that are included in ``offsets``."""
         if self.joint_noise is None or self.joint_errors is None:
             return np.zeros_like(self.offsets)
         return self.joint_errors.offsets(self.joint_noise)
 
     def corrected(self, errors: JointErrors | None) -> Measurements:
-        """The measurements with other estimated errors of the joint readings; None: as they were reported."""
+        """The measurements with different estimated errors of the joint readings; None: with readings as reported."""
         if errors is None and self.joint_errors is None:
             return self
         reported = replace(self, offsets=self.offsets - self.corrections, joint_errors=None)
@@ -183,11 +183,11 @@ class Measurements:
         return replace(reported, offsets=reported.offsets + errors.offsets(self.joint_noise), joint_errors=errors)
 
     def with_joint_noise(self, noise: JointNoise | None) -> Measurements:
-        """The measurements as reported, with another noise of the joint readings."""
+        """The measurements with readings as reported and a different noise of them."""
         return replace(self.corrected(None), joint_noise=noise)
 
     def with_errors_removed(self) -> Measurements:
-        """The measurements at readings from which the estimated errors are removed, taken for exact."""
+        """The measurements with the estimated errors removed from the readings, which then count as exact."""
         return replace(self, joint_noise=None, joint_errors=None)
 
     def select(self, keep: npt.NDArray[np.bool_] | IntArray) -> Measurements:
@@ -204,8 +204,8 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Charts:
-    """Minimal parameterization: directions of each part in the order of their parameters; an empty basis (0, ...) keeps
-    the part fixed. Those of lenses are (p, 7), given as (p, 4) without terms.
+    """Minimal parameterization: basis directions of each part in the order of its parameters; an empty basis (0, ...)
+    keeps the part fixed. Those of lenses are (p, 7), given as (p, 4) without terms.
     """
 
     generators: tuple[FloatArray, ...]
@@ -244,9 +244,9 @@ def full_charts(
     """Minimal charts around ``rig``; generators, cameras or points may be kept fixed, ``lenses`` selects their free
     parameters.
 
-    With free cameras the first is the gauge's (projective, affine: fixed; metric: ``K [I | 0]``), the second
-    loses the remaining gauge, further ones are free. Known generators are kept fixed, and leave no gauge; nor is one
-    left where neither generators nor points are free.
+    With free cameras the first one fixes the gauge (projective, affine: fixed; metric: ``K [I | 0]``), the second
+    one loses the remaining gauge freedom, further ones are free. Known generators are kept fixed and leave no gauge
+    freedom; nor is there any if neither generators nor points are free.
     """
     gauge: Literal["right", "other"] = "right" if generators or points else "other"
     none = np.zeros((0, 3, 4))
@@ -317,7 +317,7 @@ def displacements(rig: RigModel, offsets: FloatArray) -> FloatArray:
 
 
 def predicted(rig: RigModel, data: Measurements, moved: FloatArray | None = None) -> FloatArray:
-    """Raw pixels (k, 2) of the rig for each measurement (5.56); ``moved`` (s, 4, 4): displacements where known."""
+    """Raw pixels (k, 2) of the rig for each measurement (5.56); ``moved`` (s, 4, 4): displacements, if known."""
     if moved is None:
         moved = displacements(rig, data.offsets)
     world = rig.points @ moved.transpose(0, 2, 1)
@@ -339,7 +339,7 @@ def expected_pixels(rig: RigModel, offsets: FloatArray) -> FloatArray:
 
 
 def _through(lens: FloatArray, ideal: FloatArray) -> FloatArray:
-    """Raw pixels (k, 2) of ideal ones through a lens (7,), which has terms or is only radial."""
+    """Raw pixels (k, 2) of ideal ones through a lens (7,), with or without second radial and tangential terms."""
     if not bends(lens):
         return ideal
     return distort(lens if lens[4:].any() else lens[:4], ideal)
@@ -353,17 +353,17 @@ def residuals(rig: RigModel, data: Measurements) -> FloatArray:
 
 
 def projective_rig(model: CellModel) -> RigModel:
-    """The model in its own projective frame, joints counted from the base."""
+    """The model in its own projective frame, joints ordered from the base."""
     return _rig(model, np.eye(4))
 
 
 def stratum_rig(model: CellModel) -> RigModel:
-    """The model in the best frame that its stratum has, joints counted from the base; heights 1 but projective."""
+    """The model in the highest frame of its stratum, joints ordered from the base; heights 1 unless projective."""
     return _rig(model, stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean))
 
 
 def acting_order(model: CellModel) -> tuple[int, ...]:
-    """Joints in the order in which a rig composes them: with cameras on the tip the tip's joint first."""
+    """Joints in the order in which a rig composes them: with cameras on the tip, the tip's joint first."""
     order = tuple(range(len(model.joint_names)))
     return order[::-1] if model.tip_first else order
 
@@ -411,7 +411,7 @@ def common_mount(trials: TrialData) -> Mount:
 
 
 def reversed_trials(trials: TrialData) -> TrialData:
-    """Trials with the joints counted from the other end: from cameras on the tip, the base's joint is the
+    """Trials with the joints in reverse order: seen from cameras on the tip, the base's joint is the
     last before the markers.
     """
     last = len(trials.joint_names) - 1
@@ -425,7 +425,7 @@ def reversed_trials(trials: TrialData) -> TrialData:
 
 
 def with_joints_reversed(model: CellModel) -> CellModel:
-    """Model of reversed trials with its joints base first again, mounted eye-in-hand."""
+    """Model of reversed trials with its joints base first again, with eye-in-hand mount."""
     statistics = model.statistics
     if statistics is not None:
         statistics = msgspec.structs.replace(statistics, joints=statistics.joints[::-1])

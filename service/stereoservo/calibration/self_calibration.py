@@ -86,13 +86,13 @@ Progress = Callable[[str, float], None]
 
 
 OF_LENSES = frozenset({"wrong_scale", "joint_kind", "joint_order", "lens_implausible"})
-"""Causes that a lens which the search did not find imitates: fits from other lenses are tried before they are told."""
+"""Causes that an undetected lens imitates: fits from other initial lenses are tried before they are reported."""
 OF_JOINT_ERRORS = frozenset({"joint_kind", "joint_without_effect", "too_few_markers", "too_few_stops"})
-"""Causes by which single joints are refused that errors of the readings imitate."""
+"""Causes of single-joint failures that errors of the readings imitate."""
 WILD = 100.0
-"""Squared residual over the median from which a pixel of the linked joints is a wrong one."""
+"""Squared residual of the linked joints, over the median, from which a pixel counts as wrong."""
 SCALE_ROUNDS = 3
-"""Times that scales are removed from the readings and estimated again."""
+"""Most rounds of removing scales from the readings and estimating them again."""
 
 
 def fit_model(
@@ -106,14 +106,14 @@ def fit_model(
 ) -> CalibrationFit:
     """Model of a cell fitted to its trial motions, with a report of the fit.
 
-    Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and counts its
-    joints from the base in both cases. Static markers become the model's static points. Trials whose generators are
-    known (`trials_of_poses`: poses in place of joints) may be of any motion. ``lens_priors``: by camera name, an
+    Cameras are all static (eye-to-hand) or all on the tip (eye-in-hand); the model records which, and its
+    joints start at the base in both cases. Static markers become the model's static points. Trials with known
+    generators (`trials_of_poses`: poses in place of joints) may have any motion. ``lens_priors``: by camera name, an
     estimate of its lens from straight lines (`geometry.distortion.lens_from_lines`).
 
-    ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause where
-    the data do not give a model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
-    Between that and the noise floor ``chi2_ok`` is false and the report's notes contain what is known.
+    ``progress(stage, fraction)`` is called during the fit. Raises CalibrationError with the cause if
+    the data give no model, or one with residuals of more than ``options.max_sigma_factor`` sigmas.
+    Between that and the noise floor ``chi2_ok`` is false and the report's notes state what is known.
     """
     check_trials(trials)
     mount = common_mount(trials)
@@ -156,7 +156,7 @@ def _chosen_fit(
     others: Callable[[], CalibrationFit | None],
 ) -> tuple[CalibrationFit, tuple[str, ...]]:
     """The fit with or without errors of the joint readings, whichever explains the data, with notes. Raises
-    CalibrationError with the cause where neither does.
+    CalibrationError with the cause if neither does.
     """
     first, noisy = _first_fit(chain, options, fit)
     if noisy is not None and not noisy.doubtful:
@@ -174,8 +174,8 @@ def _chosen_fit(
 
 
 def _absorbed(fit: Callable[[], _Fitted]) -> CalibrationFit | None:
-    """A fit whose joint readings have errors that small scale factors may be among; None where they do not explain the
-    data, or look like one event.
+    """A fit with joint reading errors that may include small scale factors; None if it does not explain the data, or
+    the errors look like one event.
     """
     try:
         fitted = fit()
@@ -185,7 +185,7 @@ def _absorbed(fit: Callable[[], _Fitted]) -> CalibrationFit | None:
 
 
 class _Fitted(NamedTuple):
-    """A fit, whether its joint readings have errors, and whether these rather look like one event."""
+    """A fit, whether its joint readings have errors, and whether these look like a single event (``doubtful``)."""
 
     fit: CalibrationFit
     joint_errors: bool = False
@@ -193,12 +193,12 @@ class _Fitted(NamedTuple):
 
 
 class _JointErrorsError(Exception):
-    """Errors of the joint readings seemed to explain the data, and do not."""
+    """Errors of the joint readings were assumed to explain the data, but do not."""
 
 
 JointErrorsTaken = Literal["none", "at most likely", "beside scales", "scales too"]
-"""What joint readings are taken for: exact; exact, with what makes errors likely stated; with errors that scales of the
-joints do not explain better; with errors that scales may be among."""
+"""Assumption about joint readings: exact; exact, with a statement of likely errors; with errors, unless scales of the
+joints explain the data better; with errors that may include scales."""
 
 _FitOfTrials = Callable[[TrialData, FitOptions, JointErrorsTaken], _Fitted]
 
@@ -206,7 +206,8 @@ _FitOfTrials = Callable[[TrialData, FitOptions, JointErrorsTaken], _Fitted]
 def _first_fit(
     chain: TrialData, options: FitOptions, fit: _FitOfTrials
 ) -> tuple[Callable[[], CalibrationFit], _Fitted | None]:
-    """The fit with exact joint readings, to be called, and that with errors of these where they explain the data.
+    """A function that returns the fit with exact joint readings, and the fit with errors of these, if they explain
+    the data.
 
     Raises CalibrationError (``wrong_scale``) for scales that are wrong beside such errors.
     """
@@ -236,8 +237,8 @@ def _told_by_scales(
     exact: Callable[[], CalibrationFit],
     fit: Callable[[TrialData], _Fitted],
 ) -> Callable[[], CalibrationFit]:
-    """The fit with ``exact`` joint readings, to be called. Raises CalibrationError (``wrong_scale``) where the trials
-    fit to the noise with the scales removed, and do not with exact readings.
+    """A function that returns the fit with ``exact`` joint readings. Raises CalibrationError (``wrong_scale``) if the
+    trials fit to the noise with the scales removed, but not with exact readings.
     """
     factors, components = wrong.factors, wrong.components
     for _ in range(SCALE_ROUNDS):
@@ -270,12 +271,12 @@ def _with_exact_joints(
     refit: Refit,
     others: Callable[[], CalibrationFit | None],
 ) -> tuple[CalibrationFit, tuple[str, ...]]:
-    """The ``first`` fit, or one of ``others``, from other lenses, with notes. Raises CalibrationError with the cause
-    where there is none.
+    """The ``first`` fit, or one from ``others`` (different initial lenses), with notes. Raises CalibrationError with
+    the cause if there is none.
     """
 
     def otherwise(cause: CalibrationError, refused: CalibrationFit | None = None) -> CalibrationFit:
-        """The fit from other lenses where one explains the data; else the cause is raised, of a fit ``refused`` too."""
+        """The fit from other lenses if one explains the data; else raises the cause, of a ``refused`` fit too."""
         free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
         bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
         found = others() if bent else None
@@ -306,7 +307,7 @@ def _with_exact_joints(
 
 class _Start(NamedTuple):
     """Trials without rare markers, the linked joints, all measurements and the ``clean`` ones among them, and whether
-    the lens model is ``decided`` before the data.
+    the lens model is ``decided`` in advance.
     """
 
     trials: TrialData
@@ -319,12 +320,12 @@ class _Start(NamedTuple):
     markers_left_out: tuple[int, ...]
 
     def with_joint_noise(self, noise: JointNoise) -> _Start:
-        """The same with noise of the joint readings."""
+        """The same start with noise of the joint readings."""
         return self._replace(every=self.every.with_joint_noise(noise), clean=self.clean.with_joint_noise(noise))
 
 
 class _Bundles(NamedTuple):
-    """The ``projective`` bundle, the one of the stratum ``raised`` from it, the ``final`` one and its inliers (k,)."""
+    """The ``projective`` bundle, the bundle ``raised`` to its stratum, the ``final`` one and its inliers (k,)."""
 
     projective: Solution
     raised: StratumSelection
@@ -342,10 +343,10 @@ def _fit(
     bend: float | None = None,
     joint_errors: JointErrorsTaken = "none",
 ) -> _Fitted:
-    """Model and report by the stages of this module; ``bend``: radial parameter of all lenses to start from;
-    ``joint_errors``: which errors the joint readings have where the data show them.
+    """Model and report by the stages of this module; ``bend``: initial radial parameter of all lenses;
+    ``joint_errors``: permitted errors of the joint readings, if the data show them.
 
-    Raises CalibrationError, and where joint readings have errors _JointErrorsError, ScalesError.
+    Raises CalibrationError, and, if joint readings have errors, _JointErrorsError, ScalesError.
     """
     try:
         start, inexact = _start(trials, report_progress, options, priors, bend), False
@@ -402,7 +403,7 @@ def _inexact_start(
     bend: float | None,
     strict: CalibrationError,
 ) -> _Start:
-    """The start from joints whose readings have errors. Raises ``strict`` where there is none either."""
+    """The start from joints whose readings have errors. Raises ``strict`` if there is none either."""
     try:
         return _start(trials, report_progress, options, priors, bend, inexact=True)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError):
@@ -458,7 +459,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
             wanted = FREE_LENS if final.lenses == "none" else FULL_LENS
         if wanted == final.lenses:
             break
-        # Only the constraints of the higher stratum have separated distortion from kinematics.
+        # Only the constraints of the higher stratum separate distortion from kinematics.
         solution, inliers = refine_to_convergence(
             solution.rig, every.corrected(solution.data.joint_errors), "projective", options, wanted, 1e-6
         )
@@ -470,7 +471,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
 
 
 def _settled(raised: Solution, every: Measurements, options: FitOptions) -> tuple[Solution, BoolArray]:
-    """The final bundle and its inliers, from a solution of the stratum and its errors of the joints."""
+    """The final bundle and its inliers, from a solution of the stratum and its joint errors."""
     every = every.corrected(raised.data.joint_errors)
     return refine_to_convergence(raised.rig, every, raised.stratum, options, raised.lenses)
 
@@ -480,19 +481,19 @@ def _reduced_rows(start: _Start, solution: Solution) -> ReducedRows:
 
 
 def _inside(every: Measurements, solution: Solution, inliers: BoolArray) -> Measurements:
-    """The inliers, with the errors of the joints as in ``solution``."""
+    """The inliers, with the joint errors of ``solution``."""
     return every.corrected(solution.data.joint_errors).select(inliers)
 
 
 def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponents | None:
-    """Significant variance components of the linked joints, with cameras free; None where there are none.
-    ``beside_scales``: none either where scales of the joints explain what is left. Raises ScalesError.
+    """Significant variance components of the linked joints, with cameras free; None if there are none.
+    ``beside_scales``: also None if scales of the joints explain the remaining residuals. Raises ScalesError.
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
     if chi2_within(free.cost, free.determined.freedom):
         return None
-    # Wrong pixels would be taken for errors of the joints; those of a stop as a whole would not be seen.
+    # Wrong pixels would count as joint errors; those of a whole stop would not be detected.
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     near = squares <= WILD * max(1.0, float(np.median(squares)))
     free = solve(rig, clean.select(near), "projective", lenses=start.lenses, max_evaluations=1)
@@ -501,7 +502,7 @@ def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponen
     if found is None or not found.significant or not beside_scales:
         return found if found is not None and found.significant else None
     refuse_wrong_scales(start.trials, found)
-    # Errors by posture that scales would have taken are the joints' own where these are right.
+    # If the scales are right, errors by posture that they would have absorbed are the joints' own.
     return estimate_components(rows, scales=False, near=found)
 
 
@@ -512,7 +513,7 @@ def _bundles_with_joint_errors(
     options: FitOptions,
     beside_scales: bool,
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool]:
-    """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError where
+    """Bundles whitened by the components ``found``, estimated again with the final one. Raises _JointErrorsError if
     they do not explain the data, ScalesError.
     """
     at = readings(start.trials.positions - start.zero)
@@ -537,8 +538,8 @@ def _refined_by_joint_errors(
     *,
     beside_scales: bool = True,
 ) -> tuple[_Start, _Bundles, VarianceComponents, bool] | None:
-    """The final bundle, of these ``rows``, whitened by the variance components that it shows, until these stay the
-    same, and whether they look like one event; None where errors of the joints do not explain it. Raises ScalesError.
+    """The final bundle of these ``rows``, whitened by the variance components that it shows, repeated until these stay
+    the same, and whether they look like one event; None if joint errors do not explain it. Raises ScalesError.
     """
     at = readings(start.trials.positions - start.zero)
     final, inliers = bundles.final, bundles.inliers
@@ -573,7 +574,7 @@ def _refined_by_joint_errors(
 
 
 def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
-    """Bundles of a start with joint noise; None where there are none: lenses bend by errors of exact readings."""
+    """Bundles of a start with joint noise; None if there are none. Errors of readings taken as exact distort lenses."""
     try:
         return _bundles(noisy, _silent, options)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError):
@@ -581,14 +582,14 @@ def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
 
 
 def _from_other_lenses(trials: TrialData, epoch: int, created: str, options: FitOptions) -> CalibrationFit | None:
-    """The first fit, of those that start from lenses over the whole range, that its noise explains and whose lenses
-    are plausible; None where there is none.
+    """The first fit, of those from initial lenses over the whole range, that its noise explains and whose lenses
+    are plausible; None if there is none.
     """
     for bend in STARTING_BENDS:
         try:
             result = _fit(trials, epoch, created, _silent, options, {}, bend).fit
         except (CalibrationError, GeometryError, np.linalg.LinAlgError):
-            continue  # not from there
+            continue  # no fit from this start
         statistics = result.model.statistics
         if statistics is not None and statistics.chi2_ok and implausible_lens(result) is None:
             return result

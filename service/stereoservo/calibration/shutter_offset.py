@@ -1,8 +1,8 @@
-"""How much later than their stamps tell the cameras' shutters open, against the joints' stamps, from what was seen on
-the ways between the stops of the trial motions.
+"""Delay of the cameras' shutters after their stamps, relative to the joints' stamps, from the observations on the
+paths between the stops of the trial motions.
 
-On such a way one joint moves. Each frame, by the model, tells where this joint stands; the joint's samples tell when it
-stood there. A part of the difference that is the same all along a way is none of time: play of the joint, once it is
+On such a path one joint moves. The model gives this joint's position in each frame; the joint's samples give the time
+of that position. A position difference that is constant along a path is not due to time: play of the joint, once it is
 taken up, or its zero.
 """
 
@@ -21,34 +21,34 @@ from stereoservo.kinematics.model import CellModel, ShutterOffset
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 LEAST_WAY = {"revolute": 0.01, "prismatic": 0.002}
-"""[rad, m] that the joint goes on a way that counts."""
+"""Shortest travel of the joint [rad, m] on a path that is used."""
 ALONE = 0.02
-"""Share of it that another joint may move meanwhile."""
+"""Largest share of that travel by which another joint may move."""
 LONGEST_S, GRID_S = 0.3, 0.005
-"""Offsets that are looked for, and their distance at first."""
+"""Range of offsets, and their spacing in the initial grid [s]."""
 STEPS = 3
 STEP = 1e-5
-"""[rad or m] For slopes."""
+"""Joint step [rad or m] of difference quotients."""
 SLOPE_S = 0.01
-"""Half of the time over which a joint's speed is taken."""
+"""Half of the interval over which a joint's speed is computed [s]."""
 FAR_SIGMAS = 4.0
 FEWEST = 20
-"""Frames of a camera with the joint in motion."""
+"""Least number of a camera's frames with the joint in motion."""
 FEWEST_OF_WAY = 4
 PLAY = 0.03
-"""[rad or m] that a joint goes before its link does, at most."""
+"""Largest play [rad or m]: travel of a joint before its link moves."""
 MOVING = 0.1
-"""Of a way's greatest speed, from which a joint moves."""
+"""Share of a path's largest speed above which a joint counts as moving."""
 LEAST_DEVIATION_S = 1e-4
 
 
 _Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Samples of a joint, times and positions, and frames of a camera, stamps and where the joint stands by the picture."""
+"""Samples of a joint (times and positions), and frames of a camera (stamps and the joint positions they show)."""
 
 
 class _Way(NamedTuple):
-    """One way of one joint: its samples ``times`` (j,), ``positions`` (j,); frames of each camera: stamps and where the
-    joint stands by the picture.
+    """One path of one joint: its samples ``times`` (j,), ``positions`` (j,); frames of each camera: stamps and the
+    joint positions they show.
     """
 
     times: FloatArray
@@ -57,12 +57,12 @@ class _Way(NamedTuple):
 
 
 def with_shutter_offsets(model: CellModel, way: WayObservations | None) -> CellModel:
-    """The model with the offsets that the ways between its stops show, where they were kept."""
+    """The model with the offsets estimated on the paths between its stops, if these were recorded."""
     return model if way is None else msgspec.structs.replace(model, shutter_offsets=shutter_offsets(model, way))
 
 
 def shutter_offsets(model: CellModel, way: WayObservations) -> tuple[ShutterOffset, ...]:
-    """Offsets of the cameras that saw enough of moving joints."""
+    """Offsets of the cameras with enough frames of moving joints."""
     ways = list(_ways(model, way))
     found = []
     for c, camera in enumerate(model.cameras):
@@ -98,7 +98,7 @@ def _ways(model: CellModel, way: WayObservations) -> Iterator[_Way]:
 def _joint_by_pictures(
     model: CellModel, camera: int, joint: int, start: FloatArray, way: WayObservations, rows: IntArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Where (f,) a joint stands by each frame, with the others as in ``start`` (f, n), and which are known."""
+    """Position (f,) of a joint shown by each frame, with the others as in ``start`` (f, n), and mask of valid ones."""
     column = {marker: i for i, marker in enumerate(model.marker_ids)}
     index = np.array([column.get(i, -1) for i in way.markers[rows].reshape(-1).tolist()], dtype=np.int64)
     index = index.reshape(len(rows), -1)
@@ -122,7 +122,7 @@ def _joint_by_pictures(
 
 
 def _one_pinhole(model: CellModel, camera: int) -> CellModel:
-    """The model with one of its cameras, without its lens."""
+    """The model with only one of its cameras, without its lens."""
     chosen = model.cameras[camera]
     lens = chosen.lens.copy()
     lens[[0, *range(4, len(lens))]] = 0.0
@@ -130,8 +130,8 @@ def _one_pinhole(model: CellModel, camera: int) -> CellModel:
 
 
 def _aligned(series: list[_Series]) -> tuple[float, float] | None:
-    """Offset [s] by which the joint's course by the pictures lies behind that by its samples, with its deviation; None
-    where too little moves.
+    """Delay [s] of the joint positions shown by the frames relative to the joint samples, with its standard deviation;
+    None if too few frames show motion.
     """
     kept = [np.ones(len(stamps), dtype=bool) for _, _, stamps, _ in series]
     grid = np.arange(-LONGEST_S, LONGEST_S + 0.5 * GRID_S, GRID_S)
@@ -161,7 +161,7 @@ def _aligned(series: list[_Series]) -> tuple[float, float] | None:
 
 
 def _beyond_play(way: _Series, offset: float) -> BoolArray:
-    """Which frames show the joint where it has taken up its play; of a way too short for that, all."""
+    """Mask of the frames in which the joint has taken up its play; all frames if the path is too short for that."""
     times, positions, stamps, _ = way
     travel = np.abs(np.interp(stamps + offset, times, positions) - positions[0])
     beyond: BoolArray = travel > min(PLAY, 0.5 * float(travel.max()))
@@ -169,7 +169,7 @@ def _beyond_play(way: _Series, offset: float) -> BoolArray:
 
 
 def _apart(way: _Series, offset: float, use: BoolArray) -> FloatArray:
-    """By the pictures less by the samples ``offset`` later than stamped, without what is common."""
+    """Joint positions shown by the frames minus samples ``offset`` later than stamped, less their mean."""
     times, positions, stamps, shown = way
     apart = (shown - np.interp(stamps + offset, times, positions))[use]
     return np.asarray(apart - apart.mean()) if len(apart) else apart

@@ -1,9 +1,9 @@
 """Fit of a single joint's generator (its projective twist) and the markers to the joint's own trial, with the cameras
 fixed (thesis 5.52).
 
-A trial may be driven several times over, each with the joints behind the moving one (towards the markers) at other
-fixed positions: every such *distal configuration* shows the markers as a rigid structure of its own, so that four
-dots of a plate become sixteen virtual markers off one plane (5.5, fig. 5.16).
+A trial may be driven several times, each time with the joints behind the moving one (towards the markers) at different
+fixed positions. In each such *distal configuration* the markers form a rigid structure of their own, so that four
+dots of a plate become sixteen virtual markers that are not coplanar (5.5, fig. 5.16).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from stereoservo.kinematics.parameterization import Kind
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 MAX_PAIRS = 150
-"""Pairs of stops that a start looks at: plenty for a start, and its cost stays linear in the stops."""
+"""Most pairs of stops for a start: sufficient, and keeps its cost linear in the stops."""
 DIRECTIONS = np.array(
     [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=np.float64
 )
@@ -42,7 +42,7 @@ def distant_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
     first, second = np.nonzero(apart)
     if len(first) <= MAX_PAIRS:
         return first, second
-    # Multiples of the golden section spread evenly over the list and meet all steps between stops alike.
+    # Multiples of the golden section spread evenly over the list and contain all steps between stops about equally.
     chosen = np.unique((np.arange(MAX_PAIRS) * 0.6180339887498949 % 1.0 * len(first)).astype(np.int64))
     return first[chosen], second[chosen]
 
@@ -58,11 +58,11 @@ def linear_generator(
 ) -> FloatArray | None:
     """Generator (4, 4) by linear least squares over ordered pairs of stops, then the nearest exact one.
 
-    A revolute joint takes a point ``M_k`` of stop k to ``M_k + sin Δ Ĥ M_k + (1 - cos Δ) Ĥ² M_k`` at stop l
-    (4.27), linear in ``Ĥ`` and ``Ĥ²`` taken as unknowns of their own; seen in pixels of stop l, the heights
-    drop out. Any steps will do, equal or not, and the union over pairs spans space for a planar target, too
+    A revolute joint moves a point ``M_k`` of stop k to ``M_k + sin Δ Ĥ M_k + (1 - cos Δ) Ĥ² M_k`` at stop l
+    (4.27), linear in ``Ĥ`` and ``Ĥ²`` as independent unknowns; in pixels of stop l, the heights
+    cancel. Any steps are suitable, equal or not, and the union over pairs spans space for a planar target, too
     (5.4). ``points`` (k, m, 4), ``usable`` (c, k, m), ``pixels`` (c, k, m, 2), ``sigmas`` (c, k, m) [px],
-    ``angles`` (k,). None where the solution is no rotation.
+    ``angles`` (k,). None if the solution is no rotation.
     """
     span = float(np.ptp(angles))
     first, second = distant_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
@@ -82,7 +82,7 @@ def linear_generator(
         blocks.append(np.concatenate([(part[:, None, None, None] * moment).reshape(-1, 16) for part in parts], axis=1))
         rights.append(-np.einsum("kij,kj->ki", rows, source[keep]).ravel())
     system, right = np.concatenate(blocks), np.concatenate(rights)
-    if not right.size:  # no two stops far apart show a marker in common
+    if not right.size:  # no two distant stops have a marker in common
         return None
     # The scale of a point moved by the identity alone is fixed: the system is inhomogeneous, its unit
     # eigenvalue exact.
@@ -91,7 +91,7 @@ def linear_generator(
         matrix = solution[:16].reshape(4, 4)
         return nearest_rotation_generator(matrix) if kind == "revolute" else nearest_translation_generator(matrix)
     except GeometryError:
-        return None  # no rotation in sight: the other start may see one
+        return None  # no rotation; another start may give one
 
 
 def nominal_generator(
@@ -103,9 +103,9 @@ def nominal_generator(
     sigmas: FloatArray,
     angles: FloatArray,
 ) -> FloatArray | None:
-    """Generator (4, 4) as if the canonical frame's nominal cameras were the true ones: a rigid motion.
+    """Generator (4, 4) under the assumption that the canonical frame's nominal cameras are correct: a rigid motion.
 
-    The motion between the two stops, of those far apart, that explains all stops best; arguments as for
+    The motion between two distant stops that explains all stops best; arguments as for
     :func:`linear_generator`. Coarse, but bounded: it needs three markers at two stops, and is None without them.
     """
     upgrade = np.diag([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0, 1.0])
@@ -136,11 +136,11 @@ def nominal_generator(
 
 
 def turned_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray]:
-    """Generators (4, 4) of rotations about ``DIRECTIONS``, as if the cameras were nominal ones: each moves the
+    """Generators (4, 4) of rotations about ``DIRECTIONS``, assuming the nominal cameras: each moves the
     markers' centroid along the trial's chord.
 
-    ``points`` (k, m, 4), ``angles`` (k,). Noise excludes none of them, however little the markers turn.
-    Empty where no two stops far apart have three markers in common.
+    ``points`` (k, m, 4), ``angles`` (k,). Noise excludes none of them, however small the rotation of the markers.
+    Empty if no two distant stops have three markers in common.
     """
     upgrade = np.diag([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0, 1.0])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -209,33 +209,33 @@ def common_points(generator: FloatArray, kind: str, points: FloatArray, angles: 
 
 
 MIN_STOPS = 4
-"""Different positions, at which markers are shown, that a joint's trial needs."""
+"""Least number of distinct positions with visible markers in a joint's trial."""
 MIN_SHOWN = 2
-"""Markers that two cameras must see for a stop to count."""
+"""Number of markers that two cameras must see for a stop to count."""
 MIN_SIGHTINGS = 2
-"""Stops of joint trials at which two cameras must see a marker for it to enter the model."""
+"""Number of stops of joint trials at which two cameras must see a marker for it to enter the model."""
 MIN_MARKERS = 3
-"""Markers that a trial must show."""
+"""Least number of markers seen in a trial."""
 MIN_IMAGE_MOTION = 6.0
-"""Smallest motion of the markers over a trial, between inner quantiles of the stops [sigmas]: noise alone shows 4."""
+"""Least motion of the markers over a trial, between inner quantiles of the stops [sigmas]: noise alone gives 4."""
 LOCKED_RANGE = 2e-3
-"""How far other joints may stray during a trial [rad or m] and still count as locked."""
+"""Largest motion [rad or m] of other joints during a trial with which they count as locked."""
 LOCKED_SHARE = 0.05
-"""The same as a share of the motion in their own trials: of a short stroke two millimetres are much."""
+"""Likewise, as a share of the motion in their own trials: two millimetres are large relative to a short stroke."""
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""
 GOOD_FIT = 1.3
-"""Median residual [sigmas] of a joint's own trial at which no other start is tried."""
+"""Median residual [sigmas] of a joint's own trial below which no other start is tried."""
 ALIKE = 1e-3
-"""Relative difference of residuals up to which two starts have ended in the same place."""
+"""Relative difference of residuals up to which two starts have converged to the same result."""
 FULL, SHORT = 80, 20
-"""Evaluations of a start, and of each of many."""
+"""Evaluations of the cost for a single start, and for each of many."""
 WRONG_SQUARE = 100.0
-"""Squared residual over that of the typical one, or over sigmas², at which the cost of a pixel saturates."""
+"""Squared residual, relative to the typical one or to sigmas², at which the cost of a pixel saturates."""
 MISFIT = 20.0
 """Median residual [sigmas] of a joint's own trial above which its stated kind is rejected."""
 MISFIT_SHARE = 0.02
-"""The same as a share of the images' motion, where readings may have errors."""
+"""Likewise, as a share of the images' motion, if readings may have errors."""
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class JointTrial:
     """A joint's own trial: ``stops`` (k,), the distal configuration ``groups`` (k,) of each, ``base`` (n,) the
     configuration of group 0 with the joint in the middle.
 
-    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base, NaN for markers that the trial does not show
+    ``generator`` (4, 4) at the base; ``points`` (m, 4) at the base, NaN for markers that are not seen in the trial
     there.
     """
 
@@ -269,8 +269,8 @@ def trial_stops(
     """Stops (k,) at which only ``joint`` moves, the distal configuration of each (k,), and the base (n,).
 
     Joints before ``joint`` are as at the base; joints behind it are in one of the configurations in which the
-    trial was driven, counted from 0, the base's own. Stops of other trials that happen to be there belong to it,
-    too. ``inexact``: see `locked_ranges`. Raises CalibrationError.
+    trial was driven, counted from 0, the base's own. Stops of other trials in such a configuration are included.
+    ``inexact``: see `locked_ranges`. Raises CalibrationError.
     """
     name, unit = trials.joint_names[joint], _unit(trials, joint)
     own = trials.trials == joint
@@ -317,8 +317,8 @@ def trial_stops(
 
 
 def locked_ranges(trials: TrialData, *, inexact: bool = False) -> FloatArray:
-    """How far each joint (n,) may stray from where it stands in others' trials [rad or m]; ``inexact``: of arms that
-    give way under load.
+    """Largest deviation of each joint (n,) from its position in other joints' trials [rad or m]; ``inexact``: for arms
+    that are compliant under load.
     """
     locked = np.full(len(trials.joint_names), LOCKED_RANGE)
     for joint in np.unique(trials.trials[trials.trials >= 0]):
@@ -333,14 +333,14 @@ def _distal_groups(
 ) -> tuple[FloatArray, IntArray]:
     """The base (n,) of the trial ``own`` (s,), and the distal configuration (s,) of each stop, -1 off the trial.
 
-    A configuration counts with two of the trial's stops: one shows no motion. ``locked`` (n,): see `locked_ranges`.
+    A configuration needs two of the trial's stops: one shows no motion. ``locked`` (n,): see `locked_ranges`.
     """
     base = np.median(positions[own], axis=0)
     still = np.asarray((np.abs(positions[:, :joint] - base[:joint]) <= locked[:joint]).all(axis=1))
     distal = positions[:, joint + 1 :]
     groups = np.full(len(positions), -1)
     count, left = 0, np.asarray(own & still)
-    # The configuration nearest to the middle comes first, and is the base's.
+    # The configuration nearest to the mean comes first, and is the base's.
     order = np.argsort(np.abs(distal - base[joint + 1 :]).sum(axis=1), kind="stable")
     for k in order[left[order]]:
         if not left[k]:
@@ -366,10 +366,10 @@ def fit_single_joint(
 ) -> JointTrial:
     """Generator of ``joint`` and the markers from its own trial, cameras (c, 3, 4) fixed (5.52).
 
-    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). Starts one after the other until one fits: linear
-    over all pairs of stops; as if the cameras were nominal ones; axes all around. Then least squares with free
-    markers, each of a distal configuration its own. ``inexact``: readings may have errors that are small beside the
-    motion. Raises CalibrationError naming the joint.
+    ``points`` (s, m, 4) triangulated, ``usable`` (c, s, m). Starts are tried until one fits: linear
+    over all pairs of stops; assuming the nominal cameras; axes in all directions. Then least squares with free
+    markers, separate ones for each distal configuration. ``inexact``: readings may have errors that are small relative
+    to the motion. Raises CalibrationError naming the joint.
     """
     name, kind = trials.joint_names[joint], trials.joint_kinds[joint]
     stops, groups, base = trial_stops(trials, points, joint, inexact=inexact)
@@ -413,7 +413,7 @@ def fit_single_joint(
 
 
 def _common_markers(observations: VirtualObservations, angles: FloatArray) -> int:
-    """Largest number of virtual markers that two stops half of the trial's range apart have in common."""
+    """Largest number of virtual markers common to two stops that are half of the trial's range apart."""
     shown = finite_rows(observations.points).astype(np.int64)
     far_apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
     return int((shown @ shown.T)[far_apart].max(initial=0))
@@ -421,7 +421,7 @@ def _common_markers(observations: VirtualObservations, angles: FloatArray) -> in
 
 @dataclass(frozen=True)
 class VirtualObservations:
-    """Observations of the virtual markers in a joint's trial, those of group g at ``g m`` to ``g m + m - 1``.
+    """Observations of the virtual markers in a joint's trial, those of group g at indices ``g m`` to ``g m + m - 1``.
 
     ``points`` (k, v, 4), NaN where not usable; ``usable`` (c, k, v); ``pixels`` (c, k, v, 2) [px]; ``sigmas``
     (c, k, v) [px].
@@ -458,8 +458,8 @@ def virtual_markers(
 def own_trials(
     trials: TrialData, points: FloatArray, usable: BoolArray
 ) -> Iterator[tuple[int, VirtualObservations, FloatArray]]:
-    """Each joint that has stops enough in a trial of its own, what they show, and its positions (k,) there from its
-    middle one.
+    """Each joint that has enough stops in its own trial, its observations, and its positions (k,) there relative to
+    its middle one.
     """
     for joint in range(len(trials.joint_names)):
         try:
@@ -478,8 +478,8 @@ def best_single_joint(
     *,
     thorough: bool = False,
 ) -> tuple[RigModel | None, float]:
-    """Single joint of ``kind`` that fits the ``sights`` at ``angles`` (k,) best, with its median residual [sigmas];
-    start values are tried until one fits. ``thorough``: unless one does, or two converge to the same result,
+    """Single joint of ``kind`` that best fits the observations ``sights`` at ``angles`` (k,), and its median residual
+    [sigmas]; start values are tried until one fits. ``thorough``: unless one fits, or two converge to the same result,
     rotations about axes in all directions are tried, too.
     """
     camera, stop, marker = np.nonzero(observations.usable)
@@ -532,7 +532,7 @@ class _StartResult:
 
 
 def _is_certain(found: list[_StartResult]) -> bool:
-    """Whether the best result fits, or was reached from two start values."""
+    """Whether the best result fits, or two start values converged to it."""
     if not found:
         return False
     best = min(found, key=lambda one: one.score)
@@ -548,7 +548,7 @@ def _solve_from(
     data: Measurements,
     evaluations: int,
 ) -> list[_StartResult]:
-    """Result from start value ``generator`` (4, 4) after at most ``evaluations``; empty where the fit fails."""
+    """Result from start value ``generator`` (4, 4) after at most ``evaluations``; empty if the fit fails."""
     structure = common_points(generator, kind, observations.points, data.offsets[:, 0])
     structure[~observations.usable.any(axis=(0, 1))] = [0.0, 0.0, 1.0, 1.0]
     try:
@@ -561,11 +561,11 @@ def _solve_from(
             max_evaluations=evaluations,
         )
     except np.linalg.LinAlgError:
-        return []  # a point of this start lies in a focal plane; the next one may do
+        return []  # a point of this start lies in a focal plane; the next start may succeed
     # The median of a chi-square with two degrees of freedom is ln 4.
     squares = (fit.residuals.reshape(-1, 2) ** 2).sum(axis=1)
     typical = float(np.sqrt(np.median(squares) / np.log(4.0)))
-    # A wrong axis may fit the half of the markers that hardly move.
+    # A wrong axis may fit the half of the markers that move least.
     score = float(np.sqrt(np.minimum(squares, WRONG_SQUARE * max(1.0, typical**2)).mean() / 2.0))
     if not np.isfinite(score):
         return []
@@ -573,7 +573,7 @@ def _solve_from(
 
 
 def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
-    """Raise CalibrationError for a joint whose trial does not change the images by more than their noise does."""
+    """Raise CalibrationError for a joint whose trial changes the images by no more than their noise does."""
     name, unit = trials.joint_names[joint], _unit(trials, joint)
     motion, noise = _image_motion(trials, stops, joint)
     if motion < MIN_IMAGE_MOTION * noise:
@@ -591,7 +591,7 @@ def _check_effect(trials: TrialData, stops: IntArray, joint: int) -> None:
 
 
 def _image_motion(trials: TrialData, stops: IntArray, joint: int) -> tuple[float, float]:
-    """Motion of the markers in the images over a joint's ``stops`` (k,) [sigmas], and noise of the images, 1 where it
+    """Motion of the markers in the images over a joint's ``stops`` (k,) [sigmas], and noise of the images, 1 if it
     is as stated.
     """
     stops = stops[np.argsort(trials.positions[stops, joint], kind="stable")]
@@ -603,7 +603,7 @@ def _image_motion(trials: TrialData, stops: IntArray, joint: int) -> tuple[float
         pixels = trials.pixels[c, seen, i] / np.median(trials.sigmas[c, seen, i])
         motions.append(float(np.linalg.norm(np.ptp(np.quantile(pixels, [0.1, 0.9], axis=0), axis=0))))
         bends.append(np.diff(pixels, n=2, axis=0).ravel() / np.sqrt(6.0))
-    # Where the detector understates its noise, second differences show it; a motion's own are far below its range.
+    # If the detector understates its noise, second differences show it; a motion's own are far below its range.
     scatter = np.abs(np.concatenate(bends))
     noise = max(1.0, float(np.median(scatter)) / NORMAL_MEDIAN) if len(scatter) else 1.0
     return (float(np.quantile(motions, 0.8)) if motions else 0.0), noise
@@ -624,7 +624,7 @@ def link_joints(trials: TrialData, cameras: FloatArray, separate: list[JointTria
     for j, trial in enumerate(separate):
         moved = _chain(kinds[:j], generators[:j], trial.base[:j] - zero[:j])
         generators[j] = np.linalg.inv(moved) @ trial.generator @ moved
-    # Every trial has seen the markers in its own base configuration; take them all to the zero.
+    # Every trial gives the markers in its own base configuration; move them all to the zero.
     clouds = np.array(
         [trial.points @ np.linalg.inv(_chain(kinds, generators, trial.base - zero)).T for trial in separate]
     )

@@ -26,17 +26,17 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 TAIL = 1e-6
-"""Probability that the views of a static point are taken for those of two points."""
+"""Probability that the views of one static point are classified as views of two points."""
 LEAST_HEIGHT = 1e-3
-"""Height of a point, relative to its size, below which it is as good as at infinity."""
+"""Height of a point, relative to its size, below which it counts as at infinity."""
 OPEN = 1e7
-"""Condition of the rows of a point from which on it is not determined."""
+"""Condition number of a point's rows above which it is undetermined."""
 SETTLED = 1e-3
 """Length of a step [standard deviations] at which a point has converged."""
 
 
 def with_static_points(model: CellModel, static: StaticObservations | None) -> tuple[CellModel, tuple[str, ...]]:
-    """The model with its static points, and notes on those that cannot be reconstructed."""
+    """The model with its static points, and notes on those that could not be reconstructed."""
     if static is None:
         return model, ()
     if model.mount == "eye_in_hand":
@@ -80,7 +80,7 @@ def _scene_point(model: CellModel, pixels: FloatArray, sigmas: FloatArray) -> tu
     if not abs(height) > LEAST_HEIGHT * float(np.linalg.norm(point)) * float(np.linalg.norm(model.plane_at_infinity)):
         return "it is as good as at infinity"
     point = point / height
-    # Three directions that keep the height.
+    # Three directions that preserve the height.
     chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
     covariance = _covariance(model, seen, matrices, point, pixels, sigmas)
     white: FloatArray = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -136,7 +136,7 @@ def _covariance(
     pixels: FloatArray,
     sigmas: FloatArray,
 ) -> FloatArray:
-    """Covariance (2 c, 2 c) of the pixels of a point, with that of the cameras that see it."""
+    """Covariance (2 c, 2 c) of the pixels of a point, including that of the cameras that see it."""
     covariance = np.diag(np.repeat(sigmas[seen] ** 2, 2))
     if model.covariance is None:
         return covariance
@@ -157,23 +157,23 @@ def _covariance(
 
 
 NOISE = 5.0
-"""A static marker strays by no more than so many deviations of its noise ..."""
+"""Most standard deviations by which a static marker deviates from its median ..."""
 LEAST_PX = 0.3
-"""... or than this [px], which a shaking table makes ..."""
+"""... or largest deviation [px], as from a shaking table ..."""
 SHARE = 0.1
-"""... and by no more than this share of the displacement of the marker that moves most."""
+"""... and largest share of the displacement of the marker that moves most."""
 
 STRAYING = 0.25
-"""Share of a camera's stops at which a static marker may be off, for example behind the arm."""
+"""Share of a camera's stops at which a static marker may be displaced, for example behind the arm."""
 
 STOPS = 4
-"""Stops at which one camera must have seen a marker to call it static."""
+"""Least number of stops at which one camera must see a marker to classify it as static."""
 
 
 def static_markers(pixels: FloatArray, sigmas: FloatArray) -> npt.NDArray[np.bool_]:
     """Mask (m,) of the markers that are static over all stops. ``pixels`` (c, s, m, 2), NaN where missing.
 
-    ``sigmas`` (c, s, m) [px]. All false where nothing moves.
+    ``sigmas`` (c, s, m) [px]. All false if nothing moves.
     """
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     count = seen.sum(axis=1)
@@ -193,13 +193,13 @@ def static_observations(
     """Mean observations of markers ``ids`` (k,) that are stated to be static, and the ids of those that moved.
 
     ``pixels`` (c, s, k, 2) of all stops, NaN where missing, and ``sigmas`` (c, s, k) [px]. In each camera it is the
-    median over the stops, so that a stop at which the arm covers half of a marker does no harm; its sigma is that of
-    one stop, since what is systematic does not average. A marker that strays from its median at more than a quarter
-    of the stops of a camera has moved, and is left out.
+    median over the stops, so that a stop at which the arm covers half of a marker has no effect; its sigma is that of
+    one stop, since systematic errors do not average out. A marker that deviates from its median at more than a quarter
+    of a camera's stops has moved, and is left out.
     """
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of a marker that a camera never sees: NaN it stays
+        warnings.simplefilter("ignore", RuntimeWarning)  # a marker that a camera never sees stays NaN
         mean = np.nanmedian(pixels, axis=1)
         sigma = np.nanmedian(np.where(seen, sigmas, np.nan), axis=1)
     away = np.linalg.norm(pixels - mean[:, None], axis=-1)

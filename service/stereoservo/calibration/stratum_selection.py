@@ -23,16 +23,16 @@ from stereoservo.kinematics.parameterization import LensModel
 from stereoservo.numerics.arrays import FloatArray
 
 STILL = 2e-3
-"""How far other joints may stray [rad or m] at the stops of a joint's own trial."""
+"""Largest motion of other joints [rad or m] at the stops of a joint's own trial."""
 GAIN = 8.0
-"""Chi-square by which another axis must explain a joint's trial better to be tried in the whole bundle."""
+"""Least gain in chi-square of a joint's trial from a different axis for that axis to be tried in the whole bundle."""
 
 
 def with_other_axes(solution: Solution) -> list[RigModel]:
-    """Metric rigs to start from again: revolute joints get the axes that fit their own trials better, most joints
-    first.
+    """Metric rigs for a new start: revolute joints get the axes that fit their own trials better, the rig with the most
+    changed joints first.
 
-    Empty where no joint has a better one.
+    Empty if no joint has a better axis.
     """
     better: dict[int, FloatArray] = {}
     for joint, kind in enumerate(solution.rig.kinds):
@@ -51,9 +51,7 @@ def with_other_axes(solution: Solution) -> list[RigModel]:
 
 
 def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
-    """Generator (4, 4) that fits a joint's own trial better, with cameras and markers fixed; None where there is
-    none.
-    """
+    """Generator (4, 4) that fits a joint's own trial better, with cameras and markers fixed; None if there is none."""
     rig, data = solution.rig, solution.data
     used = np.unique(data.stop)
     reported = data.corrected(None).offsets
@@ -88,7 +86,7 @@ def _better_generator(solution: Solution, joint: int) -> FloatArray | None:
         try:
             fit = _solved(start, own)
         except np.linalg.LinAlgError:
-            continue  # the axis takes a marker into a focal plane
+            continue  # the axis moves a marker into a focal plane
         if best is None or fit.cost < best.cost:
             best = fit
     return best.rig.generators[0] if best is not None and best.cost < now.cost - GAIN else None
@@ -110,13 +108,13 @@ class FitOptions:
     """Thresholds of the fit.
 
     ``outlier_chi2``: a pixel (2 degrees of freedom) farther than this from the model is left out; 25 loses 4
-    in a million good ones. ``max_outliers``, ``max_trial_outliers``: share of pixels that may be left out of
-    all, and of one joint's trial. ``max_sigma_factor``: how many times the stated sigmas the residuals may be
-    before the fit is refused; detectors misjudge their noise, a wrong model misses by far more.
-    ``metric_loss``: how much worse, in variance, the metric bundle may fit than the projective one where it
-    is not certain that the metric is identifiable. ``max_spread``: largest relative standard deviation of
-    focal lengths (metric) and depths (metric, affine) with which a stratum is believed. ``lens``: what of the
-    lenses is free; ``auto`` lets the data decide between nothing, the radial parameter with its centre, and more terms.
+    in a million good ones. ``max_outliers``, ``max_trial_outliers``: largest share of pixels left out of
+    all, and of one joint's trial. ``max_sigma_factor``: largest ratio of the residuals to the stated sigmas
+    before the fit is refused; detectors misjudge their noise, a wrong model exceeds it by far more.
+    ``metric_loss``: how much worse, in variance, the metric bundle may fit than the projective one if it
+    is not certain that the metric stratum is identifiable. ``max_spread``: largest relative standard deviation of
+    focal lengths (metric) and depths (metric, affine) with which a stratum is accepted. ``lens``: free lens
+    parameters; ``auto`` lets the data decide between none, the radial parameter with its centre, and more terms.
     """
 
     outlier_chi2: float = 25.0
@@ -131,16 +129,16 @@ class FitOptions:
 DEFAULTS = FitOptions()
 
 NOMINAL_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
-"""Infinity of the canonical frame's nominal cameras."""
+"""Plane at infinity of the canonical frame's nominal cameras."""
 FINISHED, FINISH_EVALUATIONS = 4, 400
-"""How many of the bundles that have not converged are solved to their end, and how long."""
+"""Most unconverged bundles that are solved to convergence, and the limit of evaluations of each."""
 MOST_TIMES = 5.0
-"""How many times the deviation wanted one may be for its first-order value to tell how much more must be measured."""
+"""Largest ratio of a deviation to the required one at which its first-order value predicts the measurements needed."""
 LOOSE_SPREAD = 0.75
-"""Relative deviation of depths and focal lengths beyond which linear statistics are meaningless."""
+"""Relative deviation of depths and focal lengths beyond which first-order statistics are meaningless."""
 PLAUSIBLE_TAIL, NESTED_TAIL = 1e-3, 1e-6
-"""Probabilities with which a true constraint costs so much that other starts are tried, and that it is taken for a
-wrong one."""
+"""Probabilities with which a true constraint raises chi-square so much that other starts are tried, and that it is
+rejected."""
 
 
 @dataclass
@@ -148,10 +146,10 @@ class StratumSelector:
     """Accepts or rejects bundles of higher strata against the ``projective`` one; keeps the rejected ones by
     reason.
 
-    A bundle passes at once when its constraints cost no more chi-square than they should. One that costs more
-    is kept as a reserve: perhaps another start finds a better minimum, perhaps the constraints hold only
-    nearly. ``bent``: a richer lens model would have satisfied them. ``tolerable``: costly
-    ones, taken if no start finds a better; ``unfinished``: bundles that may still converge; ``loose``: good fits
+    A bundle is accepted immediately if its constraints raise chi-square no more than expected. Otherwise it is
+    kept in ``reserve``: another start may find a better minimum, or the constraints may hold only
+    approximately. ``bent``: a richer lens model would have satisfied them. ``tolerable``: bundles with a significant
+    rise, used if no start finds a better one; ``unfinished``: bundles that may still converge; ``loose``: good fits
     that hardly determine the stratum.
     """
 
@@ -166,11 +164,11 @@ class StratumSelector:
     bent: bool = False
 
     def passes(self, solution: Solution, plane: FloatArray) -> bool:
-        """Whether ``solution`` is acceptable. Sets ``hopeless`` where another start will not help."""
+        """Whether ``solution`` is acceptable. Sets ``hopeless`` if another start will not help."""
         problem = self._unidentified(solution)
         if problem:
             self._note(solution, problem)
-            # A good fit that leaves directions wide open, converged along them or not: so will any other.
+            # A good fit with undetermined directions, converged along them or not: any other will have them, too.
             open_ones = solution.determined.rank < solution.charts.size
             wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_SPREAD
             done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
@@ -188,13 +186,13 @@ class StratumSelector:
             self.tolerable.append((solution, plane))
             return False
         self.bent = self.bent or lens_wanted(solution) != solution.lenses
-        # Two starts at one minimum: the constraints hold only nearly, there is nothing better to find.
+        # Two starts at one minimum: the constraints hold only approximately, and there is no better minimum.
         self.hopeless = any(abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve)
         self.reserve.append((solution, plane))
         return False
 
     def finished(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
-        """First of the unconverged bundles that is acceptable once it is solved to convergence."""
+        """First of the unconverged bundles that is acceptable after it is solved to convergence."""
         candidates, self.unfinished = sorted(self.unfinished, key=lambda entry: entry[0].cost)[:FINISHED], []
         for solution, plane in candidates:
             if self.hopeless:
@@ -210,7 +208,7 @@ class StratumSelector:
         return min(tolerable, key=lambda entry: entry[0].cost) if tolerable else None
 
     def turned(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
-        """Best bundle so far, with other axes for single joints, if one is acceptable then."""
+        """Bundle from the best one so far, with different axes for single joints, if one is then acceptable."""
         reached = [entry for entry in (*self.reserve, *self.loose, *self.tolerable) if entry[0].converged]
         if not reached:
             return None
@@ -221,13 +219,13 @@ class StratumSelector:
             try:
                 again = solve(rig, data, "metric", lenses=solution.lenses, max_evaluations=FINISH_EVALUATIONS)
             except np.linalg.LinAlgError:
-                continue  # the new axis takes a marker into a focal plane
+                continue  # the new axis moves a marker into a focal plane
             if self.passes(again, plane):
                 return again, plane
         return None
 
     def last_resort(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
-        """A good fit that hardly determines its stratum, where the projective bundle has undetermined directions.
+        """A good fit that hardly determines its stratum, if the projective bundle has undetermined directions.
 
         Its covariance is large; predictions are as good as the trials allow.
         """
@@ -248,11 +246,10 @@ class StratumSelector:
         return None
 
     def second_best(self, certain: bool) -> tuple[Solution, FloatArray] | None:
-        """Best of the rejected but tolerable bundles, with a note of its extra residuals; None where none may be
-        taken.
+        """Best of the rejected but tolerable bundles, with a note of its extra residuals; None if none may be used.
 
-        ``certain``: the data identify the stratum beyond doubt, so that what does not fit it is wrong, not
-        the stratum.
+        ``certain``: the data identify the stratum beyond doubt, so that a misfit is due to errors of the data, not
+        to the stratum.
         """
         if not self.reserve:
             return None
@@ -268,8 +265,8 @@ class StratumSelector:
     def _worse(self, solution: Solution, tail: float, projective: Solution | None = None) -> bool:
         """Whether the constraints raise chi-square by more than true ones do with probability ``tail``.
 
-        Variances of the joints' errors are known with few freedoms, the projective bundle's too: what the joints of its
-        own trial may do. Fisher's distribution has them.
+        With joint noise by Fisher's distribution: the variances of the joints' errors, and the projective bundle's, are
+        known with few degrees of freedom, those of a joint's own trial.
         """
         beside = projective or self.projective
         fewer = max(1, beside.charts.size - solution.charts.size)
@@ -303,7 +300,7 @@ class StratumSelector:
 
 
 def _as_many(ratio: float) -> str:
-    """How many more measurements make a deviation smaller by ``ratio``, in words."""
+    """Text: how many more measurements reduce a deviation by ``ratio``."""
     return f"{ceil(ratio**2)} times as many" if ratio <= MOST_TIMES else "many more"
 
 
@@ -342,12 +339,12 @@ class StratumSelection(NamedTuple):
 def select_stratum(solution: Solution, data: Measurements, options: FitOptions) -> StratumSelection:
     """Bundle of the highest stratum that the data identify.
 
-    Metric and affine bundles start from the linear estimates and, where those fail, from nominal cameras;
-    whether they are believed is judged on the constrained bundle itself, which is far better conditioned than
-    the projective.
+    Metric and affine bundles start from the linear estimates and, if those fail, from nominal cameras;
+    acceptance is decided on the constrained bundle itself, which is far better conditioned than
+    the projective one.
     """
     noise = generator_noise(solution)
-    # Where joints have errors, those of the projective bundle lead most of the way to a start's minimum, for a tenth of
+    # If joints have errors, those of the projective bundle reach most of the way to a start's minimum, in a tenth of
     # the time.
     exact = data.with_errors_removed()
     selector = StratumSelector(solution, options)
@@ -362,7 +359,7 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
             "views_degenerate", "every candidate for the plane at infinity passes between the markers"
         )
     for start, plane in _metric_starts(solution.rig, finite, noise, np.ptp(data.offsets, axis=0)):
-        # Cameras that are not right yet must not be bent to a chain that is not: settle the chain first.
+        # Inaccurate cameras must not be fitted to an inaccurate chain: let the chain converge first.
         try:
             chain = solve(
                 start,
@@ -427,9 +424,7 @@ def _several_directions(rig: RigModel, plane: FloatArray, noise: FloatArray) -> 
 def _metric_starts(
     rig: RigModel, planes: list[FloatArray], noise: FloatArray, spans: FloatArray
 ) -> Iterator[tuple[RigModel, FloatArray]]:
-    """Metric rigs to start from and their planes: with the linear estimate of the intrinsics, then nominal
-    ones.
-    """
+    """Initial metric rigs and their planes: with the linear estimate of the intrinsics, then nominal ones."""
     revolute = np.array([kind == "revolute" for kind in rig.kinds])
     if int(revolute.sum()) < 2:
         return
@@ -438,7 +433,7 @@ def _metric_starts(
             affine = initial_reconstruction.affine_rig(rig, plane)
             linear, _ = initial_reconstruction.intrinsics_linear(affine.generators, revolute, noise)
         except GeometryError:
-            linear = None  # this plane is no start for the linear estimate; nominal cameras follow
+            linear = None  # no linear estimate from this plane; nominal cameras follow
         if linear is not None:
             yield initial_reconstruction.metric_rig(rig, plane, linear, spans), plane
         for focal in initial_reconstruction.NOMINAL_FOCALS:

@@ -27,19 +27,18 @@ STATIC = "static_"
 WAY = "way_"
 GENERATORS = "generators"
 MAX_POSITION = 1e6
-"""Largest joint position [rad or m] that is taken for one."""
+"""Largest plausible joint position [rad or m]."""
 MAX_SIGMA, MAX_PIXEL = 0.1, 4.0
-"""Largest sigma and largest pixel coordinate that are taken for such [image sizes]: a wrong detection is nearer."""
+"""Largest plausible sigma and pixel coordinate [image sizes]: a wrong detection has smaller ones."""
 MAX_OUTSIDE = 0.5
-"""Share of a camera's pixels outside its image above which the image size is taken for a wrong one."""
+"""Share of a camera's pixels outside its image above which the stated image size counts as wrong."""
 
 
 class CalibrationError(Exception):
-    """A calibration gives no model; the text holds the reason, the value and the valid range.
+    """A calibration gives no model; the text states the reason, the value and the valid range.
 
     Attributes:
-        code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``,
-            ``too_few_stops``,
+        code: machine-readable cause: ``bad_data``, ``too_few_cameras``, ``too_few_markers``, ``too_few_stops``,
             ``joint_did_not_move``, ``joint_without_effect``, ``joint_kind``, ``views_degenerate``,
             ``not_identifiable``, ``no_convergence``, ``too_many_outliers``, ``residual_above_floor``, ``mixed_mounts``;
             of the diagnosis ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``, ``joint_order``,
@@ -58,14 +57,14 @@ class CalibrationError(Exception):
 
 
 def finite_rows(array: FloatArray) -> npt.NDArray[np.bool_]:
-    """Which rows (...) of an array (..., k) are finite in all k entries."""
+    """Mask (...) of the rows of an array (..., k) that are finite in all k entries."""
     return np.asarray(np.isfinite(array).all(axis=-1), dtype=bool)
 
 
 class TrialCamera(msgspec.Struct, frozen=True):
     """A camera of the trials and its image size [px].
 
-    ``mount``: ``eye_to_hand`` where it is static and the arm carries the markers, ``eye_in_hand`` the reverse.
+    ``mount``: ``eye_to_hand`` if it is static and the arm carries the markers, ``eye_in_hand`` for the reverse.
     """
 
     name: str
@@ -75,7 +74,7 @@ class TrialCamera(msgspec.Struct, frozen=True):
 
 
 class StaticObservations(msgspec.Struct, frozen=True, eq=False):
-    """Observations of static markers, over all stops: ``ids`` (k,), raw ``pixels`` (c, k, 2) [px], NaN where a
+    """Observations of static markers, over all stops: ``ids`` (k,), raw ``pixels`` (c, k, 2) [px], NaN if a
     camera does not see one, and ``sigmas`` (c, k) [px].
     """
 
@@ -85,10 +84,10 @@ class StaticObservations(msgspec.Struct, frozen=True, eq=False):
 
 
 class WayObservations(msgspec.Struct, frozen=True, eq=False):
-    """Frames and joint samples of the ways between stops.
+    """Frames and joint samples on the paths between stops.
 
-    Frames: ``ways`` (f,) number of the way, ``cameras`` (f,) index, ``times`` (f,) [s] as stamped, ``markers`` (f, k)
-    ids or -1, raw ``pixels`` (f, k, 2), NaN where there is none. Joint samples: ``joint_ways`` (j,), ``joint_times``
+    Frames: ``ways`` (f,) number of the path, ``cameras`` (f,) index, ``times`` (f,) [s] as stamped, ``markers`` (f, k)
+    ids or -1, raw ``pixels`` (f, k, 2), NaN if there is none. Joint samples: ``joint_ways`` (j,), ``joint_times``
     (j,) [s], ``positions`` (j, n).
     """
 
@@ -103,15 +102,15 @@ class WayObservations(msgspec.Struct, frozen=True, eq=False):
 
 
 class TrialData(msgspec.Struct, frozen=True, eq=False):
-    """Stops of trial motions and what the cameras saw there.
+    """Stops of trial motions and the camera observations at them.
 
     Joints are in base-first order. ``positions`` (s, n) [rad or m]; ``trials`` (s,): the joint that moved alone, -1
     for free poses; a base stop may belong to any. ``pixels`` (c, s, m, 2) [px], NaN where a marker was not
-    seen; ``sigmas`` (c, s, m) [px], standard deviation an axis of each pixel. The first camera is the left
+    seen; ``sigmas`` (c, s, m) [px], standard deviation per axis of each pixel. The first camera is the left
     one. ``images``: how many images were averaged into the pixels (for the record). ``loads``: the loads
-    that the drives reported meanwhile, if any; copied into the model. ``static``: markers that do not move. ``way``:
-    what was seen between the stops. ``generators`` (n, 4, 4): Euclidean twists of the joints at positions 0, in a frame
-    that stands [m], where they are known (`free_arm`); then any motion will do.
+    that the drives reported during the trials, if any; copied into the model. ``static``: markers that do not move.
+    ``way``: observations between the stops. ``generators`` (n, 4, 4): Euclidean twists of the joints at positions 0,
+    in a static frame [m], if known (`free_arm`); then any motion is permitted.
     """
 
     joint_names: tuple[str, ...]
@@ -130,7 +129,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
-        """(c, s, m): which pixels were measured."""
+        """Mask (c, s, m) of the measured pixels."""
         return finite_rows(self.pixels)
 
 
@@ -144,9 +143,7 @@ class _Header(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def check_trials(trials: TrialData) -> None:
-    """Check shapes and numbers. Raises CalibrationError (``bad_data``, ``too_few_cameras``) with what does
-    not fit.
-    """
+    """Check shapes and numbers. Raises CalibrationError (``bad_data``, ``too_few_cameras``) naming the invalid one."""
     n, m, c = len(trials.joint_names), len(trials.marker_ids), len(trials.cameras)
     s = trials.positions.shape[0] if trials.positions.ndim else 0
     if n < 1 or len(trials.joint_kinds) != n:
@@ -220,7 +217,7 @@ def check_trials(trials: TrialData) -> None:
 
 
 def _check_counts(trials: TrialData) -> None:
-    """A cell has limits of size."""
+    """Check the counts against the size limits of a cell."""
     static = 0 if trials.static is None else len(trials.static.ids)
     for what, count, most in (
         ("joint", len(trials.joint_names), MAX_JOINTS),
@@ -370,7 +367,7 @@ def encode_trials(trials: TrialData) -> bytes:
 
 
 def _load_arrays(loads: JointLoads | None) -> dict[str, FloatArray]:
-    """Joint loads as arrays of their own, which programs that do not know them ignore."""
+    """Joint loads as separate arrays, which programs without support for them ignore."""
     if loads is None:
         return {}
     given = {field: getattr(loads, field) for field in JointLoads.__struct_fields__}
@@ -422,7 +419,7 @@ def _loads(arrays: dict[str, npt.NDArray[Any]]) -> JointLoads | None:
 
 
 def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
-    """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``), whatever the bytes."""
+    """Inverse of :func:`encode_trials`. Raises CalibrationError (``bad_data``) for any invalid bytes."""
     with decoding(lambda cause: _bad(path, f"is not a file of trial data: {cause}"), (CalibrationError,)):
         arrays = read_archive(data, MAX_TRIALS_BYTES)
         missing = [name for name in ("header", "positions", "trials", "pixels", "sigmas") if name not in arrays]

@@ -1,15 +1,15 @@
 """Variance components of a calibration by restricted maximum likelihood: pixels, and for each joint a random error of
-every stop, a repeatable one of every reading and one that changes slowly with the posture (Searle, Casella, McCulloch,
+each stop, a repeatable one of each reading and one that changes slowly with the posture (Searle, Casella, McCulloch,
 Variance Components, 2006, ch. 6).
 
-A repeatable error is the same whenever the joint reads the same: gear ripple, play driven from one side. One by posture
-is what gives way under load (sag) or turns with other joints (coupling): a Gaussian process over the positions of all
-joints. The parameters of the model enter the likelihood linearised, so that what they can imitate is theirs.
+A repeatable error is the same at equal readings of the joint: gear ripple, play driven from one side. The error by
+posture is due to compliance under load (sag) or to other joints (coupling): a Gaussian process over the positions of
+all joints. The model's parameters enter the likelihood linearised; effects that they can imitate count as theirs.
 
-Score tests of the components at a bundle with exact readings tell errors that are likely although the likelihood does
+Score tests of the components at a bundle with exact readings detect errors that are likely although the likelihood does
 not prove them (Lin, Variance component testing in generalised linear models, Biometrika 84, 1997): a score is a
-quadratic form of the residuals, to which exact readings give the distribution of a weighted sum of chi-squares, whose
-tail is taken from its saddlepoint (Kuonen, Biometrika 86, 1999).
+quadratic form of the residuals, which under exact readings is distributed as a weighted sum of chi-squares, whose
+tail is computed by the saddlepoint approximation (Kuonen, Biometrika 86, 1999).
 """
 
 from __future__ import annotations
@@ -32,28 +32,29 @@ from stereoservo.kinematics.joint_accuracy import JointAccuracy, posture_correla
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 FALSE_ALARM = 1e-4
-"""Probability with which joints without errors are said to have some."""
+"""Probability of reporting errors of joints that have none."""
 SAME_READING, SAME_SHARE = 2e-3, 0.05
-"""Readings nearer than this [rad or m], and than this share of the joint's range, are one place of its gear."""
+"""Readings nearer than this [rad or m], and than this share of the joint's range, have the same repeatable error."""
 LEAST_FEATURE = 1e-4
-"""Share of the largest variance of a course over postures below which a course is left out."""
+"""Variance of a posture feature, relative to the largest, below which it is left out."""
 MOST_STOPS = 120
-"""Stops, evenly spread, from which the components are estimated: more would know them better than they hold."""
+"""Most stops, evenly spread, from which the components are estimated: with more, the stated accuracy would exceed that
+of the error model itself."""
 MOST_SHARED = 120
-"""Readings met at several stops whose errors are columns of the bundle; beyond, they count as each stop's own."""
+"""Most repeated readings whose errors are columns of the bundle; those of further ones count as each stop's own."""
 ROUNDS = 40
-"""Rounds of Fisher scoring at most."""
+"""Most rounds of Fisher scoring."""
 SETTLED = 1e-3
 """Gain in log-likelihood below which the components have converged."""
 FIXED = 0.01
-"""Length that a unit direction of the parameters has in the rows that no joint moves, from which they fix it."""
+"""Length of a unit parameter direction, in the rows without joint errors, from which these determine the direction."""
 RANK_TOLERANCE = 1e-9
-"""Singular value of the unit columns below which a direction of the parameters is open."""
+"""Singular value of the unit columns below which a direction of the parameters is undetermined."""
 
 
 class Readings(NamedTuple):
-    """What joints report at s stops: ``places`` (s, n), the number of each reading, counted from 0; ``features`` (s, r)
-    that span courses over the postures, none of which shows at the zero.
+    """Joint readings at s stops: ``places`` (s, n), the number of each distinct reading, counted from 0; ``features``
+    (s, r) that span the errors by posture, all zero at the zero position.
     """
 
     places: IntArray
@@ -76,8 +77,8 @@ def readings(offsets: FloatArray) -> Readings:
 @dataclass(frozen=True)
 class VarianceComponents:
     """Estimated variances: ``pixels`` over the stated ones; ``random``, ``repeatable`` and ``posture`` (n,) of the
-    joints' errors [rad² or m²], with the ``covariance`` (3 n, 3 n) of these. ``gain``: twice the logarithm of the
-    likelihood over that of joints without errors. ``scales`` (r,), ``scale_deviations`` (r,): logarithms of the
+    joints' errors [rad² or m²], with their ``covariance`` (3 n, 3 n). ``gain``: twice the log-likelihood ratio to
+    joints without errors. ``scales`` (r,), ``scale_deviations`` (r,): logarithms of the
     revolute joints' scale factors.
     """
 
@@ -92,7 +93,7 @@ class VarianceComponents:
 
     @property
     def significant(self) -> bool:
-        """Whether joints without errors are rejected."""
+        """Whether the hypothesis of joints without errors is rejected."""
         return self.gain > float(chi2_distribution.isf(FALSE_ALARM, 3 * len(self.random)))
 
     @property
@@ -102,8 +103,8 @@ class VarianceComponents:
 
     @property
     def deviations_of_deviations(self) -> FloatArray:
-        """Standard deviations (n, 3) of `deviations`, to first order; of the largest that is likely where none was
-        seen.
+        """Standard deviations (n, 3) of `deviations`, to first order; for components estimated as zero, the largest
+        likely deviation.
         """
         spreads = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(3, -1).T
         found = self.deviations
@@ -118,38 +119,38 @@ class VarianceComponents:
 
     @property
     def stated(self) -> FloatArray:
-        """Standard deviation (n,) of a joint's error at another reading: of a variance that is known with ν freedoms
-        the expectation is ν / (ν - 2) times the estimate, of one that may be none about its own deviation.
+        """Standard deviation (n,) of a joint's error at another reading. For a variance known with ν degrees of freedom
+        its expectation is ν / (ν - 2) times the estimate, for one that may be zero about its own standard deviation.
         """
         return _stated(self.random + self.repeatable, self._variance_of_total)
 
     @property
     def stated_posture(self) -> FloatArray:
-        """The same (n,) of the error by posture; none where none was seen."""
+        """Likewise (n,) of the error by posture; zero if none was found."""
         n = len(self.random)
         variance = np.maximum(np.diag(self.covariance)[2 * n :], 0.0)
         return np.where(self.posture > 0.0, _stated(self.posture, variance), 0.0)
 
     def like(self, other: VarianceComponents) -> bool:
-        """Whether the joints' errors are those of another estimate, to a tenth of their deviations."""
+        """Whether the joints' errors equal those of another estimate, to a tenth of their standard deviations."""
         off = np.concatenate(
             [self.random - other.random, self.repeatable - other.repeatable, self.posture - other.posture]
         )
         return bool((np.abs(off) <= 0.1 * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))).all())
 
     def noise(self, at: Readings) -> JointNoise:
-        """The joints' noise at stops with these readings."""
+        """Noise of the joints at stops with these readings."""
         return joint_noise_of(np.sqrt(self.random), np.sqrt(self.repeatable), np.sqrt(self.posture), at)
 
 
 def _stated(variances: FloatArray, spreads: FloatArray) -> FloatArray:
-    """Deviations (n,) of errors with estimated ``variances`` (n,), these of variance ``spreads`` (n,)."""
+    """Standard deviations (n,) of errors whose estimated ``variances`` (n,) have variance ``spreads`` (n,)."""
     share = np.minimum(spreads, 0.5 * variances**2) / np.where(variances > 0.0, variances**2, 1.0)
     return np.sqrt(np.maximum(variances / (1.0 - share), NONE_SEEN * np.sqrt(spreads)))
 
 
 def joint_noise_of(random: FloatArray, repeatable: FloatArray, posture: FloatArray, at: Readings) -> JointNoise:
-    """Noise at stops with the readings ``at``, of joints with errors of these deviations (n,)."""
+    """Noise at stops with the readings ``at``, for joints whose errors have these standard deviations (n,)."""
     places = at.places
     own, shared = np.tile(random**2, (len(places), 1)), np.full(places.shape, -1)
     common = [
@@ -167,16 +168,16 @@ def joint_noise_of(random: FloatArray, repeatable: FloatArray, posture: FloatArr
 
 
 def noise_of_accuracy(accuracy: JointAccuracy, at: Readings) -> JointNoise:
-    """Noise at stops with the readings ``at``, of joints with the errors that a model states."""
+    """Noise at stops with the readings ``at``, for joints with the errors stated by a model."""
     return joint_noise_of(accuracy.random, accuracy.repeatable, accuracy.posture, at)
 
 
 class ReducedRows(NamedTuple):
-    """Rows that carry the components of ``joints`` joints: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales``
+    """Rows that contain the components of ``joints`` joints: ``y`` (N,), ``X`` (N, p) of the parameters, ``scales``
     (N, r), ``slopes`` (N, n) by the errors of the joints at the row's own stop, which begins at row ``begins`` (s,);
-    no row before the first has any. ``pixels`` (N, N): covariance by a unit variance of the pixels, those included by
-    which other rows have fixed parameters. ``at``: the stops' readings. ``squares`` of the ``freedom`` rows left, which
-    only pixels scatter.
+    rows before the first stop have none. ``pixels`` (N, N): covariance for a unit variance of the pixels, including
+    that of the rows by which parameters were fixed. ``at``: the stops' readings. ``squares`` of the ``freedom``
+    remaining rows, which contain pixel noise only.
     """
 
     y: FloatArray
@@ -191,11 +192,11 @@ class ReducedRows(NamedTuple):
 
     @property
     def joints(self) -> int:
-        """Their number."""
+        """Number of joints."""
         return int(self.slopes.shape[1])
 
     def shared(self, joint: int) -> tuple[FloatArray, FloatArray]:
-        """Which errors of a joint stops share: the repeatable ones (s, places), none where every stop or no stop shares
+        """Errors of a joint that stops share: the repeatable ones (s, places), none if every stop or no stop shares
         one, and those by posture (s, r).
         """
         places, where = np.unique(self.at.places[:, joint], return_inverse=True)
@@ -203,12 +204,12 @@ class ReducedRows(NamedTuple):
         return (where[:, None] == own).astype(np.float64), self.at.features
 
     def by_stop(self, rows: FloatArray) -> FloatArray:
-        """Sums (s, ...) of ``rows`` (N, ...) over each stop's own."""
+        """Sums (s, ...) of ``rows`` (N, ...) over each stop's own rows."""
         return np.asarray(np.add.reduceat(rows, self.begins, axis=0))
 
     def columns(self) -> tuple[FloatArray, IntArray]:
-        """All errors of the joints as columns (N, e), and the component (e,) of each, counted by joint, first the
-        random ones, then the repeatable, then those by posture.
+        """All joint errors as columns (N, e), and the component (e,) of each, numbered by joint: first the
+        random ones, then the repeatable ones, then those by posture.
         """
         stops, n = len(self.begins), self.joints
         at = np.searchsorted(self.begins, np.arange(len(self.y)), side="right") - 1
@@ -223,8 +224,8 @@ class ReducedRows(NamedTuple):
 
 
 def reduced_rows(solution: Solution, at_stops: Readings) -> ReducedRows:
-    """Linearised rows of a bundle whose stops have the readings ``at_stops``, its present joint noise set aside,
-    reflected so that each stop has one row for each of its joints' errors.
+    """Linearised rows of a bundle whose stops have the readings ``at_stops``, without its current joint noise,
+    reduced by reflections to one row per stop and joint error.
     """
     rig, charts = solution.rig, solution.charts
     data, _ = by_stop(solution.data)
@@ -274,8 +275,8 @@ def reduced_rows(solution: Solution, at_stops: Readings) -> ReducedRows:
 
 
 def _condensed(reduced: ReducedRows) -> ReducedRows:
-    """The rows without those before the first stop, as far as these fix parameters well: what they say of a parameter
-    is known before, with the pixels' variance (a recursive least squares step; the restricted likelihood is the same).
+    """The rows without those before the first stop, as far as these determine parameters well: their information on a
+    parameter becomes prior, with the pixels' variance (a recursive least squares step; same restricted likelihood).
     """
     first = int(reduced.begins[0])
     beside = np.column_stack([reduced.y, reduced.scales])
@@ -330,8 +331,8 @@ class _Likelihood:
         self.value = -float(logs) - 0.5 * (reduced.freedom * float(np.log(variances[0])) + left)
 
     def score(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivative by the variances, the expected information, and the factor that each takes in a step of
-        minorise-maximise, which never lowers the likelihood.
+        """Derivative by the variances, the expected information, and the factor on each variance in a
+        minorise-maximise step, which never lowers the likelihood.
         """
         reduced, pixels, n = self.reduced, self.variances[0], self.reduced.joints
         half = solve_triangular(self.root, np.eye(len(self.root)), lower=True)
@@ -356,7 +357,7 @@ class _Likelihood:
                 block = np.array([_squares(row) for row in rows])
                 information[mine, 1 + other :: n] = block
                 information[1 + other :: n, mine] = block.T
-        # Of the pixels by what all variances do together: P V P = P.
+        # Derivative by the pixels' variance from those by all variances together: P V P = P.
         freedom = len(Py) - self.basis.shape[1]
         up[0] = (float(self.white @ self.white) - self.variances[1:] @ up[1:]) / pixels
         down[0] = (freedom - self.variances[1:] @ down[1:]) / pixels
@@ -371,12 +372,12 @@ class _Likelihood:
 
 
 def _squares(arrays: list[FloatArray]) -> list[float]:
-    """Sum of the squares of each."""
+    """Sum of the squares of each array."""
     return [float((one**2).sum()) for one in arrays]
 
 
 def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[_Likelihood, FloatArray]:
-    """The likelihood at its maximum over variances that are not negative, and the information there."""
+    """Likelihood at its maximum over nonnegative variances, and the information there."""
     here = _Likelihood(reduced, X, start)
     for _ in range(ROUNDS):
         score, information, factors = here.score()
@@ -403,8 +404,8 @@ def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[
 
 
 class ExactReadings(NamedTuple):
-    """Reduced rows under exact joint readings, whitened by the ``root`` (N, N) of the pixels: ``basis`` (N, p) of the
-    parameters, unit and orthogonal, what is ``left`` (N,) beside them, and the variance of ``pixels`` over the stated
+    """Reduced rows under exact joint readings, whitened by the ``root`` (N, N) of the pixels: orthonormal ``basis``
+    (N, p) of the parameters, residuals ``left`` (N,) orthogonal to it, and the variance of ``pixels`` over the stated
     one.
     """
 
@@ -415,7 +416,7 @@ class ExactReadings(NamedTuple):
 
 
 def exact_readings(reduced: ReducedRows, X: FloatArray) -> ExactReadings | None:
-    """The rows beside parameters ``X`` (N, p) alone; None where these leave no freedom."""
+    """The rows with parameters ``X`` (N, p) alone; None if these leave no degrees of freedom."""
     freedom = len(reduced.y) - X.shape[1] + reduced.freedom
     if freedom <= 0 or len(reduced.y) <= X.shape[1]:
         return None
@@ -431,8 +432,8 @@ def estimate_components(
 ) -> VarianceComponents | None:
     """Variance components of a bundle by its `reduced_rows`. ``near``: an earlier estimate to start from.
 
-    ``scales``: with scale factors of the revolute joints among the parameters, which errors proportional to the
-    reading are then not taken for. None where nothing in the residuals points to joints, unless not ``screened``.
+    ``scales``: the parameters include scale factors of the revolute joints, so that errors proportional to the
+    reading count as scales. None if no residuals indicate joint errors, unless ``screened`` is false.
     """
     n = reduced.joints
     X = np.hstack([reduced.X, _unit(reduced.scales)]) if scales else reduced.X
@@ -451,7 +452,7 @@ def estimate_components(
     if near is not None:
         first = np.concatenate([[near.pixels], near.random, near.repeatable, near.posture])
     best, information = _maximised(reduced, X, first)
-    # Of a component that no stop shows nothing is known, and none is seen.
+    # A component that appears at no stop is undetermined, and estimated as zero.
     shown = np.flatnonzero(np.diag(information) > 0.0)
     size = np.sqrt(np.diag(information)[shown])
     covariance = np.zeros_like(information)
@@ -472,9 +473,9 @@ def estimate_components(
 
 
 NONE_SEEN = 0.8
-"""Mean of a variance that was estimated as none, flat beforehand, in its standard deviations."""
+"""Posterior mean, in standard deviations, of a variance that was estimated as zero, with a flat prior."""
 SCREEN = 3.0
-"""Deviations of a component's score beyond which the likelihood is maximised."""
+"""Standardised score of a component above which the likelihood is maximised."""
 
 
 def _unit(columns: FloatArray) -> FloatArray:
@@ -483,9 +484,7 @@ def _unit(columns: FloatArray) -> FloatArray:
 
 
 def _mean_squares(reduced: ReducedRows) -> FloatArray:
-    """Mean squared length (3 n,) of each component's columns: what a unit of its variance adds to a row, over its
-    rows.
-    """
+    """Mean squared length (3 n,) of each component's columns: variance added by a unit error, summed over its rows."""
     columns, component = reduced.columns()
     counts = np.bincount(component, minlength=3 * reduced.joints)
     sums = np.bincount(component, (columns**2).sum(axis=0), 3 * reduced.joints)
@@ -493,7 +492,7 @@ def _mean_squares(reduced: ReducedRows) -> FloatArray:
 
 
 def _scale_estimates(best: _Likelihood, reduced: ReducedRows) -> tuple[FloatArray, FloatArray]:
-    """Logarithms (r,) of the scale factors by generalised least squares, and their deviations."""
+    """Logarithms (r,) of the scale factors by generalised least squares, and their standard deviations."""
     rows = np.hstack([reduced.X, reduced.scales, reduced.y[:, None]])
     white = solve_triangular(best.root, rows, lower=True)
     at = reduced.X.shape[1]
@@ -503,20 +502,20 @@ def _scale_estimates(best: _Likelihood, reduced: ReducedRows) -> tuple[FloatArra
 
 
 LIKELY = 0.02
-"""Probability with which exact joint readings are said to have likely errors."""
+"""Probability of reporting likely errors for exact joint readings."""
 ONE_JOINT = 0.2
-"""Share of it that is spent on errors of one joint alone; the rest is on those of all joints alike."""
+"""Share of it that is used for tests of single joints; the rest is for tests of all joints alike."""
 SHOWN = 3.0
-"""Standard deviations by which a test's statistic shows the variance that it is made for."""
+"""Standard deviations of a test's statistic that correspond to the variance for which the test is optimal."""
 LEAST_CHANCE = 1e-12
-"""Probability that is stated where it is none to the accuracy of numbers."""
+"""Probability that is reported if the computed one is zero to rounding."""
 NEGLIGIBLE = 1e-10
-"""Weight of a chi-square over the largest below which it is left out."""
+"""Weight of a chi-square, relative to the largest, below which it is left out."""
 
 
 class ScoreTests(NamedTuple):
-    """Probabilities with which exact readings show as much of errors that are random, repeatable or by posture: of
-    ``single`` joints (3, n), and of all joints ``alike`` (3,); 1 where the stops tell nothing of it.
+    """Probabilities with which exact readings give scores as large as the observed ones, for errors that are random,
+    repeatable or by posture: of ``single`` joints (3, n), and of all joints ``alike`` (3,); 1 if not testable.
     """
 
     single: FloatArray
@@ -524,15 +523,15 @@ class ScoreTests(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Probability, at most, with which exact readings show as much in any of the tests (Bonferroni)."""
+        """Upper bound (Bonferroni) of the probability that exact readings reach as much in any of the tests."""
         one = float(self.single.min()) * self.single.size / ONE_JOINT
         all_joints = float(self.alike.min()) * self.alike.size / (1.0 - ONE_JOINT)
         return min(one, all_joints, 1.0)
 
 
 def likely_errors(reduced: ReducedRows) -> tuple[VarianceComponents | None, float]:
-    """Variance components of joint readings that are likely to have errors, and the probability, at most, with which
-    exact ones show as much, by the `reduced_rows` of a bundle with exact ones; None and 0 where no errors are likely.
+    """Variance components of joint readings that are likely to have errors, and the upper bound of the probability that
+    exact ones show as much, by the `reduced_rows` of a bundle with exact ones; None and 0 if no errors are likely.
     """
     tests = score_tests(reduced)
     if tests is None or tests.chance > LIKELY:
@@ -542,7 +541,7 @@ def likely_errors(reduced: ReducedRows) -> tuple[VarianceComponents | None, floa
 
 
 def score_tests(reduced: ReducedRows) -> ScoreTests | None:
-    """Score tests by the `reduced_rows` of a bundle; None where its parameters leave no freedom."""
+    """Score tests by the `reduced_rows` of a bundle; None if its parameters leave no degrees of freedom."""
     exact = exact_readings(reduced, reduced.X)
     if exact is None:
         return None
@@ -569,8 +568,8 @@ def score_tests(reduced: ReducedRows) -> ScoreTests | None:
 
 
 def point_optimal_weights(sizes: FloatArray) -> FloatArray:
-    """Weights (k,) of squared normal variates whose variances are ``1 + v sizes`` (k,), by which their sum tells best a
-    variance ``v`` that it barely shows: by ``SHOWN`` of the sum's standard deviations at ``v`` = 0.
+    """Weights (k,) of squared normal variates with variances ``1 + v sizes`` (k,) whose sum is the best test of a
+    small variance ``v``: one at which it shifts by ``SHOWN`` of the sum's standard deviations at ``v`` = 0.
     """
     if not len(sizes):
         return sizes
@@ -586,8 +585,8 @@ def point_optimal_weights(sizes: FloatArray) -> FloatArray:
 
 
 def weighted_chi2_tail(value: float, weights: FloatArray) -> float:
-    """Probability that a sum of independent chi-squares of one freedom, of ``weights`` (k,), exceeds ``value``; 1 where
-    no weight is above zero.
+    """Probability that a sum of independent chi-squares with one degree of freedom and ``weights`` (k,) exceeds
+    ``value``; 1 if no weight is above zero.
     """
     largest = float(weights.max(initial=0.0))
     if largest <= 0.0:
@@ -600,12 +599,12 @@ def weighted_chi2_tail(value: float, weights: FloatArray) -> float:
     def excess(z: float) -> float:
         return float((w / (1.0 - 2.0 * z * w)).sum()) - q
 
-    # The slope of the cumulant function grows from 0 to infinity up to 1/2.
+    # The slope of the cumulant function increases from 0 to infinity up to 1/2.
     z = float(brentq(excess, -0.5 * len(w) / q - 1.0, 0.5 * (1.0 - 1.0 / (2.0 * q + 2.0 * len(w)))))
     cumulant = -0.5 * float(np.log1p(-2.0 * z * w).sum())
     curvature = float((2.0 * (w / (1.0 - 2.0 * z * w)) ** 2).sum())
     if abs(z) * np.sqrt(curvature) < 1e-4:
-        # At the mean the tail's formula is 0 over 0; its limit has the skewness.
+        # At the mean the tail's formula is 0 / 0; its limit contains the skewness.
         third = float((8.0 * w**3).sum())
         return float(0.5 - third / (6.0 * np.sqrt(2.0 * np.pi) * curvature**1.5))
     root = np.sign(z) * np.sqrt(2.0 * (z * q - cumulant))

@@ -1,10 +1,10 @@
-"""Alignment of known points with their current images by the map between two projective frames (rigid, similar, affine
-or projective, as these allow), with residuals and reprojected pixels.
+"""Alignment of known points with their current images: estimates the map between two projective frames (rigid,
+similarity, affine or projective, depending on the frames), with residuals and reprojected pixels.
 
 For every stratum: a workpiece that has moved, cameras that were exchanged, points of a
 drawing (thesis 8.6: targets "can be reprojected onto images actually taken, even if the cameras have changed"). With
-two metric frames a rigid motion or a similarity of three points does, with two affine ones an affinity of four, else
-a homography of five. All are fitted to the pixels by one Gauss-Newton iteration on the group. Pixels are ideal ones.
+two metric frames the map is a rigid motion or a similarity (three points), with two affine ones an affinity (four),
+else a homography (five). All are fitted to the (ideal) pixels by one Gauss-Newton iteration on the group.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from stereoservo.numerics.arrays import FloatArray
 
 Family = Literal["rigid", "similar", "affine", "projective"]
 POINTS_NEEDED: dict[Family, int] = {"rigid": 3, "similar": 3, "affine": 4, "projective": 5}
-"""Points in general position that determine a map of the family."""
+"""Number of points in general position that determine a map of the family."""
 ITERATIONS = 30
 HALVINGS = 8
 CONVERGED = 1e-9
-"""Step, in units of the points' spread, at which the fit ends."""
+"""Step, in units of the points' spread, at which the fit has converged."""
 
 
 @dataclass(frozen=True)
 class AlignmentFrame:
-    """A projective frame: its cameras (c, 3, 4), and its maps to an affine and a Euclidean frame, where known."""
+    """A projective frame: its cameras (c, 3, 4), and its maps to an affine and a Euclidean frame, if known."""
 
     Ps: FloatArray
     to_affine: FloatArray | None = None
@@ -53,11 +53,11 @@ class AlignmentFrame:
 
 
 DRAWING = AlignmentFrame(np.zeros((0, 3, 4)), np.eye(4), np.eye(4))
-"""The frame of a drawing: Euclidean, in a unit of length of its own, without cameras."""
+"""Frame of a drawing: Euclidean, with its own unit of length, without cameras."""
 
 
 def family_between(old: AlignmentFrame, new: AlignmentFrame, same_scale: bool) -> Family:
-    """The smallest group that contains the map between two frames; ``same_scale``: of length, in both."""
+    """The smallest group that contains the map between two frames; ``same_scale``: both have one unit of length."""
     if old.to_euclidean is not None and new.to_euclidean is not None:
         return "rigid" if same_scale else "similar"
     return "affine" if old.to_affine is not None and new.to_affine is not None else "projective"
@@ -80,7 +80,7 @@ def algebra(family: Family) -> FloatArray:
 
 
 def upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[FloatArray, FloatArray]:
-    """Maps from either frame to the one in which `algebra` holds."""
+    """Maps from either frame to the frame in which the generators of `algebra` apply."""
     pairs = {"rigid": "to_euclidean", "similar": "to_euclidean", "affine": "to_affine"}
     if family == "projective":
         return np.eye(4), np.eye(4)
@@ -91,7 +91,9 @@ def upgrades(family: Family, old: AlignmentFrame, new: AlignmentFrame) -> tuple[
 
 
 def affinity_from_points(X: FloatArray, Y: FloatArray) -> FloatArray:
-    """``T`` (4, 4) of least squares from points ``(n, 3)`` to ``(n, 3)``. Raises GeometryError where they are flat."""
+    """Least-squares affinity ``T`` (4, 4) from points ``(n, 3)`` to ``(n, 3)``. Raises GeometryError if they are
+    coplanar.
+    """
     if len(X) < 4:
         raise GeometryError("too_few", f"{len(X)} points; an affinity needs at least 4", points=len(X))
     rows = np.hstack([X - X.mean(axis=0), np.ones((len(X), 1))])
@@ -116,11 +118,11 @@ def align(
 ) -> FrameChange:
     """Map of the family that moves points ``(n, 4)`` of the old frame onto their images in the new cameras.
 
-    Of least reprojection error over ``pixels_new`` (c, n, 2) [px], NaN where missing, ``sigmas`` (c, n) or a number
-    [px]; ``M_covariance`` (n, 4, 4) of the old points. ``names`` (n,): what to call the points. With the sign
-    that keeps points in front, and its covariance.
+    Minimises the reprojection error over ``pixels_new`` (c, n, 2) [px], NaN where missing, ``sigmas`` (c, n) or a
+    number [px]; ``M_covariance`` (n, 4, 4) of the old points. ``names`` (n,): names of the points for messages. The
+    sign keeps points in front; returned with its covariance.
 
-    Raises GeometryError for too few points seen by two cameras, and where they leave the map open.
+    Raises GeometryError if two cameras see too few points, or if these do not determine the map.
     """
     called = np.arange(len(M_old)) if names is None else np.asarray(names)
     sigma = np.broadcast_to(np.asarray(sigmas, dtype=np.float64), pixels_new.shape[:2])
@@ -141,8 +143,7 @@ def align(
     T = start_map(family, M_old[both], M_new[both], up_old, up_new)
     used = np.flatnonzero(np.isfinite(M_old).all(axis=1) & (weights > 0).any(axis=0))
     views = PointViews(new.Ps, M_old[used], pixels[:, used], weights[:, used], None if own is None else own[used])
-    # About the points' centroid, in units of their standard deviation: rotations and translations are then well
-    # distinguished.
+    # About the points' centroid, in units of their standard deviation: this decouples rotations from translations.
     local = local_frame(family, move_points(up_new, M_new[both])) @ up_new
     generators = np.linalg.inv(local) @ algebra(family) @ local
     T = descend(T, generators, views)
@@ -189,7 +190,7 @@ class PointViews:
 
 
 class ImageConstraints(Protocol):
-    """Whitened image errors of a map ``T`` (4, 4); what ``whitening`` gives is of the class's own kind."""
+    """Whitened image errors of a map ``T`` (4, 4); the type that ``whitening`` returns is the class's own."""
 
     def whitening(self, T: FloatArray) -> Any: ...
 
@@ -213,7 +214,7 @@ def descend(T: FloatArray, generators: FloatArray, views: ImageConstraints) -> F
                 break
             step = 0.5 * step
         else:
-            return T  # no direction of descent: this is the minimum to rounding
+            return T  # no direction of descent: the minimum is reached to rounding
         if float(np.abs(step).max()) < CONVERGED:
             break
     return T
@@ -222,7 +223,7 @@ def descend(T: FloatArray, generators: FloatArray, views: ImageConstraints) -> F
 def start_map(
     family: Family, M_old: FloatArray, M_new: FloatArray, up_old: FloatArray, up_new: FloatArray
 ) -> FloatArray:
-    """A first map from both reconstructions, ``|det| = 1``, with the sign that keeps points in front."""
+    """Initial map from both reconstructions, ``|det| = 1``, with the sign that keeps points in front."""
     if family == "projective":
         return linear_homography(M_old, M_new)[0]
     X, Y = move_points(up_old, M_old), move_points(up_new, M_new)
@@ -288,7 +289,7 @@ def reprojected(Ps: FloatArray, M: FloatArray, covariance: FloatArray) -> tuple[
 def drawn_points(coordinates: FloatArray, placed: FloatArray | None = None) -> FloatArray:
     """Homogeneous points ``(n, 4)`` of CAD points ``(n, 3)``, after the rigid motion ``placed`` (4, 4), if given.
 
-    Raises GeometryError where that is none: a mirror image, a change of size.
+    Raises GeometryError if ``placed`` is not a rigid motion (a mirror image, a change of size).
     """
     points = to_homogeneous(np.asarray(coordinates, dtype=np.float64))
     if placed is None:

@@ -12,14 +12,14 @@ from stereoservo.geometry.homogeneous import GeometryError, plane_of_points, to_
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 NOMINAL_FOCAL = 2.0
-"""Focal length [half image widths] that the canonical pair assumes to place its frame: 53° across."""
+"""Nominal focal length [half image widths] by which the canonical pair places its frame: 53° field of view."""
 
 DEFINITENESS = 1e-14
-"""Relative eigenvalue of a point's normal matrix below which its rays count as one."""
+"""Relative eigenvalue of a point's normal matrix below which its rays count as coincident."""
 
 
 def pixel_normaliser(width: int, height: int) -> FloatArray:
-    """``N`` (3, 3): pixels to the centre of the image as origin and half the width as unit."""
+    """``N`` (3, 3): maps pixels so that the image centre is the origin and half the width the unit."""
     if width <= 0 or height <= 0:
         raise GeometryError(
             "shape", f"image size is {width}x{height}; both must be positive", width=width, height=height
@@ -31,9 +31,7 @@ def pixel_normaliser(width: int, height: int) -> FloatArray:
 
 
 def camera_centre(P: FloatArray) -> FloatArray:
-    """Centre ``(4,)`` of a camera ``(3, 4)``: signed minors, ``cᵀX = det[P; X]``, so that its side is
-    meaningful.
-    """
+    """Centre ``(4,)`` of a camera ``(3, 4)``: signed minors, ``cᵀX = det[P; X]``, so that its sign is meaningful."""
     return plane_of_points(P[0], P[1], P[2])
 
 
@@ -52,8 +50,7 @@ def project_many(Ps: FloatArray, M: FloatArray) -> FloatArray:
 
 
 def projection_jacobian(P: FloatArray, M: FloatArray) -> FloatArray:
-    """``J_G P`` ``(n, 2, 4)`` [px per unit of M] (8.4, 8.8): derivative of pixels in homogeneous points
-    ``(n, 4)``.
+    """``J_G P`` ``(n, 2, 4)`` [px per unit of M] (8.4, 8.8): derivative of pixels by homogeneous points ``(n, 4)``.
 
     ``J_G = 1/m₃ [[1, 0, −u], [0, 1, −v]]``.
     """
@@ -62,7 +59,7 @@ def projection_jacobian(P: FloatArray, M: FloatArray) -> FloatArray:
 
 
 def projection_jacobian_many(Ps: FloatArray, M: FloatArray) -> FloatArray:
-    """Derivative ``(c, n, 2, 4)`` of the pixels of points ``(n, 4)`` in cameras ``(c, 3, 4)`` (8.8)."""
+    """Derivative ``(c, n, 2, 4)`` of pixels by points ``(n, 4)`` in cameras ``(c, 3, 4)`` (8.8)."""
     m = np.einsum("cij,nj->cni", Ps, M)
     depth = np.where(m[..., 2] == 0.0, np.nan, m[..., 2])
     pixels = m[..., :2] / depth[..., None]
@@ -80,7 +77,7 @@ def reprojection_residuals(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
 def check_views(Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """Pixels ``(c, n, 2)`` and weights ``(c, n)``, both with 0 for missing ones.
 
-    Raises GeometryError on shapes that do not fit and on weights that are not finite or negative.
+    Raises GeometryError on shapes that do not fit and on weights that are negative or not finite.
     """
     if Ps.ndim != 3 or Ps.shape[1:] != (3, 4) or pixels.ndim != 3 or pixels.shape[::2] != (Ps.shape[0], 2):
         raise GeometryError(
@@ -99,12 +96,11 @@ def check_views(Ps: FloatArray, pixels: FloatArray, weights: FloatArray | None) 
 def triangulate(
     Ps: FloatArray, pixels: FloatArray, sigmas: FloatArray | float | None = None, iterations: int = 3
 ) -> FloatArray:
-    """Points ``(n, 4)`` of least reprojection error, scaled to depth 1 in the first camera (third row of
-    ``Ps[0]``).
+    """Points ``(n, 4)`` of least reprojection error, scaled to depth 1 in the first camera (third row of ``Ps[0]``).
 
     A linear solution, then ``iterations`` renormalised ones (2.73): constraints of each camera divided by
-    its own depth. The constraints take the *predicted* pixel, so that the fixed point is the exact minimum
-    of the reprojection error. ``sigmas`` (c, n) or a number [px]; default 1. NaN rows where fewer than two
+    its own depth. The constraints use the *predicted* pixel, so that the fixed point is the exact minimum
+    of the reprojection error. ``sigmas`` (c, n) or a number [px]; default 1. Rows are NaN if fewer than two
     cameras see a point or its rays do not determine it. Raises GeometryError on shapes that do not fit.
     """
     weights = None if sigmas is None else 1.0 / np.broadcast_to(np.asarray(sigmas, dtype=np.float64), pixels.shape[:2])
@@ -159,10 +155,9 @@ def _least_squares_step(
 
 
 def triangulation_covariance(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """First-order covariance ``(n, 4, 4)`` of points scaled to depth 1, for pixel noise ``sigmas`` (c, n)
-    [px].
+    """First-order covariance ``(n, 4, 4)`` of points scaled to depth 1, for pixel noise ``sigmas`` (c, n) [px].
 
-    An infinite sigma is a missing view. Rank 3: the depth is fixed.
+    An infinite sigma marks a missing view. Rank 3: the depth is fixed.
     """
     third = Ps[0, 2]
     free = np.linalg.svd(third[None])[2][1:].T
@@ -182,17 +177,16 @@ def canonical_pair(
     right: FloatArray | None = None,
     nominal_focal: float = NOMINAL_FOCAL,
 ) -> tuple[FloatArray, FloatArray]:
-    """Cameras ``P_left = [N⁻¹ | 0]`` and ``P_right`` (3, 4) consistent with ``m'ᵀ F m = 0`` [px] (2.11,
-    2.12).
+    """Cameras ``P_left = [N⁻¹ | 0]`` and ``P_right`` (3, 4) consistent with ``m'ᵀ F m = 0`` [px] (2.11, 2.12).
 
-    With ``e'`` the right epipole, ``P_right ~ [[e']ₓF + e'aᵀ | λe']``. The free ``a`` is taken so that the
+    With ``e'`` the right epipole, ``P_right ~ [[e']ₓF + e'aᵀ | λe']``. The free ``a`` is chosen so that the
     left 3x3 block is a rotation for cameras of ``nominal_focal`` [half image widths]: the frame is then
-    close to an affine one and well conditioned. The signs and ``λ`` put the matches ``left``, ``right`` (n,
-    2) [px], or without them the crossing of the optical axes, in front of both cameras at a fourth
+    close to an affine one and well conditioned. The signs and ``λ`` put the matches ``left``, ``right`` (n, 2)
+    [px], or without them the intersection of the optical axes, in front of both cameras at a fourth
     coordinate of about one.
 
-    ``width``, ``height`` of the left image; ``right_size`` of the right one where it differs. Raises
-    GeometryError when F is not of rank two.
+    ``width``, ``height`` of the left image; ``right_size`` of the right one if it differs. Raises
+    GeometryError if F is not of rank two.
     """
     F = np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3) or not np.isfinite(F).all():
@@ -200,9 +194,7 @@ def canonical_pair(
     N_left = pixel_normaliser(width, height)
     N_right = pixel_normaliser(*(right_size or (width, height)))
     K = np.diag([nominal_focal, nominal_focal, 1.0])
-    # Fundamental matrix of the nominally calibrated rays: an essential matrix where the nominal focal
-    # length
-    # is right.
+    # Fundamental matrix of the nominally calibrated rays: an essential matrix if the nominal focal length is right.
     E = K @ np.linalg.inv(N_right).T @ F @ np.linalg.inv(N_left) @ K
     U, s, Vt = np.linalg.svd(E)
     if not (s[1] > 1e-6 * s[0] and s[2] < 1e-3 * s[1]):
@@ -220,8 +212,7 @@ def canonical_pair(
             block = sign * turned - np.outer(epipole, null)
         heights, depths = _heights_and_depths(block, epipole, rays_left, rays_right)
         front = depths > 0
-        # Height and depth say "in front of both" when the heights agree in sign, whichever sign of e' that
-        # takes.
+        # Heights and depths of equal sign mean "in front of both", whichever sign of e' is needed for that.
         count = max(int((front & (heights > 0)).sum()), int((front & (heights < 0)).sum()))
         if best is None or count > best[0]:
             best = (count, block, heights)
@@ -229,8 +220,7 @@ def canonical_pair(
     _, block, heights = best
     heights = heights[np.isfinite(heights)]
     middle = float(np.median(heights)) if len(heights) else 0.0
-    # A nominal focal length far off may put the frame's infinity among the points: move it, by a, behind
-    # them.
+    # With a wrong nominal focal length the plane at infinity may pass between the points: move it, by a, behind them.
     side = float(np.copysign(1.0, middle))
     lowest = float((side * heights).min()) if len(heights) else 0.0
     if lowest < 0.25 * abs(middle):
@@ -251,9 +241,7 @@ def _nominal_rays(
     left: FloatArray | None,
     right: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Matched rays (n, 3), or those of the left image's centre and of the right pixel nearest to the right
-    centre.
-    """
+    """Matched rays (n, 3), or those of the left image's centre and of the right pixel nearest to the right centre."""
     to_left, to_right = np.linalg.inv(K) @ N_left, np.linalg.inv(K) @ N_right
     if left is not None and right is not None:
         seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
@@ -269,9 +257,7 @@ def _nominal_rays(
 def _heights_and_depths(
     block: FloatArray, epipole: FloatArray, rays_left: FloatArray, rays_right: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fourth coordinate (n,) at left depth 1, and right depth (n,), of points on matched rays: d x' = A x
-    + w e'.
-    """
+    """Fourth coordinate (n,) at left depth 1, and right depth (n,), of points on matched rays: d x' = A x + w e'."""
     target = rays_left @ block.T
     x, e = rays_right, np.broadcast_to(epipole, rays_right.shape)
     moment = np.cross(x, e)
@@ -283,12 +269,11 @@ def _heights_and_depths(
 
 
 def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatArray:
-    """Camera ``P`` (3, 4), of unit Frobenius norm, from points ``(n, 4)`` and pixels ``(n, 2)`` [px], n >=
-    6.
+    """Camera ``P`` (3, 4), of unit Frobenius norm, from points ``(n, 4)`` and pixels ``(n, 2)`` [px], n >= 6.
 
     Linear in whitened coordinates, then (``refine``) of least reprojection error. Rows with NaN pixels are
-    left out. The sign gives the points of positive height a positive depth. Raises GeometryError for fewer
-    than six points or points that leave the camera undetermined (coplanar, on a twisted cubic with the
+    left out. The sign gives points of positive height a positive depth. Raises GeometryError for fewer
+    than six points or points that leave the camera undetermined (coplanar, or on a twisted cubic with the
     centre).
     """
     seen = np.isfinite(pixels).all(axis=1) & np.isfinite(M).all(axis=1)
@@ -343,8 +328,8 @@ def _refine_camera(P: FloatArray, M: FloatArray, pixels: FloatArray) -> FloatArr
 
 
 def isotropic_normaliser(pixels: FloatArray) -> FloatArray:
-    """``T`` (3, 3): mean of pixels ``(n, 2)`` to the origin, mean distance to √2. Raises GeometryError
-    when all are one.
+    """``T`` (3, 3): maps pixels ``(n, 2)`` to mean 0 and mean distance √2 from it. Raises GeometryError if all pixels
+    are equal.
     """
     centre = pixels.mean(axis=0)
     distance = float(np.linalg.norm(pixels - centre, axis=1).mean())
@@ -355,6 +340,6 @@ def isotropic_normaliser(pixels: FloatArray) -> FloatArray:
 
 
 def from_pixels(T: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Apply a pixel map ``T`` (3, 3) without perspective to pixels ``(n, 2)``."""
+    """Apply a pixel map ``T`` (3, 3) without a perspective part to pixels ``(n, 2)``."""
     mapped: FloatArray = pixels @ T[:2, :2].T + T[:2, 2]
     return mapped

@@ -24,9 +24,7 @@ def _square(H: FloatArray, what: str) -> FloatArray:
 
 
 def exp_rotation(G: FloatArray, theta: npt.ArrayLike) -> FloatArray:
-    """``exp(θĤ) = I + sin θ Ĥ + (1 − cos θ) Ĥ²`` (4.27): ``G`` (..., 4, 4), ``theta`` (...) [rad] -> (...,
-    4, 4).
-    """
+    """``exp(θĤ) = I + sin θ Ĥ + (1 − cos θ) Ĥ²`` (4.27): ``G`` (..., 4, 4), ``theta`` (...) [rad] -> (..., 4, 4)."""
     angle = np.asarray(theta, dtype=np.float64)[..., None, None]
     # 2 sin²(θ/2) instead of 1 − cos θ: exact for small angles.
     H: FloatArray = np.eye(4) + np.sin(angle) * G + 2.0 * np.sin(0.5 * angle) ** 2 * (G @ G)
@@ -40,9 +38,7 @@ def exp_translation(G: FloatArray, tau: npt.ArrayLike) -> FloatArray:
 
 
 def exp_generator(kind: str, G: FloatArray, q: npt.ArrayLike) -> FloatArray:
-    """The displacement of a ``revolute`` [rad] or ``prismatic`` [m] joint. Raises GeometryError for
-    another kind.
-    """
+    """Displacement of a ``revolute`` [rad] or ``prismatic`` [m] joint. Raises GeometryError for any other kind."""
     if kind == "revolute":
         return exp_rotation(G, q)
     if kind == "prismatic":
@@ -51,10 +47,9 @@ def exp_generator(kind: str, G: FloatArray, q: npt.ArrayLike) -> FloatArray:
 
 
 def nearest_rotation_generator(A: FloatArray) -> FloatArray:
-    """An exact revolute generator (``Ĥ³ = −Ĥ``) near ``A`` (4, 4): its complex eigenvectors, ``−2 Im(v
-    wᴴ)``.
+    """An exact revolute generator (``Ĥ³ = −Ĥ``) near ``A`` (4, 4): from its complex eigenvectors, ``−2 Im(v wᴴ)``.
 
-    Raises GeometryError where A has no complex pair of eigenvalues.
+    Raises GeometryError if A has no complex pair of eigenvalues.
     """
     A = _square(A, "generator")
     values, right = np.linalg.eig(A)
@@ -80,8 +75,7 @@ def nearest_rotation_generator(A: FloatArray) -> FloatArray:
 
 
 def nearest_translation_generator(A: FloatArray) -> FloatArray:
-    """The nilpotent of rank one (``Ĥ² = 0``) nearest to ``A`` (4, 4) (3.32-3.34, with hᵀk = 0 kept
-    exactly).
+    """The nilpotent of rank one (``Ĥ² = 0``) nearest to ``A`` (4, 4) (3.32-3.34, with hᵀk = 0 holding exactly).
 
     Raises GeometryError for A = 0.
     """
@@ -103,8 +97,7 @@ def nearest_translation_generator(A: FloatArray) -> FloatArray:
         k, h = pair(shift)
         return float(-(k @ h))
 
-    # The best k hᵀ under hᵀk = 0 is a leading singular pair of A − λI, λ the constraint's multiplier; there
-    # the
+    # The best k hᵀ under hᵀk = 0 is a leading singular pair of A − λI, λ the constraint's multiplier; there the
     # norm of A − λI is least. That norm is convex in λ, and its slope is −kᵀh.
     shift = brentq(overlap, -2.0, 2.0, xtol=1e-16, rtol=1e-15)
     k, h = pair(float(shift))
@@ -114,9 +107,7 @@ def nearest_translation_generator(A: FloatArray) -> FloatArray:
 
 
 def conjugate(H: FloatArray, G: FloatArray) -> FloatArray:
-    """``H Ĝ H⁻¹``: a generator or displacement ``G`` (..., 4, 4) seen after the map ``H`` (4, 4) of the
-    points.
-    """
+    """``H Ĝ H⁻¹``: a generator or displacement ``G`` (..., 4, 4) in the frame of points mapped by ``H`` (4, 4)."""
     moved: FloatArray = H @ G @ np.linalg.inv(H)
     return moved
 
@@ -126,7 +117,7 @@ STRAIGHT = 1e-6
 
 
 def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> FloatArray:
-    """``T`` (4, 4), proper, of least squares from points ``(n, 3)`` to ``(n, 3)``; ``scaled``: its scale is free.
+    """Least-squares ``T`` (4, 4), proper, from points ``(n, 3)`` to ``(n, 3)``; ``scaled``: its scale is free.
 
     Raises GeometryError for fewer than three points and points on one line.
     """

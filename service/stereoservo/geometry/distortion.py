@@ -5,8 +5,8 @@ A ``lens`` is ``(k, cu, cv, r0)`` or ``(k, cu, cv, r0, k2, p1, p2)``: the raw pi
 ``c + (p - c)(1 + k s + k2 s²) + r0 (2 p1 x y + p2 (s + 2 x²), p1 (s + 2 y²) + 2 p2 x y)`` with the centre ``c = (cu,
 cv)`` [px], the reference radius ``r0`` [px], half the image width, ``(x, y) = (p - c) / r0`` and ``s = x² + y²``. With
 square pixels and the centre at the principal point, ``k / r0²``, ``k2 / r0⁴``, ``p1 / r0``, ``p2 / r0`` are Brown's
-(and OpenCV's) ``k1 / f²``, ``k2 / f⁴``, ``p1 / f``, ``p2 / f``. Everything projective works on ideal pixels; raw ones
-are what cameras and people see.
+(and OpenCV's) ``k1 / f²``, ``k2 / f⁴``, ``p1 / f``, ``p2 / f``. Projective geometry uses ideal pixels; raw ones
+are those of the camera's images.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.numerics.arrays import FloatArray
 
 ITERATIONS = 30
-"""Newton steps of the inverse at most; from the start below five suffice inside the image."""
+"""Most Newton steps of the inverse; five suffice inside the image from the start value below."""
 CONVERGED = 1e-14
-"""Step, relative to the radius, at which the inverse ends."""
+"""Step, relative to the radius, at which the inverse has converged."""
 FARTHEST = 20.0
-"""Ideal radius [r0] beyond which no inverse of a lens of several terms is sought."""
+"""Ideal radius [r0] beyond which no inverse of a lens with several terms is computed."""
 MET = 1e-10
-"""Error [r0] of an inverse through tangential terms above which there is none: beyond the fold."""
+"""Error [r0] of an inverse with tangential terms above which there is no inverse: the pixel lies beyond the fold."""
 
 
 def straight_lens(width: int, height: int) -> FloatArray:
@@ -38,12 +38,12 @@ def straight_lens(width: int, height: int) -> FloatArray:
 
 
 def bends(lens: FloatArray) -> bool:
-    """Whether a lens distorts."""
+    """Whether a lens has distortion."""
     return bool(lens[0] != 0.0 or (len(lens) > 4 and lens[4:].any()))
 
 
 def fold_radius(lens: FloatArray) -> float:
-    """Ideal radius [px] at which the radial function ceases to grow and the image folds back; infinite where it grows
+    """Ideal radius [px] at which the radial function stops growing and the image folds back; infinite if it grows
     everywhere.
     """
     k, k2 = float(lens[0]), float(lens[4]) if len(lens) > 4 else 0.0
@@ -67,9 +67,9 @@ def distort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def undistort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Ideal pixels (..., 2) of raw ones, the inverse of :func:`distort`; NaN where no ideal pixel has this image.
+    """Ideal pixels (..., 2) of raw ones, the inverse of :func:`distort`; NaN if no ideal pixel has this image.
 
-    Newton's method on the radius. With ``k < 0`` the image ends at a radius: nothing lies beyond.
+    Newton's method on the radius. With ``k < 0`` the image ends at a finite radius.
     """
     if len(lens) > 4:
         return _undistorted(lens, np.asarray(pixels, dtype=np.float64))
@@ -112,7 +112,7 @@ def _distorted(lens: FloatArray, offset: FloatArray) -> FloatArray:
 
 def _undistorted(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Ideal pixels (..., 2) of raw ones through a lens (7,): Newton's method within brackets on the radius, then on
-    both coordinates; NaN also where tangential terms carry a pixel beyond the radial image.
+    both coordinates; NaN also if tangential terms move a pixel beyond the radial image.
     """
     centre, r0 = lens[1:3], lens[3]
     k, k2 = lens[0], lens[4]
@@ -201,17 +201,17 @@ def terms_jacobian(lens: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 CENTRE_SHARE = 0.1
-"""Standard deviation of the centre about the middle of the image, beforehand [image widths]: a weak distortion does
-not show it."""
+"""Prior standard deviation of the centre about the middle of the image [image widths]: a weak distortion does not
+determine the centre."""
 GRID = (-0.3, -0.2, -0.13, -0.08, -0.04, 0.0, 0.04, 0.08, 0.13)
-"""Radial parameters at half the image width that are tried as starts."""
+"""Initial values of the radial parameter at half the image width."""
 MOST_UNCERTAIN = 1.0
 """Standard deviation of the radial parameter above which the lines do not determine it."""
 LINE_ITERATIONS = 60
 
 
 class LensEstimate(NamedTuple):
-    """``lens`` (4,), the covariance (3, 3) of its (k, cu, cv), and the fit's chi-square with its freedoms."""
+    """``lens`` (4,), covariance (3, 3) of its (k, cu, cv), chi-square of the fit and its degrees of freedom."""
 
     lens: FloatArray
     covariance: FloatArray
@@ -220,11 +220,11 @@ class LensEstimate(NamedTuple):
 
 
 def lens_from_lines(lines: Sequence[FloatArray], sigma: float, width: int, height: int) -> LensEstimate:
-    """The lens of a camera from raw pixels (n_i, 2) along straight lines, noise ``sigma`` [px] an axis.
+    """The lens of a camera from raw pixels (n_i, 2) along straight lines, noise ``sigma`` [px] per axis.
 
-    The centre is held by a weak prior (``CENTRE_SHARE``), which the covariance includes. The covariance is at the
-    larger of the stated and the estimated noise. Raises GeometryError: ``shape``, ``too_few`` (three pixels a line,
-    at least), ``not_finite``, ``degenerate`` where the lines do not determine the distortion (such as when all pass
+    A weak prior (``CENTRE_SHARE``) constrains the centre; the covariance includes it. The covariance is at the
+    larger of the stated and the estimated noise. Raises GeometryError: ``shape``, ``too_few`` (each line needs three
+    pixels), ``not_finite``, ``degenerate`` if the lines do not determine the distortion (such as when all pass
     through the centre), ``no_convergence``.
     """
     pixels, starts = _checked(lines, sigma)
@@ -232,7 +232,7 @@ def lens_from_lines(lines: Sequence[FloatArray], sigma: float, width: int, heigh
     weak = np.array([0.0, 1.0, 1.0]) / (CENTRE_SHARE * width)
 
     def errors_at(lens: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals (n + 3,) in sigmas, those of the prior last, and their Jacobian (n + 3, 3) by the lens."""
+        """Residuals (n + 3,) in sigmas, the prior's last, and their Jacobian (n + 3, 3) by the lens parameters."""
         error, slope = _projected(lens, pixels, starts, sigma)
         return np.append(error, weak * (lens[:3] - middle[:3])), np.vstack([slope, np.diag(weak)])
 
@@ -273,7 +273,7 @@ def lens_from_lines(lines: Sequence[FloatArray], sigma: float, width: int, heigh
 
 
 def _checked(lines: Sequence[FloatArray], sigma: float) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """All pixels (n, 2) and where each line starts (l + 1,)."""
+    """All pixels (n, 2) and the index at which each line starts (l + 1,)."""
     if not sigma > 0.0:
         raise GeometryError("shape", f"sigma is {sigma} px; it must be positive", sigma=sigma)
     if not len(lines):
@@ -292,8 +292,8 @@ def _checked(lines: Sequence[FloatArray], sigma: float) -> tuple[FloatArray, npt
 def _projected(
     lens: FloatArray, pixels: FloatArray, starts: npt.NDArray[np.int64], sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Distances (n,) of raw pixels from the images of their best lines [sigmas], and their derivatives (n, 3) by
-    (k, cu, cv) with the lines eliminated.
+    """Distances (n,) of raw pixels from the images of their best-fitting lines [sigmas], and their derivatives (n, 3)
+    by (k, cu, cv) with the lines eliminated.
     """
     ideal = undistort(lens, pixels)
     if not np.isfinite(ideal).all():

@@ -1,8 +1,7 @@
 """The fundamental matrix from matched pixels: linear, robust and refined; epipolar distances; a test of parallax
 against one homography.
 
-Convention: ``m'ᵀ F m = 0`` with ``m`` left, ``m'`` right, in pixels (the thesis's F of (2.10) is the
-transpose).
+Convention: ``m'ᵀ F m = 0`` with ``m`` left, ``m'`` right, in pixels (the thesis's F of (2.10) is the transpose).
 """
 
 from __future__ import annotations
@@ -22,12 +21,11 @@ Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 
 MIN_MATCHES = 8
 INLIER_SIGMAS = 3.29
-"""Sampson distance, in sigmas, that 99.9 % of true matches keep (one degree of freedom)."""
+"""Sampson distance [sigmas] that 99.9 % of true matches do not exceed (one degree of freedom)."""
 
 
 def fundamental_linear(left: FloatArray, right: FloatArray) -> FloatArray:
-    """``F`` (3, 3) of unit Frobenius norm from matches ``(n, 2)`` [px], n >= 8, by the normalised 8-point
-    method.
+    """``F`` (3, 3) of unit Frobenius norm from matches ``(n, 2)`` [px], n >= 8, by the normalised 8-point method.
 
     Raises GeometryError for fewer than eight matches, pixels that are not finite, or matches that leave F
     undetermined (on one point, line or plane).
@@ -54,18 +52,18 @@ def fundamental_robust(
     max_iterations: int = 10_000,
     refuse_plane: bool = True,
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """``F`` (3, 3) and inliers ``(n,)`` of matches ``(n, 2)`` [px] with outliers; noise ``sigma_px`` [px] a
+    """``F`` (3, 3) and inliers ``(n,)`` of matches ``(n, 2)`` [px] with outliers; noise ``sigma_px`` [px] per
     coordinate.
 
     MAGSAC with a fixed seed, then refinement on the matches within 3.29 sigmas, until they stay the same:
-    the same input gives the same output. Raises GeometryError where no F has eight inliers, or where a
-    homography explains the inliers as well (points of one plane leave F undetermined), unless ``refuse_plane`` is
-    false: then ask :func:`parallax_ratio`.
+    the same input gives the same output. Raises GeometryError if no F has eight inliers, or if a homography
+    explains the inliers as well (points of one plane leave F undetermined), unless ``refuse_plane`` is
+    false: then use :func:`parallax_ratio`.
     """
     if not sigma_px > 0:
         raise GeometryError("shape", f"sigma_px is {sigma_px}; it must be positive", sigma_px=sigma_px)
     left, right = _matches(left, right)
-    isotropic_normaliser(left), isotropic_normaliser(right)  # refuse single points before the random search
+    isotropic_normaliser(left), isotropic_normaliser(right)  # raises for coincident points before the random search
     threshold = INLIER_SIGMAS * sigma_px
     found = _sampled(left, right, threshold, max_iterations)
     if found is None:
@@ -91,7 +89,7 @@ def fundamental_robust(
 
 
 def _sampled(left: FloatArray, right: FloatArray, threshold: float, max_iterations: int) -> FloatArray | None:
-    """``F`` (3, 3) by MAGSAC, else by least median of squares; None where neither finds one."""
+    """``F`` (3, 3) by MAGSAC, else by least median of squares; None if neither finds one."""
     parameters = cv2.UsacParams()
     parameters.confidence = 0.9999
     parameters.isParallel = False
@@ -104,7 +102,7 @@ def _sampled(left: FloatArray, right: FloatArray, threshold: float, max_iteratio
         try:
             found, _ = cv2.findFundamentalMat(left, right, *arguments)
         except cv2.error:
-            continue  # OpenCV's searches assert on some inputs, good ones among them
+            continue  # OpenCV's searches assert on some inputs, valid ones among them
         if found is not None and np.shape(found) == (3, 3) and np.isfinite(found).all():
             return np.asarray(found, dtype=np.float64)
     return None
@@ -188,9 +186,7 @@ def _sampson_parts(
 
 
 def sampson_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Signed first-order distances ``(n,)`` [px] of matches ``(n, 2)`` to the epipolar constraint; NaN
-    passes through.
-    """
+    """Signed first-order distances ``(n,)`` [px] of matches ``(n, 2)`` to the epipolar constraint; NaN is kept."""
     x, y = to_homogeneous(left), to_homogeneous(right)
     value, _, _, length = _sampson_parts(F, x, y, (np.eye(2, 3), np.eye(2, 3)))
     distances: FloatArray = value / length
@@ -198,9 +194,7 @@ def sampson_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> Flo
 
 
 def epipolar_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Distances ``(n, 2)`` [px] of the left and the right pixel of each match to its epipolar line; NaN
-    passes through.
-    """
+    """Distances ``(n, 2)`` [px] of the left and right pixel of each match to its epipolar line; NaN is kept."""
     x, y = to_homogeneous(left), to_homogeneous(right)
     on_right, on_left = x @ F.T, y @ F
     value = np.abs((y * on_right).sum(axis=1))
@@ -210,14 +204,14 @@ def epipolar_distances(F: FloatArray, left: FloatArray, right: FloatArray) -> Fl
 
 
 ROUNDING_PX = 1e-8
-"""Misfit [px] below which there is nothing but rounding."""
+"""Residual [px] below which there is only rounding error."""
 
 
 def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
     """Variance ratio of the residuals of one homography to those of ``F``, for matches (n, 2) [px].
 
-    About 1 where the points lie on one plane or the cameras share a centre; each with its own degrees of freedom.
-    Infinite where no homography is found.
+    About 1 if the points lie on one plane or the cameras share a centre; each with its own degrees of freedom.
+    Infinite if no homography is found.
     """
     left, right = _matches(left, right)
     H, _ = cv2.findHomography(left, right, 0)
@@ -225,7 +219,7 @@ def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
         return float("inf")
     mapped = to_homogeneous(left) @ np.asarray(H).T
     transfer = right - mapped[:, :2] / mapped[:, 2:]
-    # A transfer carries the left image's noise, too, stretched by the map.
+    # A transfer error includes the left image's noise, stretched by the map.
     of_plane = (transfer**2).sum() / (2 * len(left) - 8) / (1.0 + abs(np.linalg.det(H[:2, :2])))
     of_pair = (sampson_distances(F, left, right) ** 2).sum() / max(1, len(left) - 7)
     # Two copies of one image leave rounding errors, whose ratio is meaningless.
@@ -233,7 +227,7 @@ def parallax_ratio(F: FloatArray, left: FloatArray, right: FloatArray) -> float:
 
 
 def _refuse_plane(left: FloatArray, right: FloatArray, sigma_px: float) -> None:
-    """Raise GeometryError where a homography explains the matches to their noise."""
+    """Raise GeometryError if a homography explains the matches to their noise."""
     H, _ = cv2.findHomography(left, right, 0)
     if H is None:
         return
@@ -242,7 +236,7 @@ def _refuse_plane(left: FloatArray, right: FloatArray, sigma_px: float) -> None:
         return
     transfer = right - mapped[:, :2] / mapped[:, 2:]
     rms = float(np.sqrt(np.median((transfer**2).sum(axis=1)) / 2))
-    # Transfer errors carry both images' noise, about √2 sigma, times the map's stretch.
+    # Transfer errors include both images' noise, about √2 sigma, times the map's stretch.
     stretch = np.sqrt(abs(np.linalg.det(H[:2, :2]))) if abs(H[2, 2]) > 0 else 1.0
     limit = 3.0 * sigma_px * float(np.hypot(1.0, stretch))
     if rms < limit:

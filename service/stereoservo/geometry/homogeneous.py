@@ -2,8 +2,7 @@
 and the error of degenerate geometric input.
 
 Points are rows ``(n, 4)``; a plane is a 4-vector ``a`` used as ``aᵀM`` (thesis 2.5). Points that enter one
-construction keep their orbital heights: nothing here renormalises a vector whose sign or scale is an
-answer.
+construction keep their orbital heights: no function here renormalises a vector whose sign or scale is a result.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from stereoservo.numerics.arrays import FloatArray
 
 RANK_TOLERANCE = 1e-12
-"""Relative singular value below which two vectors count as one: some thousand roundings."""
+"""Relative singular value below which two vectors count as equal: some thousand rounding errors."""
 
 
 def to_homogeneous(points: FloatArray) -> FloatArray:
@@ -34,8 +33,8 @@ def from_homogeneous(points: FloatArray) -> FloatArray:
 def plane_of_points(A1: FloatArray, A2: FloatArray, A3: FloatArray) -> FloatArray:
     """Oriented plane ``(..., 4)`` through three points ``(..., 4)``: ``aᵀX = det[A1 A2 A3 X]`` (2.61).
 
-    The signed 3x3 minors: the side of a point is the sign of ``aᵀX``, and swapping two points turns the
-    plane's face. Zero where the three points are collinear. As the dual, three planes give their common
+    The signed 3x3 minors: the side of a point is the sign of ``aᵀX``, and swapping two points reverses the
+    plane's orientation. Zero if the three points are collinear. By duality, three planes give their common
     point.
     """
     A1, A2, A3 = np.broadcast_arrays(A1, A2, A3)
@@ -57,9 +56,9 @@ def plane_of_points(A1: FloatArray, A2: FloatArray, A3: FloatArray) -> FloatArra
 
 
 def planes_through_line(A1: FloatArray, A2: FloatArray) -> FloatArray:
-    """Two orthonormal planes ``(2, 4)`` that meet in the line of two points ``(4,)`` (2.59, 2.60).
+    """Two orthonormal planes ``(2, 4)`` that meet in the line through two points ``(4,)`` (2.59, 2.60).
 
-    Raises GeometryError where the two points are one.
+    Raises GeometryError if the two points coincide.
     """
     return _complement(A1, A2, "points")
 
@@ -67,7 +66,7 @@ def planes_through_line(A1: FloatArray, A2: FloatArray) -> FloatArray:
 def line_of_planes(a1: FloatArray, a2: FloatArray) -> FloatArray:
     """Two orthonormal points ``(2, 4)`` on the line in which two planes ``(4,)`` meet (2.60).
 
-    Raises GeometryError where the two planes are one.
+    Raises GeometryError if the two planes coincide.
     """
     return _complement(a1, a2, "planes")
 
@@ -96,10 +95,10 @@ def unit_rows(rows: FloatArray) -> FloatArray:
 
 
 def whitener(points: FloatArray) -> FloatArray:
-    """Map ``W`` (4, 4) that gives the normalised points ``W M / |M|`` of ``(n, 4)`` unit second moments:
-    conditioning of linear fits.
+    """Map ``W`` (4, 4) that gives the normalised points ``W M / |M|`` of ``(n, 4)`` unit second moments: conditions
+    linear fits.
 
-    Raises GeometryError where the points are coplanar.
+    Raises GeometryError if the points are coplanar.
     """
     unit = unit_rows(points)
     values, vectors = np.linalg.eigh(unit.T @ unit / len(unit))
@@ -112,18 +111,16 @@ def whitener(points: FloatArray) -> FloatArray:
 
 
 def move_points(H: FloatArray, M: FloatArray) -> FloatArray:
-    """``H M`` (..., 4) of points ``(..., 4)`` under a map ``H`` (4, 4), without normalisation of the scale."""
+    """``H M`` (..., 4) of points ``(..., 4)`` under a map ``H`` (4, 4), without normalising the scale."""
     moved: FloatArray = np.asarray(M, dtype=np.float64) @ H.T
     return moved
 
 
 class GeometryError(ValueError):
-    """Degenerate or malformed geometric input. The text holds the cause, the value, and what would be
-    valid.
+    """Degenerate or malformed geometric input. The text states the cause, the value, and what would be valid.
 
     Attributes: code: short machine-readable cause: ``"shape"``, ``"not_finite"``, ``"too_few"``,
-    ``"degenerate"``, ``"orientation"``, ``"half_turn"``, ``"no_model"``. data: the values that the message
-    speaks of.
+    ``"degenerate"``, ``"orientation"``, ``"half_turn"``, ``"no_model"``. data: the values in the message.
     """
 
     def __init__(self, code: str, message: str, **data: Any) -> None:

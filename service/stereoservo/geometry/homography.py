@@ -11,16 +11,15 @@ from stereoservo.geometry.homogeneous import GeometryError, to_homogeneous, whit
 from stereoservo.numerics.arrays import FloatArray
 
 COPLANAR_TAIL = 1e-3
-"""Probability with which coplanar points are taken for spatial ones."""
+"""Probability with which coplanar points are accepted as spatial ones."""
 
 
 def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
-    """``H`` (4, 4) with ``B_i ~ H A_i`` for points ``(n, 4)``, n >= 5, linear with whitening; ``|det H| =
-    1``.
+    """``H`` (4, 4) with ``B_i ~ H A_i`` for points ``(n, 4)``, n >= 5, linear with whitening; ``|det H| = 1``.
 
-    The sign keeps heights: ``H A_i`` points where ``B_i`` does. Rows with NaN are left out. Raises
-    GeometryError for fewer than five points or points that leave H undetermined (coplanar): exactly so, or, from six
-    points on, within the noise that the fit shows. Five points fit exactly and show none: where they are noisy ask
+    The sign keeps heights: ``H A_i`` points in the direction of ``B_i``. Rows with NaN are left out. Raises
+    GeometryError for fewer than five points or points that leave H undetermined (coplanar): exactly, or, from six
+    points on, within the noise that the fit shows. Five points fit exactly and show no noise: for noisy ones use
     `moved_cameras.refuse_coplanar`.
     """
     H, count, values = _least_squares_homography(A, B)
@@ -37,11 +36,11 @@ def homography_from_points(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def _chance_of_coplanar(values: FloatArray, count: int) -> float:
-    """Probability of a least singular value as far below the one before it, if the points were coplanar.
+    """Probability of a least singular value so far below the next larger one, if the points were coplanar.
 
-    Whitening takes the noise across the plane of coplanar points for their fourth coordinate. Then both values are of
-    that noise alone, over 3 n - 14 freedoms, the least of them the smaller by √3: H is the identity of the plane's
-    three coordinates there, of unit norm. For two directions of equal noise over ν freedoms,
+    Whitening uses the noise across the plane of coplanar points as their fourth coordinate. Then both values consist of
+    that noise alone, over 3 n - 14 degrees of freedom, the least of them smaller by √3: there H is the identity of the
+    plane's three coordinates, of unit norm. For two directions of equal noise over ν degrees of freedom,
     ``(2 s t / (s² + t²))^(ν - 1)`` is uniform in [0, 1] (the test of sphericity, exact for two).
     """
     if count < 6:
@@ -51,15 +50,15 @@ def _chance_of_coplanar(values: FloatArray, count: int) -> float:
 
 
 def linear_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int, FloatArray]:
-    """``H`` (4, 4) as of `homography_from_points`, without its test against noise: for points that have passed
-    another. Also the number of points used, and the 16 singular values of the equations.
+    """``H`` (4, 4) as by `homography_from_points`, without its test against noise: for points that have passed
+    another test. Also the number of points used, and the 16 singular values of the equations.
     """
     H, count, values = _least_squares_homography(A, B)
     return unit_determinant(H, "the homography"), count, values
 
 
 def _least_squares_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray, int, FloatArray]:
-    """As `linear_homography`, but ``H`` of any scale and perhaps singular."""
+    """As `linear_homography`, but ``H`` has any scale and may be singular."""
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
     if A.ndim != 2 or A.shape[1] != 4 or A.shape != B.shape:
         raise GeometryError("shape", f"point sets have shapes {A.shape} and {B.shape}; both must be (n, 4)")
@@ -71,8 +70,8 @@ def _least_squares_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray,
     a, b = A @ W_A.T, B @ W_B.T
     a = a / np.linalg.norm(a, axis=1, keepdims=True)
     b = b / np.linalg.norm(b, axis=1, keepdims=True)
-    # Three rows a point: an orthonormal basis of the planes through b, from the Householder reflection that
-    # moves b to e₁.
+    # Three rows per point: an orthonormal basis of the planes through b, from the Householder reflection that
+    # maps b to e₁.
     sign = np.where(b[:, :1] >= 0, 1.0, -1.0)
     mirror = b + sign * np.eye(1, 4)
     mirror = mirror / np.linalg.norm(mirror, axis=1, keepdims=True)
@@ -90,7 +89,7 @@ def _least_squares_homography(A: FloatArray, B: FloatArray) -> tuple[FloatArray,
 def plane_homography(plane: FloatArray, pixels: FloatArray) -> FloatArray:
     """``H`` (3, 3) from points of a plane ``(n, 2)`` to pixels ``(n, 2)``, n >= 4, linear in normalised coordinates.
 
-    The sign gives the points a positive depth. Raises GeometryError where they leave it open (on one line).
+    The sign gives the points a positive depth. Raises GeometryError if they do not determine H (collinear).
     """
     if len(plane) < 4:
         raise GeometryError("too_few", f"{len(plane)} points; a plane's homography needs at least 4")
@@ -106,7 +105,7 @@ def plane_homography(plane: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def unit_determinant(H: FloatArray, what: str) -> FloatArray:
-    """``H`` (4, 4) scaled to ``|det H| = 1``. Raises GeometryError where it is singular."""
+    """``H`` (4, 4) scaled to ``|det H| = 1``. Raises GeometryError if it is singular."""
     size = float(np.linalg.norm(H))
     determinant = abs(float(np.linalg.det(H / size)))
     if not determinant > 1e-20:
@@ -120,7 +119,7 @@ def pixel_whitening(
 ) -> FloatArray:
     """Whitening ``(n, 2c, 2c)`` of the pixel differences of each point, 0 where not seen.
 
-    ``weights`` (c, n) [1/px]. The points' own covariance, if given, is carried into the images to first order.
+    ``weights`` (c, n) [1/px]. The points' own covariance, if given, is propagated into the images to first order.
     """
     w = np.repeat(weights.T, 2, axis=1)
     if M_covariance is None:

@@ -1,9 +1,10 @@
-"""Alignment of points, lines and planes, in any mix, with their present images: the map between two projective frames
-that has least image error, of the group that the frames' strata allow (thesis 2.5.3, 2.6.2).
+"""Alignment of points, lines and planes, in any mix, with their current images: the map between two projective frames
+of least image error, in the group that the frames' strata allow (thesis 2.5.3, 2.6.2).
 
-A line is what images of it give, segments whose ends need not be the same places in two images, then and now; of a
-plane, points that lie on it then and others now. The start is linear in all constraints (2.84), or, with fewer than
-these need, of metric frames by the lines' directions; it is refined on the group as points alone are (`alignment`).
+A line is given by image segments, whose ends need not correspond between images or between the old and the current
+views; a plane by points on it, others in the old views than in the current ones. The start is linear in all constraints
+(2.84), or, if these are too few and the frames are metric, from the lines' directions; it is refined on the group as
+for points alone (`alignment`).
 """
 
 from __future__ import annotations
@@ -43,26 +44,26 @@ from stereoservo.geometry.moved_cameras import FrameChange
 from stereoservo.numerics.arrays import FloatArray
 
 EPIPOLAR = 4.0
-"""By how much more than to be told from one in an epipolar plane a line must differ, so that its covariance holds."""
+"""Factor on the noise in the test for lines in an epipolar plane, so that the covariance of accepted ones is valid."""
 STEP_PX = 1e-3
-"""Of the difference quotients of triangulated lines."""
+"""Step of the difference quotients of triangulated lines [px]."""
 DIRECTIONS = 5
-"""Lines, at most, whose two ways round are all tried."""
+"""Most lines for which both orientations are tried."""
 STARTS = 4
 AMBIGUOUS = 25.0
-"""Two maps whose squared errors differ by less, in variances, explain the images alike."""
+"""Two maps whose squared errors [variances] differ by less than this explain the images equally well."""
 APART = 0.02
-"""Of maps at unit norm, from which on they are two."""
+"""Difference of maps of unit norm from which they count as two."""
 FIRM = 25.0
-"""Variance of a feature over the median one up to which it counts in the linear start."""
+"""Variance of a feature, relative to the median one, up to which the linear start uses it."""
 EQUATIONS = 15
-"""That determine a homography of space."""
+"""Number of equations that determine a homography of space."""
 
 
 @dataclass(frozen=True, eq=False)
 class MixedFeatures:
     """Features in ``c`` cameras of a frame: ``points`` (c, n, 2), ``segments`` (c, m, 2, 2) of lines and ``on_planes``,
-    for each plane (c, k, 2) of points on it [px]; NaN where missing. ``sigmas`` (c, n), ``line_sigmas`` (c, m),
+    for each plane the points (c, k, 2) on it [px]; NaN where missing. ``sigmas`` (c, n), ``line_sigmas`` (c, m),
     ``plane_sigmas`` (c, k) [px].
     """
 
@@ -76,8 +77,8 @@ class MixedFeatures:
 
 @dataclass(frozen=True)
 class _Lines:
-    """Lines then by two points each, ``A`` (m, 2, 4) with ``covariance`` (m, 8, 8), and their image ``lines`` (c, m, 3)
-    now, of ``segments`` (c, m, 2, 2) known to ``sigmas`` (c, m) [px]; NaN where missing.
+    """Line constraints: each old line as two points, ``A`` (m, 2, 4) with ``covariance`` (m, 8, 8), and its current
+    image ``lines`` (c, m, 3), from ``segments`` (c, m, 2, 2) with noise ``sigmas`` (c, m) [px]; NaN where missing.
     """
 
     Ps: FloatArray
@@ -88,7 +89,7 @@ class _Lines:
     sigmas: FloatArray
 
     def _moved(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Moved points (m, 2, 4) and derivatives (c, m, 2, 4) of their distances [px] from the lines by these."""
+        """Moved points (m, 2, 4) and the derivatives (c, m, 2, 4) of their distances [px] from the lines by them."""
         moved = self.A @ T.T
         J = projection_jacobian_many(self.Ps, moved.reshape(-1, 4)).reshape(len(self.Ps), -1, 2, 2, 4)
         return moved, np.einsum("cmi,cmkij->cmkj", self.lines[..., :2], J)
@@ -101,14 +102,14 @@ class _Lines:
         return away
 
     def whitening(self, T: FloatArray) -> FloatArray:
-        """Whitening (m, 2c, 2c) of the distances: of the ends now, and of the line then."""
+        """Whitening (m, 2c, 2c) of the distances: noise of the current ends and of the old line."""
         c = len(self.Ps)
         moved, J = self._moved(T)
         pixels = project_many(self.Ps, moved.reshape(-1, 4)).reshape(c, -1, 2, 2)
         along = self.segments[..., 1, :] - self.segments[..., 0, :]
         squared = (along**2).sum(axis=-1)
         s = ((pixels - self.segments[..., :1, :]) * along[..., None, :]).sum(axis=-1) / squared[..., None]
-        shares = np.stack([1.0 - s, s], axis=-1)  # of the two ends, in the line at each point
+        shares = np.stack([1.0 - s, s], axis=-1)  # weights of the two ends at each point of the line
         whitening = np.zeros((self.A.shape[0], 2 * c, 2 * c))
         by_A = np.einsum("cmkj,ji->cmki", J, T)
         for m in range(self.A.shape[0]):
@@ -142,8 +143,8 @@ class _Lines:
 
 @dataclass(frozen=True)
 class _Planes:
-    """Points then, ``X`` (p, 4) with ``covariance`` (p, 4, 4), each with the plane ``b`` (p, 4) on which it is now and
-    that plane's ``plane_covariance`` (p, 4, 4); points now are scaled to depth 1 in the camera ``P`` (3, 4).
+    """Plane constraints: old points ``X`` (p, 4) with ``covariance`` (p, 4, 4), each with its current plane ``b``
+    (p, 4) and ``plane_covariance`` (p, 4, 4); current points are scaled to depth 1 in the camera ``P`` (3, 4).
     """
 
     P: FloatArray
@@ -158,7 +159,7 @@ class _Planes:
         return moved / depth[:, None], depth
 
     def whitening(self, T: FloatArray) -> FloatArray:
-        """One over the deviation of each point's distance from its plane, (p,)."""
+        """Inverse standard deviation (p,) of each point's distance from its plane."""
         moved, depth = self._moved(T)
         by_point = (self.b @ T) / depth[:, None]
         variance = np.einsum("pi,pij,pj->p", by_point, self.covariance, by_point)
@@ -167,12 +168,12 @@ class _Planes:
         return deviations
 
     def residuals(self, T: FloatArray, whitening: FloatArray) -> FloatArray:
-        """Distances in deviations, (p,)."""
+        """Distances (p,) in standard deviations."""
         away: FloatArray = (self._moved(T)[0] * self.b).sum(axis=1) * whitening
         return away
 
     def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
-        """Derivatives (p, k) of the residuals by the map."""
+        """Derivatives (p, k) of the residuals by the map's parameters."""
         moved, _ = self._moved(T)
         steps = np.einsum("gij,pj->pgi", generators, moved)
         along = steps - (steps @ self.P[2])[..., None] * moved[:, None]
@@ -182,7 +183,7 @@ class _Planes:
 
 @dataclass(frozen=True)
 class _Mixed:
-    """All constraints as one, with the methods of `PointViews`."""
+    """All constraints together, with the methods of `PointViews`."""
 
     parts: tuple[PointViews | _Lines | _Planes, ...]
 
@@ -199,10 +200,10 @@ class _Mixed:
 
 
 def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two points (m, 2, 4), at depth 1, of each line of segments ``(c, m, 2, 2)`` [px], NaN where missing, and their
-    covariance (m, 8, 8) for ends known to ``sigmas`` (c, m) [px].
+    """Two points (m, 2, 4), at depth 1, on each line of segments ``(c, m, 2, 2)`` [px], NaN where missing, and their
+    covariance (m, 8, 8) for ends of noise ``sigmas`` (c, m) [px].
 
-    They are where the line crosses the planes through the ends in the first camera that sees it, square to its image.
+    They lie where the line crosses the planes through the ends in the first camera that sees it, normal to its image.
     Raises GeometryError for lines that fewer than two cameras see, and lines in an epipolar plane.
     """
     m = segments.shape[1]
@@ -262,11 +263,11 @@ def plane_through(points: FloatArray, covariance: FloatArray) -> tuple[FloatArra
 def align_incidences(
     family: Family, old: AlignmentFrame, new: AlignmentFrame, then: MixedFeatures, now: MixedFeatures
 ) -> tuple[FrameChange, FloatArray, FloatArray]:
-    """Map of the family that brings the features ``then`` of the old frame onto those ``now`` of the new one; rms
-    distances of the points (n,) and weighted largest distances of the lines (m,) [px] that are left in the new cameras.
+    """Map of the family from the features ``then`` of the old frame to those ``now`` of the new one; residuals in the
+    new cameras: rms distances of the points (n,) and weighted largest distances of the lines (m,) [px].
 
-    Features go by their places in both. Raises GeometryError for features that are not known from two cameras, too few
-    of them, and where they leave the map open, or leave two.
+    Features correspond by index. Raises GeometryError for features that are not determined by two cameras, too few
+    features, and if these do not determine the map, or leave two.
     """
     mixed, incidences, firmness = _constraints(old, new, then, now)
     up_old, up_new = upgrades(family, old, new)
@@ -282,7 +283,7 @@ def align_incidences(
                 T = descend(start, generators, mixed)
                 left = mixed.residuals(T, mixed.whitening(T))
         except np.linalg.LinAlgError:
-            continue  # it diverged from this start
+            continue  # diverged from this start
         if np.isfinite(left).all() and _before_cameras(T, incidences, new):
             found.append((float(left @ left), T))
     if not found:
@@ -309,8 +310,8 @@ def align_incidences(
 
 
 def _left(mixed: _Mixed, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rms distances of points [px] and largest distances of lines, in units of what these are uncertain by beside the
-    noise now [px], that the map ``T`` (4, 4) leaves: a line that nearly lay in an epipolar plane then tells little.
+    """Residuals of the map ``T`` (4, 4): rms distances of points [px], and largest distances of lines, relative to
+    their uncertainty beside the current noise [px]: a line that lay nearly in an epipolar plane then counts little.
     """
     points, lines = np.zeros(0), np.zeros(0)
     for part in mixed.parts:
@@ -326,7 +327,7 @@ def _left(mixed: _Mixed, T: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _constraints(
     old: AlignmentFrame, new: AlignmentFrame, then: MixedFeatures, now: MixedFeatures
 ) -> tuple[_Mixed, list[Incidence], FloatArray]:
-    """All constraints in pixels, the same as incidences of space, and the variance of each feature then."""
+    """All constraints in pixels, the same ones as incidences in space, and the variance of each old feature."""
     M = triangulate(old.Ps, then.points, then.sigmas, iterations=6)
     Y = triangulate(new.Ps, now.points, now.sigmas, iterations=6)
     lost = np.flatnonzero(~(np.isfinite(M).all(axis=1) & np.isfinite(Y).all(axis=1)))
@@ -372,7 +373,7 @@ def _on_plane(
     now_px: FloatArray,
     now_sigmas: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Points then with covariances, the plane now with its covariance, and three points (3, 4) that span it."""
+    """Old points with covariances, the current plane with its covariance, and three points (3, 4) that span it."""
     X = triangulate(old.Ps, then_px, then_sigmas, iterations=6)
     Y = triangulate(new.Ps, now_px, now_sigmas, iterations=6)
     known_X, known_Y = np.isfinite(X).all(axis=1), np.isfinite(Y).all(axis=1)
@@ -398,7 +399,7 @@ def _starts(
     firmness: FloatArray,
     noise_px: float,
 ) -> list[FloatArray]:
-    """First maps, the likeliest first. Raises GeometryError where the constraints are too few for any."""
+    """Initial maps, the most likely first. Raises GeometryError if the constraints are too few for any."""
     starts: list[FloatArray] = []
     refusal: GeometryError | None = None
     if sum(incidence.equations for incidence in incidences) >= EQUATIONS:
@@ -426,7 +427,7 @@ def _starts(
 
 
 def _firm(incidences: Sequence[Incidence], firmness: FloatArray) -> list[Incidence]:
-    """Those whose features then are well known: uncertain ones would rule the linear solution."""
+    """Incidences whose old features are accurate: inaccurate ones would dominate the linear solution."""
     kept = [
         incidence for incidence, trace in zip(incidences, firmness, strict=True) if trace <= FIRM * np.median(firmness)
     ]
@@ -434,7 +435,7 @@ def _firm(incidences: Sequence[Incidence], firmness: FloatArray) -> list[Inciden
 
 
 def _in_front(T: FloatArray, incidences: Sequence[Incidence], new: AlignmentFrame) -> FloatArray:
-    """``T`` with the sign that brings the features before the first camera."""
+    """``T`` with the sign that puts the features in front of the first camera."""
     return T if float(np.sign(_present(incidences, T) @ new.Ps[0, 2]).sum()) >= 0.0 else -T
 
 
@@ -486,7 +487,7 @@ def _shift(
     *,
     scaled: bool,
 ) -> tuple[float, FloatArray] | None:
-    """What is left, and the map with rotation ``R`` (3, 3), by linear least squares; None where it stays open."""
+    """Residual and map with rotation ``R`` (3, 3), by linear least squares; None if it is not determined."""
     rows, rhs = [], []
     for incidence, a, b in zip(incidences, old, new, strict=True):
         across = np.eye(3)
@@ -518,6 +519,6 @@ def _present(incidences: Sequence[Incidence], T: FloatArray) -> FloatArray:
 
 
 def _before_cameras(T: FloatArray, incidences: Sequence[Incidence], new: AlignmentFrame) -> bool:
-    """Whether all moved points lie on the same side of each camera."""
+    """Whether each camera has all moved points on the same side."""
     depths = _present(incidences, T) @ new.Ps[:, 2].T
     return bool((np.sign(depths) == np.sign(depths[0])).all())

@@ -24,13 +24,13 @@ from stereoservo.numerics.arrays import FloatArray
 # of L = n - k hyperplanes, a multi-row. Both are stored one vector a row: ``(K, N)`` and ``(L, N)``. The empty
 # subspace has no point, the whole space no hyperplane: ``(0, N)``. Results are orthonormal rows.
 #
-# Ranks are numerical. A sine in R^N counts as zero below ``tolerance``: between rounding (1e-16) and geometry for
-# exact input. Noisy input needs the noise's own size, in a frame where coordinates are of order one
-# (`stereoservo.geometry.homogeneous.whitener`).
+# Ranks are numerical. A sine in R^N counts as zero below ``tolerance``; the default lies between rounding (1e-16) and
+# the sines of exact input. Noisy input needs a tolerance of the size of its noise, in a frame where coordinates are of
+# order one (`stereoservo.geometry.homogeneous.whitener`).
 
 
 TOLERANCE = 1e-9
-"""Sine below which a vector counts as lying in a subspace, unless the caller states another."""
+"""Default of the sine below which a vector counts as lying in a subspace."""
 
 Position = Literal["disjoint", "intersecting", "first_in_second", "second_in_first", "coincident"]
 
@@ -47,10 +47,10 @@ def _vectors(vectors: FloatArray) -> FloatArray:
 
 
 def basis(vectors: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
-    """Orthonormal rows ``(rank, N)`` that span what the vectors ``(m, N)`` span (2.62).
+    """Orthonormal rows ``(rank, N)`` that span the same subspace as the vectors ``(m, N)`` (2.62).
 
-    The rank counts singular values of the unit vectors above ``tolerance`` times the largest. Of points, the
-    join; of hyperplanes, the multi-row of their meet. Raises GeometryError for vectors that are zero or not
+    The rank counts singular values of the unit vectors above ``tolerance`` times the largest. For points the result is
+    their join; for hyperplanes, the multi-row of their meet. Raises GeometryError for vectors that are zero or not
     finite.
     """
     unit = _vectors(vectors)
@@ -61,7 +61,7 @@ def basis(vectors: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
 
 
 def dual(vectors: FloatArray, tolerance: float = TOLERANCE) -> FloatArray:
-    """Multi-row ``(N - rank, N)`` of a multi-column ``(m, N)``, and the reverse: the complement (2.65-2.67)."""
+    """Multi-row ``(N - rank, N)`` of a multi-column ``(m, N)``, and vice versa: the complement (2.65-2.67)."""
     unit = _vectors(vectors)
     if not len(unit):
         return np.eye(unit.shape[1])
@@ -85,8 +85,8 @@ def _same_space(*subspaces: FloatArray) -> None:
 def incidence_matrix(planes: FloatArray, points: FloatArray) -> FloatArray:
     """``C = [[a]] [[A]]`` (L, K) of a multi-row ``(L, N)`` and a multi-column ``(K, N)`` (2.74).
 
-    Zero where the points' span lies in the meet of the planes (2.77). Its kernel gives the intersection (2.75).
-    Vectors are taken as they are; for sines give orthonormal ones (`basis`).
+    Zero if the points' span lies in the meet of the planes (2.77). Its kernel gives the intersection (2.75).
+    Vectors are not normalised; the entries are sines if they are orthonormal (`basis`).
     """
     _same_space(planes, points)
     C: FloatArray = np.atleast_2d(planes) @ np.atleast_2d(points).T
@@ -110,10 +110,10 @@ class Relation:
 def relation(first: FloatArray, second: FloatArray, tolerance: float = TOLERANCE) -> Relation:
     """Relation of the spans of points ``first`` (m, N) and ``second`` (m', N) (2.74-2.77, fig. 2.15).
 
-    The incidence matrix of the second's multi-row and the first's multi-column has as singular values the sines
+    The singular values of the incidence matrix of the second's multi-row and the first's multi-column are the sines
     of principal angles, since both are orthonormal. With their rank, ``d = K - rank - 1``, and the subspaces are
     disjoint iff ``rank = K`` (errata; the thesis's ``L`` is wrong). Intersections of two lines in the plane and
-    of a line with a plane in space always exist; two lines in space meet only where a sine vanishes.
+    of a line with a plane in space always exist; two lines in space meet only if a sine vanishes.
     """
     _same_space(first, second)
     A, B = basis(first, tolerance), basis(second, tolerance)
@@ -146,12 +146,12 @@ def coincident(first: FloatArray, second: FloatArray, tolerance: float = TOLERAN
 PRIMITIVES = {1: "point", 2: "line", 3: "plane"}
 
 RANK = 1e-12
-"""Rank tolerance inside one primitive, whose independence `Incidence` has checked already."""
+"""Rank tolerance inside one primitive; `Incidence` has already checked the independence of its vectors."""
 
 UNDETERMINED = 0.3
-"""Standard deviation of a homography, relative to its norm, above which it counts as not determined."""
+"""Standard deviation of a homography, relative to its norm, above which it counts as undetermined."""
 REGULAR = 5.0
-"""Standard deviations by which a homography's determinant must differ from zero."""
+"""Number of standard deviations by which a homography's determinant must differ from zero."""
 
 
 @dataclass(frozen=True)
@@ -159,9 +159,9 @@ class Incidence:
     """A constraint on a homography: the span of ``first``, once moved, lies in the span of ``second`` (2.77).
 
     ``first`` (K, 4) points in the first frame, ``second`` (K', 4) points in the second one: 1 a point, 2 a line,
-    3 a plane; K = K' makes them coincide. The reverse, K > K', is not linear in H: give it to the inverse map.
-    ``images``: what c cameras saw of ``second``, NaN where missing: pixels (c, 2) of a point, segments (c, 2, 2)
-    of a line [px]. Points of ``first`` are then compared there: for a line give the ends that matter.
+    3 a plane; K = K' makes them coincide. The reverse, K > K', is not linear in H: use it with the inverse map.
+    ``images``: observations of ``second`` by c cameras, NaN where missing: pixels (c, 2) of a point, segments
+    (c, 2, 2) of a line [px]. Points of ``first`` are then compared there: for a line pass the ends that matter.
     """
 
     first: FloatArray
@@ -213,10 +213,10 @@ def homography_from_incidences(incidences: Sequence[Incidence], tolerance: float
     """``H`` (4, 4) from any mix of point, line and plane constraints, linear (2.84-2.87); ``|det H| = 1``.
 
     Each element of ``[[b]] H [[A]] = 0`` is one equation; whitened as in `homography_from_points`, with which it
-    agrees to rounding on points. The sign keeps the heights of points onto points; without such it makes the
-    largest entry positive. Five points, five lines or five planes in general position determine H, four lines
-    with their two transversals do not. Raises GeometryError for fewer than 15 equations, and with the dimension
-    of the family left where they do not determine H (singular values below ``tolerance``).
+    agrees to rounding on points. The sign keeps the heights of points constrained to points; without such constraints
+    the largest entry is positive. Five points, five lines or five planes in general position determine H, four lines
+    with their two transversals do not. Raises GeometryError for fewer than 15 equations, and, stating the dimension
+    of the remaining family, if they do not determine H (singular values below ``tolerance``).
     """
     equations = sum(incidence.equations for incidence in incidences)
     kinds = ", ".join(f"{count} x {kind}" for kind, count in Counter(map(str, incidences)).items()) or "nothing"
@@ -275,14 +275,15 @@ def _span_whitener(subspaces: Sequence[FloatArray], name: str) -> FloatArray:
 def homography_refine_incidences(
     H: FloatArray, incidences: Sequence[Incidence], Ps: FloatArray, sigma: float = 1.0
 ) -> FloatArray:
-    """``H`` (4, 4) that meets point, line and plane constraints with least squared pixel errors, ``|det H| = 1``.
+    """``H`` (4, 4) that satisfies point, line and plane constraints with least squared pixel errors, ``|det H| = 1``.
 
     The renormalised form of (2.86): in cameras ``Ps`` (c, 3, 4) of the second frame, a moved point is compared to
     a target's pixels, or by its distance to a target line's segments, scaled by its own current depth. A target
     without ``images`` (all planes) is compared by the least displacement of the moved point's pixels, ``sigma``
-    [px] each, that brings it into the target, to first order. ``H`` is a start (`homography_from_incidences`).
+    [px] each, that brings it into the target, to first order. ``H`` is the start (`homography_from_incidences`).
 
-    Raises GeometryError for fewer than 15 pixel errors, images of other cameras, and an undetermined H.
+    Raises GeometryError for fewer than 15 pixel errors, ``images`` of a different number of cameras, and an
+    undetermined H.
     """
     Ps = np.asarray(Ps, dtype=np.float64)
     points = np.concatenate([incidence.first for incidence in incidences])
@@ -308,7 +309,7 @@ def homography_refine_incidences(
 
 
 def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray, sigma: float) -> None:
-    """Raise GeometryError where noise leaves ``H`` (4, 4), moved along ``chart`` (16, 15), open or near-singular."""
+    """Raise GeometryError if noise leaves ``H`` (4, 4), moved along ``chart`` (16, 15), undetermined or singular."""
     _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
     uncertainty = 1.0 / max(float(singular[14]), 1e-300)
     if uncertainty > UNDETERMINED:
@@ -319,7 +320,7 @@ def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray,
             uncertainty=uncertainty,
             singular=singular,
         )
-    # Of the determinant, relative: tr(H⁻¹ dH) over the covariance of dH.
+    # Relative standard deviation of the determinant: tr(H⁻¹ dH) over the covariance of dH.
     covariance_px = np.linalg.inv(H).T.ravel() @ chart @ (rows.T / singular)
     deviations = 1.0 / max(float(np.linalg.norm(covariance_px)), 1e-300)
     if deviations < REGULAR:
@@ -334,7 +335,7 @@ def _refuse_undetermined(H: FloatArray, chart: FloatArray, jacobian: FloatArray,
 
 @dataclass(frozen=True)
 class _PixelTargets:
-    """Targets of moved points, as flat lists: index of the point, index of the camera, pixel."""
+    """Targets of moved points as flat lists: index of the point, index of the camera, pixel."""
 
     pixel_at: tuple[list[int], list[int]]
     pixels: FloatArray

@@ -3,7 +3,7 @@
 A line is a 6-vector ``(d, m)``: of points ``A``, ``B`` the direction ``d = A₄ B₁₂₃ - B₄ A₁₂₃`` and the moment
 ``m = A₁₂₃ x B₁₂₃``, with ``dᵀm = 0``. In a Euclidean frame d is the direction and m the moment about the origin.
 Two points span it and two planes meet in it (thesis 2.5.2); stacks come first: ``(n, 6)``. An image line ``l`` (3,)
-holds the ideal pixels with ``lᵀ(u, v, 1) = 0`` and is scaled so that this is a signed distance [px].
+consists of the ideal pixels with ``lᵀ(u, v, 1) = 0`` and is scaled so that this is a signed distance [px].
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from stereoservo.geometry.homogeneous import RANK_TOLERANCE, GeometryError, to_h
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 CERTAINTY = 3.0
-"""Standard deviations of a segment's direction by which it must differ from the epipolar line."""
+"""Number of standard deviations of its direction by which a segment must differ from the epipolar line."""
 
 
 def line_through_points(A: FloatArray, B: FloatArray) -> FloatArray:
-    """Plücker coordinates ``(..., 6)`` of the line from ``A`` (..., 4) to ``B`` (..., 4); zero where they are one."""
+    """Plücker coordinates ``(..., 6)`` of the line from ``A`` (..., 4) to ``B`` (..., 4); zero if they coincide."""
     A, B = np.broadcast_arrays(np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64))
     d = A[..., 3:] * B[..., :3] - B[..., 3:] * A[..., :3]
     line: FloatArray = np.concatenate([d, np.cross(A[..., :3], B[..., :3])], axis=-1)
@@ -32,13 +32,13 @@ def line_through_points(A: FloatArray, B: FloatArray) -> FloatArray:
 def line_in_planes(a: FloatArray, b: FloatArray) -> FloatArray:
     """Plücker coordinates ``(..., 6)`` of the meet of planes ``(..., 4)``: the dual of `line_through_points` (2.60)."""
     swapped = line_through_points(a, b)
-    # Points give (d, m), planes (m, d), up to the sign that the order of the two leaves open.
+    # Points give (d, m), planes (m, d), up to the sign, which depends on the order of the two.
     line: FloatArray = np.concatenate([swapped[..., 3:], swapped[..., :3]], axis=-1)
     return line
 
 
 def span_matrix(L: FloatArray) -> FloatArray:
-    """``A Bᵀ - B Aᵀ`` (..., 4, 4) of lines ``(..., 6)``: a plane times it is the point where plane and line cross."""
+    """``A Bᵀ - B Aᵀ`` (..., 4, 4) of lines ``(..., 6)``: maps a plane to its intersection with the line."""
     L = np.asarray(L, dtype=np.float64)
     matrix = np.zeros((*L.shape[:-1], 4, 4))
     matrix[..., :3, :3] = cross_matrix(-L[..., 3:])
@@ -48,7 +48,7 @@ def span_matrix(L: FloatArray) -> FloatArray:
 
 
 def meet_matrix(L: FloatArray) -> FloatArray:
-    """``a bᵀ - b aᵀ`` (..., 4, 4) of lines ``(..., 6)``: a point times it is the plane of point and line."""
+    """``a bᵀ - b aᵀ`` (..., 4, 4) of lines ``(..., 6)``: maps a point to the plane through it and the line."""
     L = np.asarray(L, dtype=np.float64)
     return span_matrix(np.concatenate([L[..., 3:], L[..., :3]], axis=-1))
 
@@ -63,12 +63,12 @@ def cross_matrix(w: FloatArray) -> FloatArray:
 
 
 def line_points(L: FloatArray) -> FloatArray:
-    """Two orthonormal points ``(..., 2, 4)`` whose join is the line ``(..., 6)`` (2.78), its orientation kept."""
+    """Two orthonormal points ``(..., 2, 4)`` whose join is the line ``(..., 6)`` (2.78), with its orientation."""
     return _two_rows(span_matrix(checked_lines(L)), L, line_through_points)
 
 
 def line_planes(L: FloatArray) -> FloatArray:
-    """Two orthonormal planes ``(..., 2, 4)`` whose meet is the line ``(..., 6)`` (2.79), its orientation kept."""
+    """Two orthonormal planes ``(..., 2, 4)`` whose meet is the line ``(..., 6)`` (2.79), with its orientation."""
     return _two_rows(meet_matrix(checked_lines(L)), L, line_in_planes)
 
 
@@ -79,14 +79,14 @@ def _two_rows(matrix: FloatArray, L: FloatArray, line_of: Callable[[FloatArray, 
 
 
 def line_residual(L: FloatArray) -> FloatArray:
-    """``2 dᵀm / |L|²`` (...) in [-1, 1]: zero where the 6-vector ``(..., 6)`` is a line (the Klein quadric)."""
+    """``2 dᵀm / |L|²`` (...) in [-1, 1]: zero if the 6-vector ``(..., 6)`` is a line (the Klein quadric)."""
     L = np.asarray(L, dtype=np.float64)
     residual: FloatArray = 2.0 * (L[..., :3] * L[..., 3:]).sum(axis=-1) / (L**2).sum(axis=-1)
     return residual
 
 
 def checked_lines(L: FloatArray, tolerance: float = 1e-9) -> FloatArray:
-    """``L`` (..., 6) as given. Raises GeometryError where one is zero, not finite, or no line (see `nearest_line`)."""
+    """``L`` (..., 6) unchanged. Raises GeometryError if one is zero, not finite, or no line (see `nearest_line`)."""
     L = np.asarray(L, dtype=np.float64)
     if L.shape[-1] != 6:
         raise GeometryError("shape", f"lines have shape {L.shape}; (..., 6) is needed", shape=L.shape)
@@ -104,9 +104,9 @@ def checked_lines(L: FloatArray, tolerance: float = 1e-9) -> FloatArray:
 
 
 def nearest_line(L: FloatArray) -> FloatArray:
-    """The line ``(..., 6)`` nearest to 6-vectors ``(..., 6)``: ``d + m`` and ``d - m`` get one length.
+    """The line ``(..., 6)`` nearest to 6-vectors ``(..., 6)``: ``d + m`` and ``d - m`` are scaled to equal lengths.
 
-    Raises GeometryError where the 6-vector is as near to all lines (``d = ± m``).
+    Raises GeometryError if all lines are equally near to the 6-vector (``d = ± m``).
     """
     L = np.asarray(L, dtype=np.float64)
     plus, minus = L[..., :3] + L[..., 3:], L[..., :3] - L[..., 3:]
@@ -121,13 +121,15 @@ def nearest_line(L: FloatArray) -> FloatArray:
 
 
 def reciprocal_product(L1: FloatArray, L2: FloatArray) -> FloatArray:
-    """``d₁ᵀm₂ + m₁ᵀd₂`` (...) of lines ``(..., 6)``: ``-det[A₁ B₁ A₂ B₂]``, zero where they meet, else their sense."""
+    """``d₁ᵀm₂ + m₁ᵀd₂`` (...) of lines ``(..., 6)``: ``-det[A₁ B₁ A₂ B₂]``, zero if they meet; else its sign is the
+    sense of their crossing.
+    """
     product: FloatArray = (L1[..., :3] * L2[..., 3:] + L1[..., 3:] * L2[..., :3]).sum(axis=-1)
     return product
 
 
 def line_motion(H: FloatArray) -> FloatArray:
-    """``(6, 6)``: what a map ``H`` (4, 4) of the points does to lines."""
+    """``(6, 6)`` map of lines under the map ``H`` (4, 4) of points."""
     ends = np.eye(4)
     # Basis lines in the order of the coordinates: d_i from the origin e₄ to e_i; m from e₂e₃, e₃e₁, e₁e₂.
     first, second = [3, 3, 3, 1, 2, 0], [0, 1, 2, 2, 0, 1]
@@ -145,7 +147,7 @@ def line_projection(P: FloatArray) -> FloatArray:
 def project_lines(Ps: FloatArray, L: FloatArray) -> FloatArray:
     """Image lines ``(c, n, 3)`` of lines ``(n, 6)`` in cameras ``(c, 3, 4)``, scaled to distances [px].
 
-    NaN where a line passes through a camera's centre or has its image at infinity.
+    NaN if a line passes through a camera's centre or its image is at infinity.
     """
     raw = np.stack([np.asarray(L, dtype=np.float64) @ line_projection(P).T for P in Ps])
     return _as_distance(raw)
@@ -158,22 +160,22 @@ def _as_distance(lines: FloatArray) -> FloatArray:
 
 
 def image_lines(segments: FloatArray) -> FloatArray:
-    """Image lines ``(..., 3)`` through the ends of segments ``(..., 2, 2)`` [px] (2.57); NaN where the ends are one."""
+    """Image lines ``(..., 3)`` through the ends of segments ``(..., 2, 2)`` [px] (2.57); NaN if the ends coincide."""
     ends = to_homogeneous(segments)
     return _as_distance(np.cross(ends[..., 0, :], ends[..., 1, :]))
 
 
 def interpretation_planes(Ps: FloatArray, lines: FloatArray) -> FloatArray:
-    """Planes ``Pᵀl`` (c, n, 4) of camera centres and image lines ``(c, n, 3)``: rows ``lᵀP`` of (2.72, errata)."""
+    """Planes ``Pᵀl`` (c, n, 4) through camera centres and image lines ``(c, n, 3)``: rows ``lᵀP`` of (2.72, errata)."""
     planes: FloatArray = np.einsum("cij,cni->cnj", Ps, lines)
     return planes
 
 
 def crossing_angles(Ps: FloatArray, segments: FloatArray) -> FloatArray:
-    """``(c, c, n)`` [rad]: angle in [0, π/2] in camera i of a segment and the epipolar line of camera j at its middle.
+    """``(c, c, n)`` [rad]: angle in [0, π/2] in camera i between a segment and camera j's epipolar line at its middle.
 
-    Zero in all pairs where the line lies in an epipolar plane: then the interpretation planes are one and the
-    line is lost. Depths along the line scale with 1/sin of it. NaN where i = j or a segment is missing.
+    Zero in all pairs if the line lies in an epipolar plane: then the interpretation planes coincide and do not
+    determine the line. Depths along the line scale with 1/sin of it. NaN where i = j or a segment is missing.
     """
     c, n = segments.shape[:2]
     angles = np.full((c, c, n), np.nan)
@@ -190,11 +192,11 @@ def crossing_angles(Ps: FloatArray, segments: FloatArray) -> FloatArray:
 def triangulate_lines(Ps: FloatArray, segments: FloatArray, sigma: float = 1.0, iterations: int = 10) -> FloatArray:
     """Lines ``(n, 6)``, unit norm, from segments ``(c, n, 2, 2)`` [px], NaN where missing, seen by c >= 2 cameras.
 
-    The meet of the interpretation planes (2.72), then of least squared distance [px] between the segments' ends
-    and the projected line; with two cameras the meet already is. The ends need not correspond between images.
+    The meet of the interpretation planes (2.72), then least squared distances [px] between the segments' ends
+    and the projected line; with two cameras the meet is already optimal. The ends need not correspond between images.
     ``sigma`` [px] is the noise of the ends.
 
-    Raises GeometryError naming the lines that fewer than two cameras see, and those that cannot be told from
+    Raises GeometryError naming the lines that fewer than two cameras see, and those that cannot be distinguished from
     lines in an epipolar plane: in every pair of cameras the segment is within three standard deviations of its
     direction, ``3 √2 σ / length``, parallel to the epipolar line.
     """
@@ -202,7 +204,7 @@ def triangulate_lines(Ps: FloatArray, segments: FloatArray, sigma: float = 1.0, 
     _refuse_epipolar(Ps, segments, sigma)
     lines = image_lines(segments)
     planes = np.nan_to_num(interpretation_planes(Ps, lines)).transpose(1, 0, 2)
-    # Rows weighted as distances at the depth of the cameras' middle: scales of cameras do not matter.
+    # Rows weighted as distances at the depth of the cameras' mean: scales of cameras do not matter.
     planes = planes / np.linalg.norm(Ps, axis=(1, 2))[None, :, None]
     points = np.linalg.svd(planes)[2][:, 2:, :]
     seen: BoolArray = np.asarray(np.isfinite(segments).all(axis=(2, 3)))
@@ -239,7 +241,7 @@ def _refuse_epipolar(Ps: FloatArray, segments: FloatArray, sigma: float) -> None
     with np.errstate(divide="ignore"):
         limit = np.maximum(CERTAINTY * np.sqrt(2.0) * sigma / length, 1e-9)
     angles = crossing_angles(Ps, segments)
-    # A pair determines the line where both of its images cross the epipolar lines significantly.
+    # A pair determines the line if both of its images cross the epipolar lines significantly.
     told = (angles > limit[:, None]) & (angles.transpose(1, 0, 2) > limit[None, :])
     lost = np.flatnonzero(~told.any(axis=(0, 1)))
     if len(lost):
@@ -261,8 +263,8 @@ def _distances(
 ) -> tuple[FloatArray, FloatArray]:
     """Distances ``(n, 2c)`` [px] of segment ends to projected lines, and their Jacobian ``(n, 2c, 4)``.
 
-    The line of orthonormal points ``(n, 2, 4)`` moves by its points along its two orthonormal planes: the four
-    freedoms of a line.
+    The line of orthonormal points ``(n, 2, 4)`` moves by displacing its points along its two orthonormal planes: the
+    four degrees of freedom of a line.
     """
     c, n = segments.shape[:2]
     planes = np.linalg.svd(points)[2][:, 2:, :]

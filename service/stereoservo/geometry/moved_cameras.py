@@ -1,10 +1,10 @@
 """Static scene points while cameras move (thesis 2.19 to 2.21): resection of one moved camera with covariance, the
-struct of a change of the projective frame, covariances of transformed points, test for coplanar points.
+result type of a change of the projective frame, covariances of transformed points, test for coplanar points.
 
-Five points of which no four are coplanar are a frame of space. When cameras have moved, their new canonical frame
-differs from the old one by one homography ``H``, which the points' images give; what was known moves with it: points
-``H M``, generators ``H Ĝ H⁻¹``, cameras that stood still ``P H⁻¹``. With six points a single moved camera is resected
-in the old frame and needs no second one. Pixels are ideal ones (undistorted).
+Five points of which no four are coplanar define a frame of space. After cameras have moved, their new canonical frame
+differs from the old one by one homography ``H``, which is determined by the points' images; all known quantities are
+transformed by it: points ``H M``, generators ``H Ĝ H⁻¹``, static cameras ``P H⁻¹``. With six points a single moved
+camera is resected in the old frame and needs no second one. Pixels are ideal ones (undistorted).
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from stereoservo.geometry.homogeneous import GeometryError, unit_rows, whitener
 from stereoservo.numerics.arrays import FloatArray
 
 OFF_PLANE = 5.0
-"""Standard deviations by which points must lie off their best common plane not to count as coplanar."""
+"""Number of standard deviations from their best common plane below which points count as coplanar."""
 EXACT = 1e-9
-"""Standard deviation, relative to their norm, that points without a covariance are taken to have."""
+"""Standard deviation, relative to their norm, assumed for points without a covariance."""
 
 
 def plane_deviations(points: FloatArray, covariance: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Best common plane (4,) of points ``(n, 4)``, n >= 4, and the rms distance from it in standard deviations.
 
-    ``covariance`` (n, 4, 4) of the points at their scale; None takes them as exact to `EXACT`. The same in any frame.
+    ``covariance`` (n, 4, 4) of the points at their scale; None: exact to `EXACT`. Invariant to the choice of frame.
     """
     points = np.asarray(points, dtype=np.float64)
     n = len(points)
@@ -58,10 +58,10 @@ def plane_deviations(points: FloatArray, covariance: FloatArray | None = None) -
 def refuse_coplanar(
     points: FloatArray, covariance: FloatArray | None = None, names: Sequence[int] | None = None
 ) -> None:
-    """Raise GeometryError naming the points where all but one, or all, of ``(n, 4)`` are coplanar within noise.
+    """Raise GeometryError naming the points if all, or all but one, of ``(n, 4)`` are coplanar within noise.
 
-    Of five points that is four coplanar ones: they carry no frame. ``covariance`` as for `plane_deviations`; ``names``
-    (n,) are the numbers to call the points by, default 0 to n - 1.
+    With five points this means four coplanar ones, which define no frame. ``covariance`` as for `plane_deviations`;
+    ``names`` (n,): numbers of the points for the message, default 0 to n - 1.
     """
     n = len(points)
     if n < 5:
@@ -87,8 +87,8 @@ class FrameChange:
     """The map from the old projective frame to the new one.
 
     ``H`` (4, 4), ``|det H| = 1``, with the sign that keeps heights positive; ``covariance`` (16, 16) of its entries row
-    by row; ``points`` (k,) the rows that were used; ``rms`` of the residuals in standard deviations, 1 where the model
-    holds; ``degrees_of_freedom`` of them.
+    by row; ``points`` (k,) the rows that were used; ``rms`` of the residuals in standard deviations, 1 if the model
+    is valid; ``degrees_of_freedom`` of them.
     """
 
     H: FloatArray
@@ -99,10 +99,9 @@ class FrameChange:
 
 
 def carried_point_covariance(change: FrameChange, M: FloatArray, M_covariance: FloatArray | None = None) -> FloatArray:
-    """First-order covariance ``(m, 4, 4)`` of transformed points ``H M`` from that of H and, if given, of the
-    points.
+    """First-order covariance ``(m, 4, 4)`` of transformed points ``H M`` from that of H and, if given, of the points.
 
-    Both taken as independent: for points that are not among those that gave H.
+    Assumes that both are independent: for points that were not used to estimate H.
     """
     rows = np.einsum("ij,nk->nijk", np.eye(4), M).reshape(len(M), 4, 16)
     covariance: FloatArray = rows @ change.covariance @ rows.transpose(0, 2, 1)
@@ -127,8 +126,8 @@ class ResectedCamera:
 def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -> ResectedCamera:
     """One moved camera in the frame of static scene points ``(n, 4)``, n >= 6, from ``pixels`` (n, 2) [px].
 
-    Of least reprojection error (`resection`); NaN pixels are left out, ``sigma`` [px] is their noise. Raises
-    GeometryError for fewer than six points and where they, or noise, leave the camera undetermined (coplanar points).
+    Minimises the reprojection error (`resection`); NaN pixels are left out, ``sigma`` [px] is their noise. Raises
+    GeometryError for fewer than six points and if they, or noise, leave the camera undetermined (coplanar points).
     """
     M, pixels = np.asarray(M, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     P = resection(M, pixels)
@@ -152,10 +151,10 @@ def resect_moved_camera(M: FloatArray, pixels: FloatArray, sigma: float = 1.0) -
 
 
 def _refuse_flat_view(P: FloatArray, deviation: FloatArray) -> None:
-    """Raise GeometryError where a homography of the points' plane explains the pixels within noise.
+    """Raise GeometryError if a homography of the points' plane explains the pixels within noise.
 
     ``P`` (3, 4) with the points' best plane as first coordinate, and a root ``spread`` (12, 11) of its covariance:
-    without a significant first column the images are those of points in the plane.
+    without a significant first column the images are those of coplanar points.
     """
     column, root = P[:, 0], deviation[[0, 4, 8]]
     deviations = float(np.sqrt(column @ np.linalg.solve(root @ root.T, column) / 3.0))

@@ -1,6 +1,6 @@
 """Least squares of the reprojection error over any parameterized motion; the solver of thesis chapters 3 and 4.
 
-A motion maps its parameters to the displacements of all stops. Points are given, or free and eliminated by the Schur
+A motion maps its parameters to the displacements of all stops. Points are known, or free and eliminated by the Schur
 complement (variable projection). Pixels are ideal ones [px], NaN where missing.
 """
 
@@ -18,10 +18,10 @@ MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-10
 """Relative decrease of the cost below which the fit has converged."""
 UNDETERMINED = 1e-11
-"""Relative eigenvalue of the scaled information matrix below which a direction counts as not determined."""
+"""Relative eigenvalue of the scaled information matrix below which a direction counts as undetermined."""
 
 Motion = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Parameters (q,) to displacements (s, 4, 4) and their derivatives (s, q, 4, 4)."""
+"""Function from parameters (q,) to displacements (s, 4, 4) and their derivatives (s, q, 4, 4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ def read_images(Ps: FloatArray, pixels: FloatArray, sigma: FloatArray | float) -
 
 
 def with_rest(motion: Motion) -> Motion:
-    """The images with the rest pose, the identity, as the first stop."""
+    """The motion with the rest pose, the identity, as its first stop."""
 
     def moved(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         H, slopes = motion(x)
@@ -71,7 +71,7 @@ def with_rest(motion: Motion) -> Motion:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Residuals (m, r), derivatives in the motion (m, r, q) and in each point's own chart (m, r, 3)."""
+    """Residuals (m, r), derivatives by the motion (m, r, q) and by each point's own chart (m, r, 3)."""
 
     residuals: FloatArray
     motion: FloatArray
@@ -125,7 +125,7 @@ class Minimum:
 def minimise(images: Images, motion: Motion, x: FloatArray, M: FloatArray, free_points: bool) -> Minimum:
     """Levenberg-Marquardt from ``x`` (q,) and points ``M`` (m, 4), or fixed ones (s, m, 4).
 
-    Raises GeometryError where the start itself gives no finite residual, or no convergence is reached.
+    Raises GeometryError if the residuals at the start are not finite, or if it does not converge.
     """
     charts = point_charts(M) if free_points else np.zeros((M.shape[-2], 4, 3))
     at = linearise(images, *motion(x), M, charts)
@@ -153,7 +153,7 @@ def minimise(images: Images, motion: Motion, x: FloatArray, M: FloatArray, free_
             x, M, charts, at, cost = x + step, M_new, charts_new, new, cost_new
             damping = max(damping / 10.0, 1e-12)
         else:
-            # At the minimum rounding decides which cost is the lower one.
+            # At the minimum rounding decides which of two costs is lower.
             done = abs(float(gradient @ step)) <= COST_TOLERANCE * (cost + 1e-12 * images.measurements)
             damping *= 10.0
         if done:
@@ -176,7 +176,7 @@ def _damped_step(information: FloatArray, gradient: FloatArray, damping: float) 
 
 
 def covariance_of(information: FloatArray, what: str) -> FloatArray:
-    """Inverse of an information matrix (q, q). Raises GeometryError where the data leave a direction undetermined."""
+    """Inverse of an information matrix (q, q). Raises GeometryError if the data leave a direction undetermined."""
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
     if not values[0] > UNDETERMINED * values[-1]:

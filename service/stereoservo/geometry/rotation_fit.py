@@ -1,7 +1,7 @@
-"""Maximum likelihood of one projective rotation from pixels and known angles (thesis 4.4, (4.42), (4.43)).
+"""Maximum likelihood estimate of one projective rotation from pixels and known angles (thesis 4.4, (4.42), (4.43)).
 
 Ten parameters, and points, eliminated by the Schur complement. Pixels are ideal ones [px], NaN
-where missing. Everything runs in coordinates whitened over the points at all stops.
+where missing. All computation uses coordinates whitened over the points at all stops.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class RotationFit:
 
     ``generator`` (4, 4); ``parameters`` (10,) in ``chart`` with ``covariance`` (10, 10), and the
     ``generator_covariance`` (16, 16) of its entries row by row, of rank ten, both at the stated noise;
-    ``points`` (m, 4) at angle 0, NaN where left out, depth 1 in the first camera; ``cost`` the sum of squares
-    over the stated variances; ``freedom`` measurements less parameters; ``evaluations`` of the model.
+    ``points`` (m, 4) at angle 0, NaN if left out, depth 1 in the first camera; ``cost`` the sum of squares
+    over the stated variances; ``freedom`` measurements minus parameters; ``evaluations`` of the model.
     """
 
     generator: FloatArray
@@ -62,7 +62,7 @@ def bundle_rotation(
     """The rotation and the points of least reprojection error (4.42 with free points, three parameters each).
 
     Cameras ``Ps`` (c, 3, 4); ``pixels`` (s, c, m, 2) [px] at ``angles`` (s,) [rad]; start ``points`` (m, 4) at angle
-    0, NaN where one is to be left out, and ``generator`` (4, 4); noise ``sigma``, a number or (s, c, m) [px]. Points
+    0, NaN for points to leave out, and ``generator`` (4, 4); noise ``sigma``, a number or (s, c, m) [px]. Points
     seen fewer than twice are left out. Raises GeometryError for shapes that do not fit, a start that is no rotation, a
     generator that the data do not determine, no convergence.
     """
@@ -88,7 +88,7 @@ def bundle_rotation(
             measurements=used.measurements,
             parameters=size,
         )
-    # A flat scene spans space only over its stops.
+    # A planar scene spans space only over its stops.
     W = whitener((points[known] @ exp_rotation(G, theta).transpose(0, 2, 1)).reshape(-1, 4))
     M = points[known] @ W.T
     M = M / np.linalg.norm(M, axis=1, keepdims=True)
@@ -135,10 +135,10 @@ HALF_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class RotationFrame:
-    """A frame in which a projective rotation is one about z: ``H = S⁻¹ J_R(θ) S`` (4.9).
+    """A frame in which a projective rotation is a rotation about z: ``H = S⁻¹ J_R(θ) S`` (4.9).
 
-    ``planes`` (4, 4): rows ``h₁..h₄`` of S; ``points`` (4, 4): rows ``k₁..k₄``, the columns of S⁻¹. Which
-    of the points on the axis is at infinity, and which of the planes normal to it, no rotation determines.
+    ``planes`` (4, 4): rows ``h₁..h₄`` of S; ``points`` (4, 4): rows ``k₁..k₄``, the columns of S⁻¹. A rotation does
+    not determine which point of its axis is at infinity, nor which of the planes normal to the axis.
     """
 
     planes: FloatArray
@@ -146,7 +146,7 @@ class RotationFrame:
 
     @property
     def generator(self) -> FloatArray:
-        """``Ĥ = k₂h₁ᵀ − k₁h₂ᵀ`` (4, 4) (4.17): the same for every frame of one rotation."""
+        """``Ĥ = k₂h₁ᵀ − k₁h₂ᵀ`` (4, 4) (4.17): equal for all frames of one rotation."""
         return np.asarray(self.points[:2].T @ HALF_TURN @ self.planes[:2], dtype=np.float64)
 
     @property
@@ -171,7 +171,7 @@ class RotationFrame:
 
 
 def check_rotation_generator(G: FloatArray) -> FloatArray:
-    """``G`` (4, 4) as an array, once ``Ĥ³ = −Ĥ`` holds and it is not zero. Raises GeometryError."""
+    """``G`` (4, 4) as an array. Raises GeometryError unless ``Ĥ³ = −Ĥ`` and it is not zero."""
     G = np.asarray(G, dtype=np.float64)
     if G.shape != (4, 4) or not np.isfinite(G).all():
         raise GeometryError("shape", f"a generator is a finite (4, 4) matrix, got {G.tolist()}", shape=G.shape)
@@ -189,7 +189,7 @@ def check_rotation_generator(G: FloatArray) -> FloatArray:
 def rotation_frame(G: FloatArray) -> RotationFrame:
     """One Jordan frame of the rotations ``exp(θĤ)``, ``G`` (4, 4) a generator (4.9, 4.25).
 
-    All others are ``frame.changed(rotation_commutator(...))``. Raises GeometryError where G is no generator
+    All others are ``frame.changed(rotation_commutator(...))``. Raises GeometryError if G is no generator
     of a rotation.
     """
     G = check_rotation_generator(G)
@@ -203,9 +203,9 @@ def rotation_frame(G: FloatArray) -> RotationFrame:
 class RotationChart:
     """Layout of the ten parameters of (4.43): ``order`` (4,) is the permutation Y of the coordinates.
 
-    Coordinates so ordered, ``h'₁₁ = 1`` and ``h'₂₁ = 0`` are fixed and ``h'₂₂`` is the second pivot. The
-    charts of a calibration's bundle span the same ten freedoms as directions of conjugation, which reach
-    every joint kind and stratum but only near their centre; this one is explicit and good wherever
+    In coordinates of this order, ``h'₁₁ = 1`` and ``h'₂₁ = 0`` are fixed and ``h'₂₂`` is the second pivot. The
+    charts of a calibration's bundle span the same ten degrees of freedom as directions of conjugation; those apply to
+    every joint kind and stratum, but only near their centre. This chart is explicit and valid wherever
     ``h'₂₂ ≠ 0``, so that its ten numbers determine the rotation by themselves.
     """
 
@@ -215,7 +215,7 @@ class RotationChart:
 def rotation_chart(G: FloatArray) -> RotationChart:
     """The chart with the largest pivots for the generator ``G`` (4, 4). Raises GeometryError."""
     frame = rotation_frame(G)
-    # Both rows are taken at once: rotations among them leave column norms as they are.
+    # Both rows are permuted together: rotations between them preserve column norms.
     h = _orthonormal_rows(frame.axial_planes)
     first = int(np.argmax((h**2).sum(axis=0)))
     turned = _turned(h, first)
@@ -230,7 +230,7 @@ def rotation_parameters(G: FloatArray, chart: RotationChart) -> FloatArray:
     """``x`` (10,) of the generator ``G`` (4, 4): ``h'₁₂ h'₁₃ h'₁₄ h'₂₂ h'₂₃ h'₂₄ k'₁₃ k'₁₄ k'₂₃ k'₂₄`` (4.43).
 
     ``Ĥ' = Y Ĥ Y⁻¹``, ``[h'₁ h'₂]ᵀ = Q⁻¹ [h₁ h₂]ᵀ Y⁻¹``, ``K' = Y K Q``, with Q a scaled rotation (errata).
-    Raises GeometryError where G is no rotation's generator, or not in this chart.
+    Raises GeometryError if G is no rotation's generator, or not in this chart.
     """
     frame = rotation_frame(G)
     h, k = frame.axial_planes[:, chart.order], frame.normal_directions[:, chart.order]
@@ -260,7 +260,7 @@ def rotation_parameter_derivatives(x: FloatArray, chart: RotationChart) -> Float
         change_rows[p, i, j] = 1.0
     for p, (i, j) in enumerate(((0, 2), (0, 3), (1, 2), (1, 3))):
         change_columns[6 + p, j, i] = 1.0
-    # hᵢᵀkⱼ = δᵢⱼ stays: the upper two entries of each direction follow (4.19).
+    # hᵢᵀkⱼ = δᵢⱼ is preserved: the upper two entries of each direction follow (4.19).
     right = -(change_rows @ columns) - rows[:, 2:] @ change_columns[:, 2:]
     change_columns[:, :2] = np.linalg.solve(rows[:, :2], right)
     changes = change_columns @ HALF_TURN @ rows + columns @ HALF_TURN @ change_rows
@@ -292,7 +292,7 @@ def _orthonormal_rows(h: FloatArray) -> FloatArray:
 
 
 def _turned(h: FloatArray, column: int) -> FloatArray:
-    """Rows (2, 4) turned among themselves so that the second is zero in ``column``."""
+    """Rows (2, 4) rotated into each other so that the second is zero in ``column``."""
     length = float(np.hypot(h[0, column], h[1, column]))
     c, s = h[0, column] / length, h[1, column] / length
     return np.asarray(np.array([[c, s], [-s, c]]) @ h, dtype=np.float64)

@@ -28,9 +28,9 @@ def screw_twist(direction: FloatArray, point: FloatArray, pitch: float = 0.0) ->
 
 
 def twist_angle(X: FloatArray) -> FloatArray:
-    """θ >= 0 (...) [rad] of twists ``(..., 4, 4)``: ``tr X² = -2θ²``, known to about 1e-8 of the norm near zero.
+    """θ >= 0 (...) [rad] of twists ``(..., 4, 4)``: ``tr X² = -2θ²``, accurate to about 1e-8 of the norm near zero.
 
-    Raises GeometryError where the eigenvalues are real: no rigid motion.
+    Raises GeometryError if the eigenvalues are real: no rigid motion.
     """
     X = np.asarray(X, dtype=np.float64)
     squared = -0.5 * np.einsum("...ij,...ji->...", X, X)
@@ -47,8 +47,8 @@ def twist_angle(X: FloatArray) -> FloatArray:
 def exp_twist(X: FloatArray) -> FloatArray:
     """``exp(X) = I + X + (1 - cosθ)/θ² X² + (θ - sinθ)/θ³ X³`` (..., 4, 4) of any twist, θ = 0 included (A.9).
 
-    Also the exponential of a sum ``τĤ_T + θĤ_R`` that is not aligned (errata to A.1). Raises GeometryError where X is
-    no twist by its eigenvalues.
+    Also the exponential of a sum ``τĤ_T + θĤ_R`` that is not aligned (errata to A.1). Raises GeometryError if the
+    eigenvalues of X are not those of a twist.
     """
     X = np.asarray(X, dtype=np.float64)
     theta = twist_angle(X)[..., None, None]

@@ -1,10 +1,10 @@
 """Stratification: maps between projective, affine and Euclidean frames, decomposition of cameras, orientation of
 planes (thesis 2.2, (2.7)-(2.18)).
 
-Frames: projective ``P`` with a first camera ``[N⁻¹ | 0]`` (the thesis takes N = I), affine ``A`` with the same camera
-and the plane at infinity (0, 0, 0, 1), Euclidean ``E`` with ``[K | 0]``. ``plane`` (4,) is the plane at infinity in P,
-scaled as the caller wants heights to be: ``plane @ M`` becomes the fourth coordinate. ``intrinsics`` (3, 3) is
-``K̃ = N K``, which is K where N = I. Points follow by `homogeneous.move_points`, planes by ``aᵀH⁻¹``, cameras
+Frames: projective ``P`` with a first camera ``[N⁻¹ | 0]`` (the thesis uses N = I), affine ``A`` with the same camera
+and the plane at infinity (0, 0, 0, 1), Euclidean ``E`` with ``[K | 0]``. ``plane`` (4,) is the plane at infinity in P;
+its scale defines heights: ``plane @ M`` becomes the fourth coordinate. ``intrinsics`` (3, 3) is
+``K̃ = N K``, which is K if N = I. Points are transformed by `homogeneous.move_points`, planes by ``aᵀH⁻¹``, cameras
 by ``P H⁻¹``, generators and displacements by `displacements.conjugate`.
 """
 
@@ -16,23 +16,23 @@ from stereoservo.geometry.homogeneous import GeometryError, unit_rows
 from stereoservo.numerics.arrays import FloatArray
 
 ABSOLUTE_PLANE = np.array([0.0, 0.0, 0.0, 1.0])
-"""The plane at infinity of affine and Euclidean frames."""
+"""Plane at infinity of affine and Euclidean frames."""
 
 
 def projective_to_affine(plane: FloatArray) -> FloatArray:
-    """``H_PA = [I 0; a∞ᵀ]`` (4, 4) (2.14). Raises GeometryError where the plane passes through the first camera."""
+    """``H_PA = [I 0; a∞ᵀ]`` (4, 4) (2.14). Raises GeometryError if the plane passes through the first camera."""
     return projective_to_euclidean(plane, np.eye(3))
 
 
 def affine_to_projective(plane: FloatArray) -> FloatArray:
-    """``H_PA⁻¹`` (4, 4): affine points back into the projective frame of ``plane`` (4,)."""
+    """``H_PA⁻¹`` (4, 4): maps affine points to the projective frame of ``plane`` (4,)."""
     return euclidean_to_projective(plane, np.eye(3))
 
 
 def projective_to_euclidean(plane: FloatArray, intrinsics: FloatArray) -> FloatArray:
     """``H_PE = [K̃⁻¹ 0; a∞ᵀ]`` (4, 4) (2.16, 2.17): ``ρ X = H_PE M`` with the orbital height ρ = plane @ M (2.47).
 
-    Raises GeometryError where the plane passes through the first camera or ``intrinsics`` is singular.
+    Raises GeometryError if the plane passes through the first camera or ``intrinsics`` is singular.
     """
     plane, K = _checked(plane, intrinsics)
     H = np.zeros((4, 4))
@@ -74,7 +74,7 @@ def _checked(plane: FloatArray, intrinsics: FloatArray) -> tuple[FloatArray, Flo
 def upper_triangular(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     """``A ~ K R`` (3, 3): K upper triangular with a positive diagonal and ``K₃₃ = 1``, R orthogonal (2.1-2.3).
 
-    R has the determinant's sign of A. Raises GeometryError where A is singular.
+    R has the sign of det A as its determinant. Raises GeometryError if A is singular.
     """
     A = np.asarray(A, dtype=np.float64)
     singular = np.linalg.svd(A, compute_uv=False)
@@ -125,7 +125,7 @@ def intrinsics_and_slopes(P: FloatArray, directions: FloatArray) -> tuple[FloatA
 def triangular_root(omega: FloatArray) -> FloatArray:
     """Upper triangular ``K`` (3, 3), positive diagonal, ``K₃₃ = 1``, with ``K Kᵀ ~ ω*`` (3, 3).
 
-    Raises LinAlgError where ``omega`` is not positive definite.
+    Raises LinAlgError if ``omega`` is not positive definite.
     """
     flip = np.eye(3)[::-1]
     root = flip @ np.linalg.cholesky(flip @ omega @ flip) @ flip
@@ -137,7 +137,7 @@ def oriented_plane(plane: FloatArray, points: FloatArray) -> FloatArray:
     """``plane`` (4,) with the sign that gives points ``(n, 4)`` positive scales ``plane @ M`` (2.47).
 
     The points are scaled so that they are in front (depth 1 in the first camera). Raises GeometryError naming those on
-    the other side: a plane at infinity that cuts a finite object is wrong.
+    the other side: a plane at infinity that intersects a finite object is wrong.
     """
     heights = np.asarray(points, dtype=np.float64) @ plane
     side = 1.0 if (heights > 0).sum() >= (heights < 0).sum() else -1.0

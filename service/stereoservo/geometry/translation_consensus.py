@@ -1,7 +1,7 @@
 """Plane at infinity and translation directions from images of a moved scene, with disagreeing motions rejected (thesis
 3.2.2, 3.2.3).
 
-Every motion is judged by itself, and then by the plane at infinity that most of them agree on. All thresholds
+Every motion is tested by itself, and then against the plane at infinity on which most of them agree. All thresholds
 follow from the noise of the pixels.
 """
 
@@ -40,22 +40,22 @@ Reason = Literal["", "unseen", "points", "conditioning", "not_a_translation", "n
 TAIL = 1e-3
 """Probability with which one test rejects a good motion."""
 ROUNDS = 5
-"""Most times that the agreeing motions are chosen again."""
+"""Most rounds of selecting the agreeing motions."""
 HEIGHT_DEVIATION = 1.0 / 3.0
-"""Largest relative standard deviation of a point's height: three of them reach the plane at infinity."""
+"""Largest relative standard deviation of a point's height: at three of them the point reaches the plane at infinity."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionJudgement:
     """Result of the test of one motion from rest.
 
-    ``reason`` why it is left out, empty where it is used: ``unseen`` (too few points before and after),
-    ``points`` (no homography fits: wrong matches), ``conditioning`` (``σ₂`` of the homography's generator above
-    what its noise explains), ``not_a_translation`` (a homography fits, a translation does not), ``no_motion``
-    (no plane at infinity in it at all), ``other_plane`` (a translation, but not with the plane at
-    infinity of the others). ``conditioning`` σ₁/σ₂ and ``least_conditioning``, below which noise does not
-    explain it; ``excess`` the chi-square by which the translation fits worse than the homography, of nine
-    freedoms; ``distance`` the squared Mahalanobis distance of its plane from that of the others, of three;
+    ``reason`` why it is left out, empty if it is used: ``unseen`` (too few points before and after),
+    ``points`` (no homography fits: wrong matches), ``conditioning`` (``σ₂`` of the homography's generator is above
+    the value that noise explains), ``not_a_translation`` (a homography fits, a translation does not), ``no_motion``
+    (it contains no plane at infinity), ``other_plane`` (a translation, but with a different plane at
+    infinity from the others). ``conditioning`` σ₁/σ₂ and ``least_conditioning``, below which noise does not
+    explain it; ``excess`` the chi-square by which the translation fits worse than the homography, with nine degrees of
+    freedom; ``distance`` the squared Mahalanobis distance of its plane from that of the others, with three;
     ``height_deviation`` the largest relative standard deviation of a point's height above its own plane: a motion above
     `HEIGHT_DEVIATION` determines too little by itself, but adds to others. NaN where not computed.
     """
@@ -91,7 +91,7 @@ class _Scene:
     flat: bool
 
     def start(self, stops: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Linear plane at infinity (4,) and directions (n, 4) from rest to each of the stops."""
+        """Linear estimate of the plane at infinity (4,) and directions (n, 4) from rest to each of the stops."""
         if self.flat:
             return planar_start(self.images.cameras, self.rest, self.pixels[stops])
         Hs = [translation_homography(self.images.cameras, self.rest, self.pixels[s]) for s in stops]
@@ -99,15 +99,15 @@ class _Scene:
         return plane, np.stack([direction_given_plane(H, plane, self.weighting) for H in Hs])
 
     def homography(self, stop: int) -> FloatArray:
-        """Linear homography (4, 4) from rest to a stop; of coplanar points that of their translation."""
+        """Linear homography (4, 4) from rest to a stop; for coplanar points that of their translation."""
         if not self.flat:
             return translation_homography(self.images.cameras, self.rest, self.pixels[stop])
         plane, k = self.start(np.array([stop]))
         return np.asarray(np.eye(4) + np.outer(k[0], plane), dtype=np.float64)
 
     def deviation(self, fit: TranslationFit) -> float:
-        """Relative deviation of the heights of the points; of coplanar ones also of what lies off their plane, as far
-        to any side as the points reach, measured in the images.
+        """Relative deviation of the points' heights; for coplanar points also of positions off their plane, up to
+        their own extent to either side, measured in the images.
         """
         among = height_deviation(self.rest, fit)
         if not self.flat:
@@ -123,7 +123,7 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Single:
-    """One motion tested by itself: its plane at infinity in the chart of `_height_one`, None where it has none."""
+    """One motion tested by itself: its plane at infinity in the chart of `_height_one`, None if it has none."""
 
     plane: FloatArray | None
     covariance: FloatArray | None
@@ -136,12 +136,12 @@ def estimate_translations(
     """Plane at infinity and directions of pure translations from rest, from images alone.
 
     Cameras ``Ps`` (c, 3, 4), ``pixels`` (n + 1, c, m, 2) [px] with the stop at rest first, NaN where missing, noise
-    ``sigma``, a number or (n + 1, c, m) [px]. Linear start, motions left out that are no translations or do not
-    share the plane at infinity (``reject``), then the bundle with free points. Raises GeometryError for shapes
-    that do not fit, where no majority of the motions agrees, and where the motions used leave the plane at
+    ``sigma``, a number or (n + 1, c, m) [px]. Linear start, rejection (``reject``) of motions that are no translations
+    or do not share the plane at infinity, then the bundle with free points. Raises GeometryError for shapes
+    that do not fit, if no majority of the motions agrees, and if the motions used leave the plane at
     infinity undetermined; its data hold the reasons.
 
-    Coplanar points (to within their noise) work where the motions lead out of their plane. The covariance is one of
+    Coplanar points (to within their noise) are possible if the motions lead out of their plane. The covariance is of
     first order: where `height_deviation` is above about 1 % it is too small (at 2 % by half, at 6 % sixfold).
     """
     if len(pixels) < 2:
@@ -184,33 +184,33 @@ def _scene(Ps: FloatArray, pixels: FloatArray, sigma: FloatArray | float) -> _Sc
 
 
 def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
-    """Sum of squared distances of triangulated points M (m, 4) from the plane that fits best, over their variances.
+    """Sum of squared distances of triangulated points M (m, 4) from the best-fitting plane, over their variances.
 
-    ``sigmas`` (c, m) [px], infinite where a camera does not see a point. Chi-square of m − 3 freedoms where the points
-    are coplanar.
+    ``sigmas`` (c, m) [px], infinite where a camera does not see a point. Chi-square with m − 3 freedoms for coplanar
+    points.
     """
     C = triangulation_covariance(Ps, M, sigmas)
     weights = 1.0 / np.linalg.norm(M, axis=1)
     plane = np.zeros(4)
-    for _ in range(10):  # the variances follow the plane
+    for _ in range(10):  # the variances depend on the plane
         plane = np.linalg.svd(M * weights[:, None], full_matrices=len(M) < 4)[2][3]
         weights = 1.0 / np.sqrt(np.maximum(np.einsum("i,nij,j->n", plane, C, plane), 1e-300))
     return float(((M @ plane * weights) ** 2).sum())
 
 
 def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
-    """Largest standard deviation of the scales ``hᵀM`` of points (m, 4), relative to the scales, where that of the
-    points' centroid is one. NaN points are left out.
+    """Largest standard deviation of the scales ``hᵀM`` of points (m, 4), relative to the scales, normalised to 1 at the
+    points' centroid. NaN points are left out.
     """
     M = points[np.isfinite(points).all(axis=1)]
     M = M / (M @ fit.plane)[:, None]
-    # Heights 1 at the middle: what moves all of them alike is scale.
+    # Heights 1 at the centroid: what changes all of them equally is scale.
     M = M - M.mean(axis=0)
     return float(np.sqrt(np.einsum("ni,ij,nj->n", M, fit.plane_covariance, M).max()))
 
 
 def _require_heights(scene: _Scene, fit: TranslationFit) -> None:
-    """Raise GeometryError where the plane at infinity is too uncertain, or passes between the points."""
+    """Raise GeometryError if the plane at infinity is too uncertain, or passes between the points."""
     points = scene.rest[np.isfinite(scene.rest).all(axis=1)]
     deviation = scene.deviation(fit)
     if not deviation <= HEIGHT_DEVIATION:
@@ -260,7 +260,7 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
     H, slopes = motion(best.x)
     refined = conjugate(back, H[0])
     conditioning = least = nan
-    if not scene.flat:  # of coplanar points the homography is not known as a whole
+    if not scene.flat:  # with coplanar points the homography is only partly known
         svd = translation_from_homography(refined, weighting)
         noise = _second_singular_noise(weighting.left @ back, H[0], slopes[0], covariance)
         conditioning, least = svd.conditioning, float(svd.singular[0] / noise)
@@ -295,8 +295,8 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
 
 def _second_singular_noise(left: FloatArray, H: FloatArray, slopes: FloatArray, covariance: FloatArray) -> float:
     """Value that ``σ₂`` of the generator of a true translation exceeds with probability `TAIL`, from the
-    homography's covariance (15, 15), G weighted by ``left``: by Weyl at most the norm of the error, whose square
-    is nearly a scaled chi-square.
+    homography's covariance (15, 15), with G weighted by ``left``: by Weyl's inequality at most the norm of the error,
+    whose square is nearly a scaled chi-square.
     """
     gamma = float(np.trace(H)) / 4.0
     traces = np.trace(slopes, axis1=1, axis2=2)
@@ -311,8 +311,8 @@ def _second_singular_noise(left: FloatArray, H: FloatArray, slopes: FloatArray, 
 def _height_one(
     W: FloatArray, points: FloatArray, plane: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Chart of a plane (4,): three coordinates and their covariance (3, 3), whitened, scaled to 1 at the points'
-    centroid.
+    """Chart of a plane (4,): three coordinates and their covariance (3, 3), whitened, scaled to 1 at the centroid of
+    the points.
     """
     M = points[np.isfinite(points).all(axis=1)] @ W.T
     centroid = (M / np.linalg.norm(M, axis=1, keepdims=True)).mean(axis=0)
@@ -325,7 +325,7 @@ def _height_one(
 
 
 def _distance(single: _Single, plane: FloatArray, covariance: FloatArray) -> float:
-    """Squared Mahalanobis distance between a motion's plane and another one; infinite where it has none."""
+    """Squared Mahalanobis distance between a motion's plane and another one; infinite if it has none."""
     if single.plane is None or single.covariance is None:
         return float("inf")
     difference = single.plane - plane
@@ -333,10 +333,10 @@ def _distance(single: _Single, plane: FloatArray, covariance: FloatArray) -> flo
 
 
 def _largest_agreement(singles: list[_Single]) -> BoolArray:
-    """Largest consensus set: the motions that agree with the one most others agree with; of equals, the one with
+    """Largest consensus set: the motion with which most others agree, and those; among equals, the one with
     the most accurate plane.
 
-    Motions that determine too little by themselves agree with anything; they are used only where there are no others.
+    Motions that determine too little by themselves agree with any plane; they are used only if there are no others.
     """
     limit = float(chi2_distribution.isf(TAIL, 3))
     best: tuple[int, float, BoolArray] | None = None

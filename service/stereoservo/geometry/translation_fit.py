@@ -1,7 +1,7 @@
-"""Maximum likelihood of projective translations that share the plane at infinity (thesis 3.2.3, (3.40)).
+"""Maximum likelihood estimate of projective translations that share the plane at infinity (thesis 3.2.3, (3.40)).
 
-Six parameters for one motion, 3 + 3n for n: of the plane ``h`` the largest entry is fixed (its scale is
-no parameter), and the entry of each ``k`` beside it follows from ``hᵀk = 0`` (3.39 with errata). Solved by
+Six parameters for one motion, 3 + 3n for n: the largest entry of the plane ``h`` is fixed (its scale is
+no parameter), and the entry of each ``k`` at the same index follows from ``hᵀk = 0`` (3.39 with errata). Solved by
 `reprojection_fit` in coordinates whitened over the points. Pixels are ideal ones [px], NaN where missing.
 """
 
@@ -34,8 +34,8 @@ class TranslationFit:
 
     ``plane`` (4,) h, of unit norm, the points on its positive side; ``plane_covariance`` (4, 4), of rank
     three, ``C h = 0``, at the stated noise; ``directions`` (n, 4) k_s with ``hᵀk = 0``; ``points`` (m, 4) at
-    rest, NaN where not estimated, depth 1 in the first camera; ``cost`` the sum of squares over the stated
-    variances; ``freedom`` measurements less parameters; ``evaluations`` of the model.
+    rest, NaN if not estimated, depth 1 in the first camera; ``cost`` the sum of squares over the stated
+    variances; ``freedom`` measurements minus parameters; ``evaluations`` of the model.
     """
 
     plane: FloatArray
@@ -47,14 +47,14 @@ class TranslationFit:
     evaluations: int
 
     def agrees(self, tail: float = 1e-3) -> bool:
-        """Whether the stated noise exceeds the cost with a probability above ``tail``."""
+        """Whether a chi-square at the stated noise exceeds the cost with a probability above ``tail``."""
         return bool(self.cost <= chi2_distribution.isf(tail, max(1, self.freedom)))
 
 
 @dataclass(frozen=True, eq=False)
 class SharedPlane:
-    """The minimal chart (3 + 3n,) of n translations about one plane (3.39 with errata): entry ``at`` of h stays
-    ``pivot``, the entry ``at`` of each k follows from ``hᵀk = 0``.
+    """The minimal chart (3 + 3n,) of n translations about one plane (3.39 with errata): entry ``at`` of h is fixed
+    at ``pivot``, entry ``at`` of each k follows from ``hᵀk = 0``.
     """
 
     at: int
@@ -97,8 +97,8 @@ def shared_plane(plane: FloatArray, directions: FloatArray) -> tuple[SharedPlane
 
 
 def homography_motion(Hs: FloatArray, span: FloatArray | None = None) -> tuple[Motion, FloatArray]:
-    """Fifteen parameters for each of the homographies ``(n, 4, 4)``, and the map from them; with orthonormal columns
-    ``span`` (4, 3) the eleven that act on the points they span.
+    """Motion with fifteen parameters for each of the homographies ``(n, 4, 4)``, and their start values; with
+    orthonormal columns ``span`` (4, 3) only the eleven that act on the points they span.
     """
     n = len(Hs)
     columns = np.eye(4) if span is None else span
@@ -128,9 +128,9 @@ def refine_translations(
     """Translations of least reprojection error with points given a priori (3.40).
 
     Cameras ``Ps`` (c, 3, 4); ``pixels`` (n, c, m, 2) [px] after each of the n motions; ``points`` (m, 4) before
-    them, or (n, m, 4) before each one; start ``plane`` (4,), ``directions`` (n, 4). Points are taken for exact:
-    the covariance holds the pixels' noise alone, unless ``points_covariance`` (m, 4, 4) of common points says
-    theirs, which is then carried over to first order. Raises GeometryError for shapes that do not fit, a plane
+    them, or (n, m, 4) before each one; start ``plane`` (4,), ``directions`` (n, 4). Points are assumed exact:
+    the covariance is due to the pixels' noise alone, unless ``points_covariance`` (m, 4, 4) of common points states
+    theirs, which is then propagated to first order. Raises GeometryError for shapes that do not fit, a plane
     that the data do not determine, no convergence.
     """
     images = read_images(Ps, pixels, sigma)
@@ -172,8 +172,8 @@ def bundle_translations(
 ) -> TranslationFit:
     """Translations and points of least reprojection error over all stops (3.40 with free points).
 
-    ``pixels`` (n + 1, c, m, 2) [px], the stop at rest first; start ``points`` (m, 4) at rest, NaN where a point
-    is to be left out, ``plane`` (4,), ``directions`` (n, 4) from rest to each stop. Raises GeometryError as
+    ``pixels`` (n + 1, c, m, 2) [px], the stop at rest first; start ``points`` (m, 4) at rest, NaN for points
+    to leave out, ``plane`` (4,), ``directions`` (n, 4) from rest to each stop. Raises GeometryError as
     `refine_translations` does.
     """
     images = read_images(Ps, pixels, sigma)
@@ -240,11 +240,11 @@ def _answer(
 
 
 ACROSS = 1e-6
-"""Share of a motion that must lead out of the points' plane, relative, for the start to exist."""
+"""Relative part of a motion that must lead out of the points' plane for the start to exist."""
 
 
 def plane_basis(M: FloatArray) -> FloatArray:
-    """Orthonormal ``(4, 4)``: columns 1 to 3 span the points M (m, 4) best, column 4 is their common plane."""
+    """Orthonormal ``(4, 4)``: columns 1 to 3 best span the points M (m, 4), column 4 is their common plane."""
     unit = M / np.linalg.norm(M, axis=1, keepdims=True)
     basis: FloatArray = np.linalg.svd(unit, full_matrices=len(unit) < 4)[2].T
     return basis
@@ -272,8 +272,8 @@ def planar_map(Ps: FloatArray, m: FloatArray, depth: FloatArray, pixels: FloatAr
 def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Plane at infinity ``h`` (4,), unit norm, and directions ``k`` (n, 4), linear, from coplanar points.
 
-    Points M (m, 4) at rest; pixels (n, c, m, 2) [px] after each motion, NaN where missing. Raises GeometryError where
-    all motions lie in the points' plane, which leaves the plane at infinity open, or too few points are seen.
+    Points M (m, 4) at rest; pixels (n, c, m, 2) [px] after each motion, NaN where missing. Raises GeometryError if
+    all motions lie in the points' plane, which leaves the plane at infinity undetermined, or too few points are seen.
     """
     known = np.isfinite(M).all(axis=1)
     M = M[known]
@@ -288,7 +288,7 @@ def planar_start(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> tuple[Flo
     weighted = []
     for moved in pixels:
         D = planar_map(Ps, m, depth, moved[:, known])
-        # D = γ (B + k gᵀ): on the plane γ is the eigenvalue that comes twice.
+        # D = γ (B + k gᵀ): on the plane γ is the double eigenvalue.
         values = np.linalg.eigvals(B.T @ D)
         pairs = [(abs(values[i] - values[j]), values[i] + values[j]) for i, j in ((0, 1), (0, 2), (1, 2))]
         gamma = 0.5 * float(min(pairs, key=lambda pair: float(pair[0]))[1].real)

@@ -20,10 +20,9 @@ from stereoservo.numerics.arrays import FloatArray
 
 
 def raw_generator(H: FloatArray) -> FloatArray:
-    """``H / γ − I`` with ``γ = tr H / 4`` (3.2, 3.22): the generator of a measured homography ``(4, 4)``, as
-    it is.
+    """``H / γ − I`` with ``γ = tr H / 4`` (3.2, 3.22): unconstrained generator of a measured homography ``(4, 4)``.
 
-    Of rank one only as far as H is a translation. Raises GeometryError where the trace is zero to rounding.
+    Of rank one only if H is exactly a translation. Raises GeometryError if the trace is zero to rounding.
     """
     H = np.asarray(H, dtype=np.float64)
     if H.shape != (4, 4) or not np.isfinite(H).all():
@@ -39,14 +38,14 @@ def raw_generator(H: FloatArray) -> FloatArray:
 
 
 TRACE_FREE = np.linalg.svd(np.eye(4).reshape(1, 16))[2][1:].reshape(15, 4, 4)
-"""Orthonormal basis of the matrices without trace, among them every generator."""
+"""Orthonormal basis of the matrices with trace zero, among them every generator."""
 
 
 def translation_homography(Ps: FloatArray, M: FloatArray, pixels: FloatArray) -> FloatArray:
     """``H = I + G``, ``tr G = 0``, from points before and pixels after a motion near a translation, linear.
 
-    Each pixel gives two equations ``(u P₃ − P₁)(M + G M) = 0``, which weigh errors where they arise, in the images;
-    divided by the depth before the motion. Cameras (c, 3, 4), points (m, 4) of any scale, pixels (c, m, 2) [px],
+    Each pixel gives two equations ``(u P₃ − P₁)(M + G M) = 0``, divided by the depth before the motion, so that they
+    weight errors as they arise in the images. Cameras (c, 3, 4), points (m, 4) of any scale, pixels (c, m, 2) [px],
     NaN where missing. Raises GeometryError for fewer than 15 equations or points that leave G undetermined.
     """
     values, w = check_views(Ps, pixels, None)
@@ -79,8 +78,8 @@ def translation_homography(Ps: FloatArray, M: FloatArray, pixels: FloatArray) ->
 class Weighting:
     """Coordinates ``left G right⁻¹``, both (4, 4), in which the norm of a generator G is taken.
 
-    The rank-one matrix nearest to a measured one depends on them. Identities are the thesis's choice: the
-    projective frame as it is.
+    The rank-one matrix nearest to a measured one depends on them. The thesis uses identities: the norm in
+    the projective frame itself.
     """
 
     left: FloatArray
@@ -111,7 +110,7 @@ UNWEIGHTED = Weighting(np.eye(4), np.eye(4))
 
 
 FLAT = 1e-12
-"""Smallest relative second moment that points count with in a whitening: exactly coplanar ones have none."""
+"""Smallest relative second moment used in a whitening: exactly coplanar points have a moment of zero."""
 
 
 def conditioner(M: FloatArray) -> FloatArray:
@@ -130,7 +129,7 @@ def image_weighting(Ps: FloatArray, M: FloatArray) -> Weighting:
     """Weighting in which the norm of G is, to first order, the rms motion of points M (m, 4) in the images of
     cameras (c, 3, 4) [px], as far as one matrix on each side can express it.
 
-    Raises GeometryError for fewer than five points, and points or cameras that leave a direction out of the images.
+    Raises GeometryError for fewer than five points, and if points or cameras leave a direction invisible.
     """
     M = M[np.isfinite(M).all(axis=1)]
     if len(M) < 5:
@@ -169,14 +168,14 @@ class TranslationSVD:
 
     @property
     def conditioning(self) -> float:
-        """``σ₁/σ₂``: large where the homography is a translation (3.36); infinite for an exact one."""
+        """``σ₁/σ₂``: large if the homography is a translation (3.36); infinite for an exact one."""
         return float(self.singular[0] / self.singular[1]) if self.singular[1] > 0 else float("inf")
 
 
 def translation_from_homography(H: FloatArray, weighting: Weighting = UNWEIGHTED) -> TranslationSVD:
     """Direction and plane at infinity of one homography ``H`` (4, 4) by SVD (3.32-3.34, 3.36).
 
-    Raises GeometryError for the identity and for a homography without trace.
+    Raises GeometryError for the identity and for a homography with trace zero.
     """
     G = weighting.weighted(H)
     U, singular, Vt = np.linalg.svd(G)
@@ -192,7 +191,7 @@ def plane_at_infinity_from_stack(
 ) -> FloatArray:
     """Plane at infinity ``(4,)``, unit norm, of homographies ``(n, 4, 4)`` of any directions (3.37).
 
-    Raises GeometryError for an empty stack and for a homography without trace.
+    Raises GeometryError for an empty stack and for a homography with trace zero.
     """
     stack = np.concatenate([weighting.weighted(H) for H in _some(Hs)])
     return weighting.plane(np.linalg.svd(stack, full_matrices=False)[2][0])
@@ -200,7 +199,7 @@ def plane_at_infinity_from_stack(
 
 def direction_given_plane(H: FloatArray, plane: FloatArray, weighting: Weighting = UNWEIGHTED) -> FloatArray:
     """``k`` (4,) with ``I + k hᵀ`` nearest to the homography ``H`` (4, 4), and ``hᵀk = 0``, for the plane
-    at infinity ``h`` (4,) as scaled. Raises GeometryError for a homography without trace.
+    at infinity ``h`` (4,) at its given scale. Raises GeometryError for a homography with trace zero.
     """
     row = np.linalg.solve(weighting.right.T, plane)
     k = np.linalg.solve(weighting.left, weighting.weighted(H) @ row / (row @ row))

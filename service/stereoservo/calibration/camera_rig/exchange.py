@@ -1,8 +1,8 @@
-"""Cameras of a rig in other programs' files: OpenCV's FileStorage YAML, ROS ``camera_info`` YAML (of
-camera_calibration_parsers) and Kalibr's camera chain; written and read.
+"""Import and export of a rig's cameras in the files of other programs: OpenCV's FileStorage YAML, ROS ``camera_info``
+YAML (of camera_calibration_parsers) and Kalibr's camera chain.
 
-All of them count pixels with integers at pixel centres and distort as OpenCV does (``plumb_bob``, ``radtan``), so that
-numbers go over unchanged; floats are written with the 17 digits that give them back.
+All of them have integer pixel coordinates at pixel centres and distortion as in OpenCV (``plumb_bob``, ``radtan``), so
+that numbers are copied unchanged; floats are written with 17 digits, which restores them exactly.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.numerics.arrays import FloatArray
 
 ROTATION = 1e-6
-"""Largest deviation of ``Rᵀ R`` from the identity of a rotation that a file may state."""
+"""Largest deviation of ``Rᵀ R`` from the identity that is accepted for a rotation in a file."""
 
 
 def save_opencv(cameras: Sequence[RigCamera], path: Path) -> None:
-    """Write ``camera_name1``, ``image_width1``, ``image_height1``, ``M1``, ``D1`` and so on, and of each camera but the
-    first ``R2``, ``T2`` from the first one's frame; of a pair these are ``R`` and ``T``, as of stereoCalibrate.
+    """Write ``camera_name1``, ``image_width1``, ``image_height1``, ``M1``, ``D1`` and so on, and for each camera but
+    the first ``R2``, ``T2`` from the first one's frame; for a pair these are ``R`` and ``T``, as by stereoCalibrate.
 
     Raises CalibrationError (``bad_file``).
     """
@@ -46,7 +46,7 @@ def save_opencv(cameras: Sequence[RigCamera], path: Path) -> None:
 
 
 def load_opencv(path: Path) -> tuple[RigCamera, ...]:
-    """Cameras of a file of `save_opencv`, of OpenCV's stereo sample (M1, D1, …, R, T), or of its calibration sample
+    """Cameras from a file of `save_opencv`, of OpenCV's stereo sample (M1, D1, …, R, T), or of its calibration sample
     (camera_matrix, distortion_coefficients). Raises CalibrationError (``bad_file``).
     """
     try:
@@ -93,8 +93,8 @@ def load_opencv(path: Path) -> tuple[RigCamera, ...]:
 
 
 def save_ros(cameras: Sequence[RigCamera], folder: Path) -> list[Path]:
-    """Write ``CAMERA.yaml`` of each camera, as camera_calibration_parsers does; of a pair with its rectification, which
-    holds the relative pose. The pose of more than two cameras has no place in the format.
+    """Write ``CAMERA.yaml`` for each camera, as camera_calibration_parsers does; for a pair with its rectification,
+    which contains the relative pose. The format cannot represent the poses of more than two cameras.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rectified = (
@@ -121,8 +121,8 @@ def save_ros(cameras: Sequence[RigCamera], folder: Path) -> list[Path]:
 
 
 def load_ros(paths: Sequence[Path]) -> tuple[RigCamera, ...]:
-    """Cameras of ``camera_info`` files, the first one the reference. Relative poses follow from the rectification, of
-    pairs whose second projection states a baseline. Raises CalibrationError (``bad_file``).
+    """Cameras from ``camera_info`` files, the first one the reference. Relative poses follow from the rectification,
+    for pairs whose second projection states a baseline. Raises CalibrationError (``bad_file``).
     """
     cameras: list[RigCamera] = []
     first: FloatArray | None = None
@@ -152,8 +152,8 @@ def load_ros(paths: Sequence[Path]) -> tuple[RigCamera, ...]:
 
 
 def save_kalibr(cameras: Sequence[RigCamera], path: Path) -> None:
-    """Write a camera chain; each pose is relative to the camera before. Raises CalibrationError (``bad_file``) for a
-    third radial term, for which ``radtan`` has no place.
+    """Write a camera chain; each pose is relative to the previous camera. Raises CalibrationError (``bad_file``) for a
+    third radial term, which ``radtan`` does not have.
     """
     tree = {}
     for k, camera in enumerate(cameras):
@@ -181,7 +181,7 @@ def save_kalibr(cameras: Sequence[RigCamera], path: Path) -> None:
 
 
 def load_kalibr(path: Path) -> tuple[RigCamera, ...]:
-    """Cameras of a chain. Raises CalibrationError (``bad_file``)."""
+    """Cameras from a chain. Raises CalibrationError (``bad_file``)."""
     cameras: list[RigCamera] = []
     tree, motion = _tree(path), np.eye(4)
     while (one := tree.get(f"cam{len(cameras)}")) is not None:
@@ -208,7 +208,7 @@ def load_kalibr(path: Path) -> tuple[RigCamera, ...]:
 
 
 def load_cameras(path: Path) -> tuple[RigCamera, ...]:
-    """Cameras of a file of any of these formats; of a folder, of the ``camera_info`` files in it, by name.
+    """Cameras from a file of any of these formats; for a folder, from its ``camera_info`` files, sorted by name.
 
     Raises CalibrationError (``bad_file``).
     """

@@ -1,9 +1,10 @@
-"""The bundle of a camera rig: that of a cell (:mod:`stereoservo.calibration.bundle_adjustment`) with an arm of six
-joints that nobody has read, three along and three about the axes of the first camera, in the place of the hand that
-waves.
+"""Bundle adjustment of a camera rig: the bundle of a cell (:mod:`stereoservo.calibration.bundle_adjustment`) with a
+fictitious arm of six joints without readings, three along and three about the axes of the first camera, in place of
+the hand that waves the body.
 
-The six joints' errors at each stop are estimated with the rest; their deviations are so wide that they say nothing.
-Cameras are tied to pixels without skew, of one focal length, and to a lens about the principal point.
+The six joints' errors at each stop are estimated with the other parameters; their standard deviations are so large that
+they do not constrain the poses. Cameras are tied to pixels without skew, a single focal length, and a lens centred at
+the principal point.
 """
 
 from __future__ import annotations
@@ -49,20 +50,20 @@ from stereoservo.kinematics.parameterization import Kind, LensModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 FOCAL_RANGE = (0.8, 20.0)
-"""Focal lengths [half image widths] that a start may have; beyond it is a nominal one."""
+"""Range of initial focal lengths [half image widths]; outside it a nominal one is used."""
 LINE_MARKERS = 5
-"""Markers on a line of a layout from which its image shows the lens."""
+"""Least number of a layout's markers on a line whose image is used to estimate the lens."""
 LINES = 16
-"""About as many lines, evenly spread over the views, start a lens."""
+"""Approximate number of lines, evenly spread over the views, that initialise a lens."""
 ON_LINE = 1e-6
-"""Distance from a line, relative to the layout's size, up to which a marker is on it."""
+"""Distance from a line, relative to the layout's size, up to which a marker counts as on it."""
 
 
 @dataclass(frozen=True)
 class RigStart:
     """Start of a bundle: ``cameras`` (c, 3, 4) in the first one's frame, ``poses`` (s, 4, 4) of the body in it,
-    ``points`` (m, 3) on the body, ``lenses`` (c, 4). Lengths in metres where the layout is known,
-    else in a unit of their own; the body is then at rest at stop ``reference``.
+    ``points`` (m, 3) on the body, ``lenses`` (c, 4). Lengths are in metres if the layout is known, else in an
+    arbitrary unit; the body is then in its reference pose at stop ``reference``.
     """
 
     cameras: FloatArray
@@ -80,7 +81,7 @@ def rigid(R: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def starts(views: RigViews) -> list[RigStart]:
-    """Starts of the bundle, the best first. Raises CalibrationError where the views allow none."""
+    """Starts of the bundle, the best first. Raises CalibrationError if the views determine none."""
     return [_start_of_layout(views)] if views.layout is not None else _starts_of_body(views)
 
 
@@ -120,7 +121,7 @@ def _in_plane(layout: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -> FloatArray:
-    """Homographies (c, s, 3, 3) from the plane (m, 2) to ideal pixels; NaN where a camera did not see it."""
+    """Homographies (c, s, 3, 3) from the plane (m, 2) to ideal pixels; NaN if a camera did not see it."""
     c, s, _ = views.sigmas.shape
     found = np.full((c, s, 3, 3), np.nan)
     for k in range(c):
@@ -131,12 +132,12 @@ def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -
                 try:
                     found[k, stop] = plane_homography(plane[there], ideal[stop, there])
                 except GeometryError:
-                    continue  # the markers that this picture shows are on one line: it starts nothing
+                    continue  # the markers seen in this image are on one line: no homography
     return found
 
 
 def _line_lens(views: RigViews, k: int) -> FloatArray:
-    """Lens (4,) of camera k by the images of the layout's straight lines; without distortion where there are none."""
+    """Lens (4,) of camera k from the images of the layout's straight lines; without distortion if there are none."""
     camera, lines = views.cameras[k], []
     for members in _layout_lines(views.layout):
         for raw in views.pixels[k][:, members]:
@@ -148,15 +149,15 @@ def _line_lens(views: RigViews, k: int) -> FloatArray:
         sigma = float(np.median(views.sigmas[k][views.seen[k]]))
         try:
             found = lens_from_lines(lines, sigma, camera.width, camera.height).lens
-            # Lines hardly show the centre of a weak distortion, and the principal point goes with it.
+            # Lines hardly determine the centre of a weak distortion, and the principal point is tied to it.
             return np.append(found[0], straight_lens(camera.width, camera.height)[1:])
         except GeometryError:
-            pass  # the bundle finds the lens from a straight one, too
+            pass  # the bundle converges from a lens without distortion, too
     return straight_lens(camera.width, camera.height)
 
 
 def _layout_lines(layout: FloatArray | None) -> list[list[int]]:
-    """Markers of each line along the layout's own axes that has enough of them."""
+    """Markers of each line along the layout's own axes that contains enough of them."""
     if layout is None:
         return []
     size = float(np.ptp(layout, axis=0).max())
@@ -172,8 +173,8 @@ def _layout_lines(layout: FloatArray | None) -> list[list[int]]:
 
 
 def _focal(views: RigViews, k: int, homographies: FloatArray) -> float:
-    """Focal length [px] by the circular points of all places, principal point in the middle; nominal where they do
-    not show it: ``h₁ᵀ ω h₂ = 0``, ``h₁ᵀ ω h₁ = h₂ᵀ ω h₂``, linear in 1/f².
+    """Focal length [px] from the circular points of all places, with a central principal point; nominal if they do
+    not determine it: ``h₁ᵀ ω h₂ = 0``, ``h₁ᵀ ω h₁ = h₂ᵀ ω h₂``, linear in 1/f².
     """
     camera = views.cameras[k]
     N = pixel_normaliser(camera.width, camera.height)
@@ -200,7 +201,7 @@ def _plane_pose(H: FloatArray, focal: float, centre: FloatArray) -> FloatArray:
 
 
 def _extrinsics(poses: FloatArray) -> FloatArray:
-    """Motions (c, 4, 4) from the first camera's frame into each, along the pairs with most places in common."""
+    """Motions (c, 4, 4) from the first camera's frame into each, along the pairs with most common places."""
     c = len(poses)
     there = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
     found = np.full((c, 4, 4), np.nan)
@@ -226,7 +227,7 @@ def _extrinsics(poses: FloatArray) -> FloatArray:
     return found
 
 
-# -- a body that nobody has measured ------------------------------------------------------------------------
+# -- a body of unknown layout -------------------------------------------------------------------------------
 
 
 def _starts_of_body(views: RigViews) -> list[RigStart]:
@@ -249,8 +250,9 @@ def _starts_of_body(views: RigViews) -> list[RigStart]:
 
 
 def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> list[RigStart]:
-    """Starts with these ``lenses`` (c, 4): noise of a pixel shows others than there are, and where a bundle from those
-    comes to nothing, one without distortion may."""
+    """Starts with these ``lenses`` (c, 4): with noise of one pixel, estimated lenses may be wrong; if the bundle from
+    them does not converge, one without distortion may.
+    """
     cameras, points, _ = initial_reconstruction(undistorted(trials, lenses))
     there = np.asarray(np.isfinite(points).all(axis=2))
     reference = int(np.argmax((there[:, None] & there[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
@@ -279,7 +281,7 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
 
 
 def _displacements(points: FloatArray, reference: int) -> FloatArray:
-    """Projective displacements (k, 4, 4), of determinant 1, from the reference place to others.
+    """Projective displacements (k, 4, 4), of determinant 1, from the reference place to the others.
 
     Raises CalibrationError (``flat_body``, ``too_few_markers``).
     """
@@ -345,11 +347,11 @@ def _metric_start(
         try:
             poses[stop] = similarity_from_points(body[common], X[stop, common], scaled=False)
         except GeometryError:
-            break  # the rest shows too little of what is known: left out
+            break  # the remaining ones have too few known points: left out
         new = there[stop] & ~known
         body[new] = (X[stop, new] - poses[stop, :3, 3]) @ poses[stop, :3, :3]
-    # The first camera is K [I | 0] in this frame. The others' matrices are not of square pixels yet: the bundle's ties
-    # make them so from where they explain the images.
+    # The first camera is K [I | 0] in this frame. The other cameras' pixels are not square yet: the bundle's ties
+    # enforce that as far as it explains the images.
     return RigStart(
         matrices / np.linalg.norm(matrices[:, 2, :3], axis=1)[:, None, None], poses, body, lenses, reference
     )
@@ -357,28 +359,28 @@ def _metric_start(
 
 HAND: tuple[Kind, ...] = ("prismatic",) * 3 + ("revolute",) * 3
 TIED = 1e-2
-"""Standard deviation of a tie [px]: below what data show, so that it holds, and not so stiff that steps stall."""
+"""Standard deviation of a tie [px]: small enough to dominate the data, large enough that steps do not stall."""
 LOOSE = 10.0
-"""Ties [px] with which the bundle of an unknown body begins, whose cameras have any pixels yet."""
+"""Initial ties [px] of the bundle of an unknown body, whose cameras do not have square pixels yet."""
 WIDE = 100.0
-"""Deviations of the hand's joints [rad], and [distances of the body]."""
+"""Standard deviations of the hand's joints: rotations [rad], translations [distances of the body]."""
 OUTLIER = 5.0
 """Residual, in estimated standard deviations of the noise, beyond which a measurement is left out."""
 ROUNDS = 3
 ASPECT_GAIN = 25.0
-"""Chi-square that pixels which are not square must gain to be believed, beside 2 for each camera."""
+"""Gain in chi-square from which non-square pixels are accepted, plus 2 for each camera."""
 ASPECT_ROUNDS = 3
 EVALUATIONS = 150
 POSE = Limits(evaluations=40, tolerance=1e-6)
-"""Of the fit of one pose."""
+"""Termination of the fit of one pose."""
 FRAMES = 60
-"""Frames of the body among which the one is taken in which its middle angle stays farthest from a quarter turn."""
+"""Number of tried body frames; the one whose middle angle stays farthest from a quarter turn is used."""
 
 
 @dataclass(frozen=True)
 class RigProblem:
-    """What a bundle of ``views`` begins from: which measurements ``kept`` (k,) of ``data``, the ``body_frame`` (3, 3)
-    of the hand's angles. ``aspect``: factor of the rows' coordinate that makes pixels square.
+    """Input of a bundle of ``views``: the mask ``kept`` (k,) of the ``data``'s measurements, the ``body_frame`` (3, 3)
+    of the hand's angles. ``aspect``: factor on row coordinates that makes pixels square.
     """
 
     views: RigViews
@@ -391,7 +393,7 @@ class RigProblem:
 
 @dataclass(frozen=True)
 class RigFit(RigProblem):
-    """The bundle of a problem, with its ``solution``."""
+    """Bundle of a problem, with its ``solution``."""
 
     solution: Solution
 
@@ -414,25 +416,25 @@ class RigFit(RigProblem):
 
     @property
     def freedoms(self) -> int:
-        """Residuals less parameters, those of the body's poses included."""
+        """Degrees of freedom: residuals minus parameters, those of the body's poses included."""
         solution = self.solution
         free = len(self.views.names) - (0 if self.length_known else 1)
         return solution.rows - solution.charts.size - 6 * free
 
     @property
     def variance(self) -> float:
-        """Variance factor of the stated sigmas: what the residuals show."""
+        """Variance factor: estimated over stated variance."""
         return self.solution.cost / max(self.freedoms, 1)
 
     @cached_property
     def residuals(self) -> FloatArray:
-        """Residuals (k, 2) [px] of all measurements, those left out included."""
+        """Residuals (k, 2) [px] of all measurements, including rejected ones."""
         data = replace(self.data, offsets=self.solution.data.offsets)
         return np.asarray((predicted(self.rig, data) - data.pixels) / np.array([1.0, self.aspect]))
 
     @cached_property
     def root(self) -> FloatArray:
-        """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance that residuals show."""
+        """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance of the residuals."""
         return np.asarray(self.solution.determined.root * np.sqrt(self.variance))
 
     def moved(self, x: FloatArray) -> RigModel:
@@ -440,7 +442,7 @@ class RigFit(RigProblem):
         return rig_at(self.rig, self.solution.charts, x)
 
     def pose_deviations(self) -> FloatArray:
-        """Deviations (s, 6) of the body's poses, cameras taken for exact: along [m] and about [rad] the axes."""
+        """Standard deviations (s, 6) of the body's poses for exact cameras: along [m] and about [rad] the axes."""
         data = self.solution.data
         rows = joint_columns(self.rig, data)
         found = np.full((len(self.views.names), 6), np.inf)
@@ -451,9 +453,10 @@ class RigFit(RigProblem):
 
 
 def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> RigFit:
-    """The bundle from ``start``; measurements that stick out of the noise are left out in rounds, pixels that are not
-    square are found. Where its ``solution`` has not converged, the data leave the cameras open. Raises GeometryError,
-    LinAlgError where they leave no model.
+    """The bundle from ``start``, with outliers rejected in rounds and non-square pixels detected.
+
+    If its ``solution`` has not converged, the data leave the cameras undetermined. Raises GeometryError, LinAlgError if
+    they determine no model.
     """
     views, start = _placed(views, start)
     data, body_frame = _measurements(views, start)
@@ -465,7 +468,7 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     if not known:
         ties = PinholeTies(LOOSE, LOOSE, LOOSE)
         loose = _settled(begun, rig, lenses, ties)
-        if not loose.solution.converged:  # its first step is too far off where places are
+        if not loose.solution.converged:  # its first step is too large for the initial places
             begun = replace(begun, data=_with_poses_settled(rig, data))
             loose = _settled(begun, rig, lenses, ties)
         if not loose.solution.converged:
@@ -478,7 +481,7 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     free = _settled(square, square.rig, lenses, open_aspect)
     if not free.solution.converged:
         return free
-    # Pixels are square unless the chi-square of all cameras' aspects is beyond chance by far.
+    # Pixels are square unless the chi-square of all cameras' aspects is far beyond chance.
     gain = (square.solution.cost - free.solution.cost) / max(free.variance, 1e-300)
     if gain < ASPECT_GAIN + 2.0 * len(views.cameras):
         return square
@@ -491,7 +494,7 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
 
 
 def _stretched(fit: RigFit, ratio: float) -> tuple[RigFit, RigModel]:
-    """The fit with rows' coordinates stretched by ``ratio``, to begin from."""
+    """The fit with row coordinates scaled by ``ratio``, as a new start."""
     stretch = np.diag([1.0, ratio, 1.0])
     lenses = fit.rig.lenses * np.array([1.0, 1.0, ratio, 1.0, 1.0, 1.0, 1.0])
     rig = replace(fit.rig, cameras=stretch @ fit.rig.cameras, lenses=lenses)
@@ -500,7 +503,7 @@ def _stretched(fit: RigFit, ratio: float) -> tuple[RigFit, RigModel]:
 
 
 def _placed(views: RigViews, start: RigStart) -> tuple[RigViews, RigStart]:
-    """Views and start of those stops and markers that have a place in it."""
+    """Views and start restricted to the stops and markers whose initial poses and points are known."""
     stops, markers = np.isfinite(start.poses[:, 0, 0]), np.isfinite(start.points[:, 0])
     reference = None if start.reference is None else int(stops[: start.reference].sum())
     return views.select(stops, markers), replace(
@@ -509,7 +512,7 @@ def _placed(views: RigViews, start: RigStart) -> tuple[RigViews, RigStart]:
 
 
 def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
-    """The bundle from ``rig``, and from the places and the measurements kept of the fit that has ``begun``."""
+    """The bundle from ``rig``, starting with the places and the kept measurements of ``begun``."""
     data, kept = replace(begun.data, pinhole_ties=ties), begun.kept
     for _ in range(ROUNDS):
         solution = solve(
@@ -534,8 +537,8 @@ def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeT
 
 
 def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
-    """The measurements with the hand's readings at the least residuals of each stop, cameras and body as they are: each
-    stop on its own, for the bundle does not damp the hand's errors.
+    """The measurements with the hand's readings fitted to each stop separately, with cameras and body fixed, because
+    the bundle does not damp the hand's errors.
     """
     offsets = data.offsets.copy()
     for stop in np.unique(data.stop):

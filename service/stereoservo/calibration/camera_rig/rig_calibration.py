@@ -1,8 +1,7 @@
-"""Calibration of cameras without an arm: the bundle's cameras with their covariance, or the refusal of views that leave
-them open; and the model's file.
+"""Calibration of cameras without an arm: the bundle's cameras with their covariance, or refusal of views that leave
+them undetermined; and the result's file.
 
-
-Also which further views of the body would make the cameras better known.
+Also advice on further views of the body that would improve the accuracy of the cameras.
 """
 
 from __future__ import annotations
@@ -29,19 +28,19 @@ from stereoservo.numerics.arrays import FloatArray
 
 SCHEMA = 1
 LEAST_TURN = 8.0
-"""Angle [°] from the mean direction that a tenth of the places must reach: a board's normals, or a body's turns."""
+"""Angle [°] from the mean direction that a tenth of the places must reach: of a board's normals, or a body's turns."""
 TURN_SIGMAS = 5.0
-"""That angle in deviations of a place's own, below which it is noise."""
+"""Ratio of that angle to the standard deviation at a place, below which it counts as noise."""
 FOCAL_DEVIATION = 0.02
-"""Deviation of a focal length, relative to it, above which it counts as open."""
+"""Relative standard deviation of a focal length above which it counts as undetermined."""
 CENTRE_DEVIATION = 0.03
-"""Deviation of a principal point [image widths] above which it counts as open."""
+"""Standard deviation of a principal point [image widths] above which it counts as undetermined."""
 PAIR_DEVIATION = 1.0
-"""Deviation of the rotation between two cameras [°] above which it counts as open."""
+"""Standard deviation of the rotation between two cameras [°] above which it counts as undetermined."""
 OUTSIDE = 0.5
-"""Distance of a principal point from the middle [image sizes] beyond which the model is no camera's."""
+"""Distance of a principal point from the middle [image sizes] beyond which the model is implausible."""
 MOST_LEFT_OUT = 0.2
-"""Share of measurements that may stick out of the noise."""
+"""Largest share of rejected measurements."""
 MOST_NOISE = 2.0
 """Noise of the pixels [px] above which the views do not fit a pinhole with radial and tangential distortion."""
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -51,7 +50,7 @@ WAVE = "Wave the body also tilted, by 20 to 40 degrees about two axes, near and 
 
 class RigCamera(msgspec.Struct, frozen=True):
     """A camera of a rig. ``focal`` (fx, fy) and ``centre`` (cx, cy) [px], integer = pixel centre; ``distortion`` (k1,
-    k2, p1, p2[, k3]) of Brown's model as OpenCV has it. ``rotation`` (3, 3), ``translation`` (3,): from the first
+    k2, p1, p2[, k3]) of Brown's model as in OpenCV. ``rotation`` (3, 3), ``translation`` (3,): from the first
     camera's frame into its own. ``deviations`` of all by name: lengths in the rig's unit, angles in rad.
     """
 
@@ -88,10 +87,10 @@ class ViewResidual(msgspec.Struct, frozen=True):
 
 
 class RigCalibration(msgspec.Struct, frozen=True):
-    """A calibrated rig. ``unit``: of its lengths, ``m`` where one was known, else ``baseline`` (of the second camera).
+    """A calibrated rig. ``unit``: of its lengths, ``m`` if one was known, else ``baseline`` (of the second camera).
 
-    ``parameters`` name the rows of ``covariance``: ``CAMERA.NAME``. ``sigma_px``: noise of a pixel coordinate that the
-    residuals show. ``views`` worst first.
+    ``parameters`` name the rows of ``covariance``: ``CAMERA.NAME``. ``sigma_px``: noise of a pixel coordinate,
+    estimated from the residuals. ``views`` worst first.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -109,12 +108,12 @@ class RigCalibration(msgspec.Struct, frozen=True):
     schema: int = SCHEMA
 
     def camera(self, name: str) -> RigCamera:
-        """The camera of that name. Raises KeyError."""
+        """The camera with that name. Raises KeyError."""
         return {camera.name: camera for camera in self.cameras}[name]
 
 
 class KnownDistance(NamedTuple):
-    """Distance [m] of two markers of the body by their ids."""
+    """Distance [m] of two markers of the body, given by their ids."""
 
     first: int
     second: int
@@ -122,9 +121,9 @@ class KnownDistance(NamedTuple):
 
 
 def calibrate_rig(views: RigViews, known: KnownDistance | None = None) -> tuple[RigCalibration, RigFit]:
-    """Calibrate the cameras of ``views``; ``known``: of a body that nobody has measured.
+    """Calibrate the cameras of ``views``; ``known``: for a body of unknown layout.
 
-    Raises CalibrationError where the views leave the cameras open: cause, value, limit and what to do.
+    Raises CalibrationError if the views leave the cameras undetermined: cause, value, limit and advice.
     """
     views = usable_views(views)
     try:
@@ -141,8 +140,8 @@ def calibrate_rig(views: RigViews, known: KnownDistance | None = None) -> tuple[
 
 
 def _best_fit(views: RigViews, begun: list[RigStart]) -> RigFit:
-    """The first bundle that converges. Raises CalibrationError where none does: of places without turns for that,
-    as the bundles' starts and ends show them.
+    """The first bundle that converges. Raises CalibrationError if none does: for lack of turns between the places, if
+    the bundles' starts and results show that.
     """
     failure: Exception | None = None
     ended: list[RigFit] = []
@@ -172,7 +171,7 @@ def _best_fit(views: RigViews, begun: list[RigStart]) -> RigFit:
 
 
 def _turn_deviations(fit: RigFit) -> FloatArray:
-    """Deviations (s,) of the body's turns [°], cameras taken for exact."""
+    """Standard deviations (s,) of the body's turns [°], for exact cameras."""
     return np.asarray(np.degrees(fit.pose_deviations()[:, 3:].max(axis=1)))
 
 
@@ -188,10 +187,11 @@ def _open(why: str) -> CalibrationError:
 
 
 def _require_turns(poses: FloatArray, deviations: FloatArray, views: RigViews) -> None:
-    """Refuse places (s, 4, 4) between which the board was not tilted, the body not turned; ``deviations`` (s,) [°].
+    """Raise CalibrationError if the board was not tilted, or the body not turned, between the places (s, 4, 4);
+    ``deviations`` (s,) [°].
 
-    A plane's normal is ``Kᵀ l`` of its vanishing line, so that parallel boards show one normal whatever the camera is
-    taken for; and turns of an unknown body are those of its projective displacements' eigenvalues.
+    A plane's normal is ``Kᵀ l`` of its vanishing line, so that parallel boards have one normal for any assumed camera;
+    and turns of an unknown body are those of its projective displacements' eigenvalues.
     """
     there = np.isfinite(poses[:, 0, 0])
     if views.layout is not None:
@@ -293,7 +293,7 @@ def _physical(
 
 
 def rig_result(fit: RigFit, known: KnownDistance | None) -> RigCalibration:
-    """The cameras of a fit with their covariance. Raises CalibrationError where ``known`` names no two markers."""
+    """The cameras of a fit with their covariance. Raises CalibrationError if ``known`` does not name two markers."""
     ids, metric = fit.views.marker_ids, fit.length_known
     if known is not None:
         missing = [one for one in (known.first, known.second) if one not in ids]
@@ -395,11 +395,11 @@ PLACES = (
 )
 DISTANCES = (("near", 0.6), ("as far", 1.0))
 INSIDE = 0.9
-"""Share of the markers that a view must show."""
+"""Least share of the markers that are visible in an advised view."""
 
 
 class ViewAdvice(msgspec.Struct, frozen=True):
-    """A view that would help: what it does to the relative deviation of the worst known focal length."""
+    """A useful further view: its effect on the relative deviation of the least accurate focal length."""
 
     message: str
     camera: str
@@ -411,8 +411,8 @@ class ViewAdvice(msgspec.Struct, frozen=True):
 
 
 def next_views(fit: RigFit, result: RigCalibration) -> list[ViewAdvice]:
-    """Views before the camera whose focal length is known worst, the most helpful first; none where no such view shows
-    the body.
+    """Views in front of the camera with the least accurate focal length, the most useful first; none if no such view
+    shows the body.
     """
     worst = max(result.cameras, key=lambda camera: camera.deviations["fx"] / camera.focal[0])
     k = [camera.name for camera in result.cameras].index(worst.name)
@@ -456,7 +456,7 @@ def _rows(
     tilt: tuple[float, float],
     share: float,
 ) -> FloatArray | None:
-    """Rows (2 k, p) of one more view, its own pose eliminated; None where it does not show the body."""
+    """Rows (2 k, p) of one more view, with its own pose eliminated; None if it does not show the body."""
     camera = result.cameras[k]
     motions = np.array([np.array(one.motion) for one in result.cameras])
     depths = fit.poses[:, 2, 3]
@@ -494,7 +494,7 @@ def _rows(
 
 
 def _facing(fit: RigFit, k: int) -> FloatArray:
-    """Rotation (3, 3) of the body before camera k that is nearest to the mean of its places."""
+    """Rotation (3, 3) of the body in front of camera k that is nearest to the mean of its places."""
     turns = Rotation.from_matrix(fit.poses[:, :3, :3])
     mean: FloatArray = turns.mean().as_matrix()
     if not fit.length_known:

@@ -1,8 +1,7 @@
-"""Views of a rigid marker body, waved before the cameras of a rig: the data of a calibration without an arm, and its
-refusals.
+"""Views of a rigid marker body that is waved in front of a rig's cameras: the data of a calibration without an arm, and
+its refusals.
 
-
-Places at which a body that is waved by hand was held still, from the observations of all cameras over time.
+Also the places at which a body waved by hand was held still, from the observations of all cameras over time.
 """
 
 from __future__ import annotations
@@ -18,21 +17,21 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import CameraObservation
 
 LEAST_MARKERS = 4
-"""Markers of a view below which it shows no plane's homography, and no pose that can be checked."""
+"""Least number of markers in a view: fewer determine no plane homography and no pose with redundancy."""
 LEAST_STOPS = 3
-"""Places of the body below which nothing is left to check a lens by."""
+"""Least number of places of the body: with fewer, a lens cannot be checked."""
 STRAIGHT = 0.02
-"""Second singular value of a layout, relative to the first, below which its markers are on one line."""
+"""Second singular value of a layout, relative to the first, below which its markers count as collinear."""
 FLAT = 1e-6
-"""Third singular value of a layout, relative to the first, above which it is no plane."""
+"""Third singular value of a layout, relative to the first, above which it is not planar."""
 
 
 @dataclass(frozen=True)
 class RigViews:
-    """Raw ``pixels`` (c, s, m, 2) [px] of m markers at s places of the body, NaN where one was not seen, with
-    ``sigmas`` (c, s, m) [px] an axis; all cameras saw it at the same instant. ``names`` (s,) of the places.
+    """Raw ``pixels`` (c, s, m, 2) [px] of m markers at s places of the body, NaN if not seen, with
+    ``sigmas`` (c, s, m) [px] per axis; all cameras observed it at the same instant. ``names`` (s,) of the places.
 
-    ``layout`` (m, 3) [m]: where the markers are on the body, a plane; None where nobody has measured them.
+    ``layout`` (m, 3) [m]: positions of the markers on the body, a plane; None if unknown.
     """
 
     cameras: tuple[TrialCamera, ...]
@@ -44,11 +43,11 @@ class RigViews:
 
     @property
     def seen(self) -> BoolArray:
-        """(c, s, m): which pixels there are."""
+        """Mask (c, s, m) of the available pixels."""
         return np.asarray(np.isfinite(self.pixels).all(axis=-1))
 
     def select(self, stops: BoolArray, markers: BoolArray) -> RigViews:
-        """The views at some ``stops`` (s,) of some ``markers`` (m,)."""
+        """The views at selected ``stops`` (s,) of selected ``markers`` (m,)."""
         return replace(
             self,
             marker_ids=tuple(i for i, keep in zip(self.marker_ids, markers, strict=True) if keep),
@@ -60,7 +59,7 @@ class RigViews:
 
 
 def refused(code: str, cause: str, value: float, limit: float, unit: str, remedy: str) -> CalibrationError:
-    """The refusal of data: what is wrong, its value and limit, and what to do."""
+    """Error for refused data: what is wrong, its value and limit, and advice."""
     return CalibrationError(
         code,
         f"{cause}: {value:.3g}{unit}, the limit is {limit:.3g}{unit}. {remedy}",
@@ -73,7 +72,7 @@ def refused(code: str, cause: str, value: float, limit: float, unit: str, remedy
 
 
 def usable_views(views: RigViews) -> RigViews:
-    """The views without pictures of too few markers, places that no camera saw and markers that were seen but once.
+    """The views without images of too few markers, places that no camera saw and markers that were seen only once.
 
     Raises CalibrationError: ``bad_data``, ``too_few_views``, ``camera_apart``, ``markers_on_a_line``.
     """
@@ -153,13 +152,13 @@ def _require_layout(views: RigViews) -> None:
 
 
 STILL_PX = 0.5
-"""Median change of the markers from one frame to the next up to which a body is still [px]."""
+"""Median motion of the markers between two frames up to which a body counts as still [px]."""
 GAP_S = 0.25
-"""Frames farther apart in time are no neighbours."""
+"""Largest time between consecutive frames."""
 HELD_S = 0.3
-"""How long the body must be still before all cameras that see it."""
+"""Time for which the body must be still in all cameras that see it."""
 ELSEWHERE_PX = 8.0
-"""Median distance of the markers, in some camera, from the place before that makes another place."""
+"""Median distance of the markers from the previous place, in some camera, from which a place is a new one."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ class _Still:
 
 
 def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[CameraObservation]]) -> RigViews:
-    """The views of a body at the places at which it was held still for ``HELD_S`` before all cameras that saw it; each
+    """The views of a body at the places at which it was held still for ``HELD_S`` in all cameras that saw it; each
     camera's pixels are the means over that time, with the detector's standard deviations.
     """
     ids = tuple(sorted({int(i) for one in seen.values() for o in one for i in o.ids}))
@@ -213,7 +212,7 @@ def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[Cam
 
 
 def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
-    """When the body was still before one camera, or not seen by it."""
+    """Intervals in which one camera saw the body still, or did not see it."""
     found: list[_Still] = []
     for before, after in pairwise(observations):
         if after.t_shutter_ns - before.t_shutter_ns > GAP_S * 1e9:
@@ -236,7 +235,7 @@ def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
 def _mean(
     observations: Sequence[CameraObservation], began: int, ended: int, ids: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean pixels (m, 2), NaN where a marker was in less than half of the frames, and the detector's sigmas (m,)."""
+    """Mean pixels (m, 2), NaN if a marker was in less than half of the frames, and the detector's sigmas (m,)."""
     inside = [o for o in observations if began <= o.t_shutter_ns <= ended]
     column = {marker: k for k, marker in enumerate(ids)}
     total, squares, count = np.zeros((len(ids), 2)), np.zeros(len(ids)), np.zeros(len(ids))
@@ -252,7 +251,7 @@ def _mean(
 
 
 def _elsewhere(place: FloatArray, before: FloatArray) -> bool:
-    """Whether the body (c, m, 2) is away from where it was."""
+    """Whether the body (c, m, 2) is away from its previous place."""
     for here, there in zip(place, before, strict=True):
         common = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
         if common.any() and float(np.median(np.linalg.norm((here - there)[common], axis=1))) > ELSEWHERE_PX:

@@ -1,18 +1,18 @@
-"""Detection of a changed camera, marker or joint zero from the innovations (observed less predicted pixels) of one
-moment: result types and the call of the numba kernel.
+"""Detection of a changed camera, marker or joint zero from one set of innovations (observed minus predicted pixels):
+result types and the call of the numba kernel.
 
-Innovations are observed less predicted pixels. Hypotheses, each a change of few parameters:
+Hypotheses, each a change of few parameters:
 
     nothing                0
-    camera k moved         6, a displacement; 8, a homography of its image, where the model is not metric; 2, a shift of
-                           its image, where it sees too few points for that
+    camera k moved         6, a displacement; 8, a homography of its image, if the model is not metric; 2, a shift of
+                           its image, if it sees too few points for that
     all cameras together   6, one displacement (metric)
-    marker i slipped       3, its point; 2 where one camera sees it
+    marker i slipped       3, its point; 2 if one camera sees it
     the zero of joint j    1
-    all joints             n: their zeros, or what looks the same: another tool, an arm that was pushed
+    all joints             n: their zeros, or a change with the same effect: a different tool, an arm that was pushed
 
-Static points move with cameras only. Each hypothesis is estimated by Gauss-Newton iteration, and decided among by
-`hypothesis_test`. Of two that are nearly as good both are returned: with one pose and no static point a displaced rig
+Static points move with cameras only. Each hypothesis is estimated by Gauss-Newton iteration; `hypothesis_test` selects
+among them. If two are nearly as good, both are returned: with one pose and no static point a displaced rig
 cannot be distinguished from a displaced arm.
 """
 
@@ -35,10 +35,10 @@ KINDS: tuple[ChangeKind, ...] = ("nothing", "camera", "cameras", "marker", "join
 @dataclass(frozen=True)
 class IsolatedChange:
     """An estimated change: its ``kind`` and ``index`` (of the camera, marker or joint; -1 for all), its ``size`` in
-    parameters and the ``chi2`` that it leaves.
+    parameters and the remaining ``chi2``.
 
-    ``amount``: angle [rad] of a displaced camera, offset [rad or m] of a joint's zero (of all joints: the largest), NaN
-    where the image alone was moved, 0 of a marker. ``effect_px``: rms displacement of the pixels that it concerns.
+    ``amount``: angle [rad] of a displaced camera, offset [rad or m] of a joint's zero (for all joints: the largest),
+    NaN for a motion of the image alone, 0 for a marker. ``effect_px``: rms displacement of the affected pixels.
     """
 
     kind: ChangeKind
@@ -51,10 +51,10 @@ class IsolatedChange:
 
 @dataclass(frozen=True)
 class ChangeDiagnosis:
-    """The change that best explains one set of innovations. ``measurements``: number of coordinates; ``chi2`` if
-    nothing has changed.
+    """The change that best explains one set of innovations. ``measurements``: number of coordinates; ``chi2``
+    without any change.
 
-    ``kind`` ``unexplained``: no noise, and no single hypothesis explains it; ``cause`` is then the best, or None.
+    ``kind`` ``unexplained``: not noise, and no single hypothesis explains it; ``cause`` is then the best one, or None.
     ``runner_up``: a cause that explains nearly as well, so that the two are indistinguishable; else None.
     """
 
@@ -85,7 +85,7 @@ def diagnose(
     """Diagnose one set of innovations with the compiled kernel; deterministic.
 
     ``matrices`` (c, 3, 4); ``points`` (m, 4) as predicted; ``innovations`` (c, m, 2) of ideal pixels [px] and
-    ``weights`` (c, m) = 1/sigma [1/px], 0 where not seen; ``operators`` (n, 4, 4) at the current joints (5.21);
+    ``weights`` (c, m) = 1/sigma [1/px], 0 if not seen; ``operators`` (n, 4, 4) at the current joints (5.21);
     ``twists`` (6, 4, 4) of a metric model, else None; static points (s, 4) likewise with (c, s, 2) and (c, s).
     """
     cameras, markers, joints = len(matrices), len(points), len(operators)

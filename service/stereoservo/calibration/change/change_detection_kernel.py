@@ -1,5 +1,5 @@
 """Numba kernels of change detection: least-squares estimates of all hypothetical changes (camera, marker, joint zero,
-…) from the innovations of one moment, and the choice among them.
+…) from one set of innovations, and the selection among them.
 
 Explicit loops in a fixed order, no LAPACK: the results are part of recordings.
 """
@@ -28,16 +28,16 @@ from stereoservo.numerics.linear import NormalSystem, add_pixel_equations, dampe
 NOTHING, CAMERA, CAMERAS, MARKER, JOINT, JOINTS, UNEXPLAINED = range(7)
 ROUNDS = 6
 SPARE = 2
-"""Redundant measurements that a hypothesis needs: an exact fit proves nothing."""
+"""Least number of redundant measurements for a hypothesis: an exact fit proves nothing."""
 SCREEN = 0.7
 """Share of its threshold that a hypothesis must reach to first order to be estimated in full."""
 EXPLAINED = 0.05
-"""Share of chi-square that an explanation may leave besides the noise: models are not exact far from where they are."""
+"""Share of chi-square that may remain beside the noise: models are inexact far from their estimate."""
 
 
 class SightedPoints(NamedTuple):
-    """Points ``X`` (p, 4) in cameras ``Ps`` (c, 3, 4): where they are seen, ``pixels`` (c, p, 2), or are predicted to
-    be, and with what ``weights`` (c, p) [1/px], 0 where not seen.
+    """Points ``X`` (p, 4) in cameras ``Ps`` (c, 3, 4): observed or predicted ``pixels`` (c, p, 2), with ``weights``
+    (c, p) [1/px], 0 if not seen.
     """
 
     Ps: FloatArray
@@ -55,7 +55,7 @@ class DisplacementGroup(NamedTuple):
 
 
 class Displaced(NamedTuple):
-    """An element ``D`` (4, 4) of a group of d dimensions, and the ``total`` (d,) of the steps to it."""
+    """An element ``D`` (4, 4) of a group of d dimensions, and the sum ``total`` (d,) of the steps to it."""
 
     D: FloatArray
     total: FloatArray
@@ -63,7 +63,7 @@ class Displaced(NamedTuple):
 
 @kernel
 def _effect(predicted: SightedPoints, camera: int, D: FloatArray, count: int) -> float:
-    """Rms motion [px] of the first ``count`` points, where seen, in one camera, or all (-1), by a displacement."""
+    """Rms motion [px] of the first ``count`` points, if seen, in one camera, or all (-1), by a displacement."""
     Ps, X, pixels, weights = predicted
     low, high = (0, Ps.shape[0]) if camera < 0 else (camera, camera + 1)
     squares, seen = 0.0, 0.0
@@ -85,15 +85,15 @@ def _effect(predicted: SightedPoints, camera: int, D: FloatArray, count: int) ->
 
 @kernel
 def _angle(D: FloatArray) -> float:
-    """Angle [rad] of a displacement in any frame, by its trace 2 + 2 cos."""
+    """Angle [rad] of a displacement in any frame, from its trace 2 + 2 cos."""
     quarter = (4.0 - D[0, 0] - D[1, 1] - D[2, 2] - D[3, 3]) / 4.0
     return 2.0 * math.asin(math.sqrt(min(max(quarter, 0.0), 1.0)))
 
 
 class Moment(NamedTuple):
-    """What one moment shows: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm; their
-    ``pixels`` as predicted and ``observed`` (c, p, 2), ``weights`` (c, p) [1/px]; the arm's ``operators`` (n, 4, 4) and
-    the ``twists`` (6 or 0, 4, 4) of a metric model.
+    """Measurements of one moment: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm;
+    their predicted ``pixels`` and ``observed`` ones (c, p, 2), ``weights`` (c, p) [1/px]; the arm's ``operators``
+    (n, 4, 4) and the ``twists`` (6 or 0, 4, 4) of a metric model.
     """
 
     Ps: FloatArray
@@ -108,8 +108,8 @@ class Moment(NamedTuple):
 
 @kernel
 def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result: FloatArray) -> None:
-    """Estimate of hypothesis ``h`` into ``result`` (4,): chi-square of what it concerns, first-order gain, amount,
-    effect [px].
+    """Estimate of hypothesis ``h`` into ``result`` (4,): chi-square of the affected measurements, first-order gain,
+    amount, effect [px].
     """
     Ps, X, markers, pixels, observed, weights, operators, twists = moment
     cameras, joints = Ps.shape[0], operators.shape[0]
@@ -151,7 +151,7 @@ def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result:
                 chi2 += w * w * (du * du + dv * dv)
                 seen += 1.0
         result[3] = math.sqrt(squares / max(seen, 1.0))
-        if sizes[h] == 2:  # a point that one camera sees may be anywhere on its ray
+        if sizes[h] == 2:  # a point seen by one camera may be anywhere on its ray
             result[0], result[1] = 0.0 if rounds > 0 else chi2, chi2
         else:
             place = np.empty(4)
@@ -175,8 +175,8 @@ def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result:
 def hypothesis_sizes(
     weights: FloatArray, cameras: int, markers: int, joints: int, metric: bool, sizes: IntArray
 ) -> int:
-    """Parameters of each hypothesis into ``sizes`` (2 + c + m + n + 1,), 0 where it cannot be tested; and how many
-    coordinates are measured.
+    """Number of parameters of each hypothesis into ``sizes`` (2 + c + m + n + 1,), 0 if it cannot be tested; and the
+    number of measured coordinates.
     """
     points = weights.shape[1]
     total, of_arm = 0, 0
@@ -217,7 +217,7 @@ def _kind(h: int, cameras: int, markers: int, joints: int) -> int:
 
 
 class Innovations(NamedTuple):
-    """``innovations`` (c, p, 2) [px] with ``weights`` (c, p) [1/px] of points ``X`` (p, 4), the first ``markers`` of
+    """``innovations`` (c, p, 2) [px] with ``weights`` (c, p) [1/px] of points ``X`` (p, 4), the first ``markers`` on
     the arm, then static ones, in cameras ``Ps`` (c, 3, 4); ``operators`` and ``twists`` as in `Moment`.
     """
 
@@ -231,8 +231,8 @@ class Innovations(NamedTuple):
 
 
 class Explanations(NamedTuple):
-    """Of H hypotheses: ``sizes``, their parameters, ``chi2`` that each leaves, ``amounts`` and ``effects`` [px], (H,)
-    each; the ``answer`` (3,): kind, hypothesis, runner-up or -1.
+    """Results for H hypotheses: ``sizes`` (numbers of parameters), remaining ``chi2``, ``amounts`` and ``effects``
+    [px], (H,) each; the ``answer`` (3,): kind, hypothesis, runner-up or -1.
     """
 
     sizes: IntArray
@@ -244,7 +244,7 @@ class Explanations(NamedTuple):
 
 @kernel
 def _predict(shown: Fields, pixels: FloatArray, observed: FloatArray) -> tuple[float, float]:
-    """``pixels`` (c, p, 2) as predicted and ``observed``, where seen; chi-square and rms [px] of the innovations."""
+    """Predicted ``pixels`` (c, p, 2) and ``observed`` ones, if seen; chi-square and rms [px] of the innovations."""
     Ps, X, _, innovations, weights, _, _ = shown
     chi2, square_px, seen = 0.0, 0.0, 0.0
     for c in range(Ps.shape[0]):
@@ -317,19 +317,19 @@ def explain_innovations(seen: Fields, thresholds: FloatArray, log_alpha: float, 
     if is_unexplained(chi2[first], total - sizes[first], log_alpha, EXPLAINED * whole):
         answer[0] = UNEXPLAINED
     if answer[0] == JOINT and second >= 0 and sizes[second] > 1 and _kind(second, cameras, markers, joints) != MARKER:
-        # The motion of one joint is a displacement, too: what contains it and costs more is no rival.
+        # The motion of one joint is a displacement, too: a larger hypothesis that contains it is no alternative.
         return
     if second >= 0 and (chi2[second] - chi2[first]) / noise + (sizes[second] - sizes[first]) * penalty < UNCLEAR:
         answer[2] = second
 
 
 SETTLED = 1e-4
-"""Decrease of chi-square to first order at which Gauss and Newton's iteration ends."""
+"""Decrease of chi-square to first order at which the Gauss-Newton iteration ends."""
 DAMPING = 1e-10
 
 
 class CameraPoints(NamedTuple):
-    """Points ``X`` (p, 4), moved by ``D`` (4, 4), in a camera ``P`` (3, 4): where they are ``observed`` (p, 2), and
+    """Points ``X`` (p, 4), moved by ``D`` (4, 4), in a camera ``P`` (3, 4): ``observed`` pixels (p, 2) and
     ``weights`` (p,).
     """
 
@@ -342,9 +342,9 @@ class CameraPoints(NamedTuple):
 
 @kernel
 def _equations(E: FloatArray, points: CameraPoints, count: int, equations: NormalSystem, rows: FloatArray) -> float:
-    """Equations of the first ``count`` points onto ``equations``; their chi-square.
+    """Add the normal equations of the first ``count`` points to ``equations``; returns their chi-square.
 
-    ``E`` (d, 3, 4) = P times the algebra; ``rows`` (2, d) scratch. Infinite where a point is not ahead.
+    ``E`` (d, 3, 4) = P times the algebra; ``rows`` (2, d) scratch. Infinite if a point is behind the camera.
     """
     P, D, X, observed, weights = points
     N, b = equations
@@ -405,9 +405,9 @@ def fit_displacement(
     seen: SightedPoints, camera: int, group: DisplacementGroup, count: int, rounds: int, found: Displaced
 ) -> tuple[float, float]:
     """Chi-square of the first ``count`` points in one camera, or all (-1), moved by the best element of a group, which
-    goes into ``found``.
+    is written to ``found``.
 
-    With ``rounds`` 0: chi-square of the model as it is. Second: the gain to first order of the first step.
+    With ``rounds`` 0: chi-square of the unchanged model. Second: the gain to first order of the first step.
     """
     Ps, X, observed, weights = seen
     algebra, first, last = group
@@ -465,7 +465,7 @@ def fit_image_motion(
 ) -> tuple[float, float]:
     """Chi-square of ``pixels`` (q, 2) of one camera moved by the best homography (``size`` 8) or shift (2).
 
-    ``moved`` (q, 2): where it puts them. Second: the gain to first order of the first step.
+    ``moved`` (q, 2): the moved pixels. Second: the gain to first order of the first step.
     """
     q = pixels.shape[0]
     seen, cu, cv, spread = 0.0, 0.0, 0.0, 0.0
@@ -526,9 +526,9 @@ def fit_image_motion(
 
 @kernel
 def fit_point(sighted: SightedPoints, p: int, rounds: int, found: FloatArray) -> tuple[float, float]:
-    """Chi-square of point ``p`` alone at its best place ``found`` (4,); second: gain to first order of the first step.
+    """Chi-square of point ``p`` alone at its best position ``found`` (4,); second: first-order gain of the first step.
 
-    Two views or more: three of its coordinates are free, all but the largest.
+    With two or more views, three of its coordinates are free, all but the largest.
     """
     Ps, X, observed, weights = sighted
     largest = 0

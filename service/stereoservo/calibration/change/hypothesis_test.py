@@ -1,11 +1,11 @@
 """Statistical test of which of several hypothetical changes of a model explains its residuals: chi-square thresholds,
 candidates, Schwarz's criterion, significance.
 
-Used on-line, for the innovations of one moment (`change_detection_kernel`), and off-line, for the pixels of a check
+Used on-line, for one set of innovations (`change_detection_kernel`), and off-line, for the pixels of a check
 motion (`model_check`). Each hypothesis is a change of ``size`` parameters. Those of the largest first-order gain are
-estimated in full. Significant are those whose likelihood ratio, in the noise that the best one leaves, exceeds the
-chi-square quantile of the false-alarm rate (Wilks, Bonferroni); of these the least ``chi2 + size ln N`` wins (Schwarz).
-Kernels are explicit loops in a fixed order: their results are part of recordings.
+estimated in full. A hypothesis is significant if its likelihood ratio, at the noise that the best one leaves, exceeds
+the chi-square quantile of the false-alarm rate (Wilks, Bonferroni); of these the least ``chi2 + size ln N`` is selected
+(Schwarz). Kernels are explicit loops in a fixed order: their results are part of recordings.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 
 MAX_SIZE = 16
-"""Parameters of the largest hypothesis: all joints."""
+"""Number of parameters of the largest hypothesis: all joints."""
 REFINED = 5
-"""Hypotheses, the best to first order, that are estimated in full."""
+"""Number of hypotheses, the best to first order, that are estimated in full."""
 UNCLEAR = 9.2
 """Difference of the penalised chi-squares of two hypotheses below which neither is excluded: odds of 100 to 1."""
 
@@ -34,8 +34,8 @@ UNCLEAR = 9.2
 class Thresholds:
     """Limits of the decision.
 
-    ``ratios`` (MAX_SIZE + 1,): reduction of chi-square that a hypothesis of so many parameters must exceed, in the
-    noise that the best one leaves; ``log_alpha``: logarithm of the probability below which a chi-square as a whole is
+    ``ratios`` (MAX_SIZE + 1,): reduction of chi-square that a hypothesis of so many parameters must exceed, at the
+    noise that the best one leaves; ``log_alpha``: logarithm of the probability below which the total chi-square is
     not noise; ``least_px``: rms change of the pixels below which no change is reported, however significant.
     """
 
@@ -55,7 +55,7 @@ def alarm_thresholds(
 ) -> Thresholds:
     """Thresholds at which white noise of the stated size raises at most ``false_alarms_per_hour``.
 
-    Half of the probability goes to chi-square as a whole, half to the hypotheses in equal shares.
+    Half of the probability is assigned to the total chi-square, half to the hypotheses in equal shares.
     Raises ValueError for rates that are not positive.
     """
     if not (false_alarms_per_hour > 0.0 and decisions_per_hour > 0.0):
@@ -69,16 +69,16 @@ def alarm_thresholds(
 
 
 def check_thresholds(alpha: float, hypotheses: int, measurements: int) -> Thresholds:
-    """Thresholds of a single decision of false-alarm probability ``alpha``, which also ask that a hypothesis gains more
-    than the penalty ``size ln N`` of its parameters, ``N`` the number of ``measurements``.
+    """Thresholds of a single decision of false-alarm probability ``alpha``, which also require that a hypothesis gains
+    more than the penalty ``size ln N`` of its parameters, ``N`` the number of ``measurements``.
     """
     penalties = np.arange(MAX_SIZE + 1) * math.log(measurements)
     return Thresholds(np.maximum(_ratios(alpha / hypotheses), penalties), math.log(alpha), 0.0)
 
 
 def _ratios(alpha: float) -> FloatArray:
-    """Chi-square quantiles (MAX_SIZE + 1,) by degrees of freedom; a ratio is distributed so by Wilks's theorem, exactly
-    where the hypothesis is linear.
+    """Chi-square quantiles (MAX_SIZE + 1,) by degrees of freedom: the distribution of a ratio by Wilks's theorem, exact
+    if the hypothesis is linear.
     """
     return np.array([math.inf] + [chi2_quantile(alpha, size) for size in range(1, MAX_SIZE + 1)])
 
@@ -128,16 +128,16 @@ def log_tail(chi2: float, freedom: int) -> float:
 
 @kernel
 def is_unexplained(chi2: float, freedom: int, log_alpha: float, tolerated: float) -> bool:
-    """Whether a chi-square is neither noise at level ``log_alpha`` nor within what a model's errors are ``tolerated``
-    to leave.
+    """Whether a chi-square is neither noise at level ``log_alpha`` nor within the ``tolerated`` part due to errors of
+    the model.
     """
     return log_tail(chi2, freedom) < log_alpha and not chi2 <= tolerated
 
 
 @kernel
 def select_candidates(gains: FloatArray, sizes: IntArray, candidates: BoolArray) -> None:
-    """Mark in ``candidates`` (h,) the `REFINED` testable hypotheses of the largest penalised first-order ``gains``
-    (h,); ``sizes`` (h,) is 0 where a hypothesis cannot be tested.
+    """Mark in ``candidates`` (h,) the `REFINED` testable hypotheses with the largest penalised first-order ``gains``
+    (h,); ``sizes`` (h,) is 0 if a hypothesis cannot be tested.
     """
     candidates[:] = False
     for _ in range(REFINED):
@@ -152,7 +152,7 @@ def select_candidates(gains: FloatArray, sizes: IntArray, candidates: BoolArray)
 
 @kernel
 def noise_level(chi2: FloatArray, sizes: IntArray, candidates: BoolArray, measurements: int) -> float:
-    """Least reduced chi-square that a candidate leaves, at least 1: the variance of the noise over the stated one."""
+    """Least reduced chi-square of the candidates, at least 1: the variance of the noise over the stated one."""
     noise = math.inf
     for h in range(chi2.shape[0]):
         if candidates[h]:
@@ -167,8 +167,8 @@ def penalised_chi2(chi2: float, size: int, noise: float, penalty: float) -> floa
 
 
 class Tested(NamedTuple):
-    """Hypotheses that were tested: ``chi2`` (h,) that each leaves, ``sizes`` (h,): its parameters, ``effects`` (h,)
-    [px], and which are ``candidates`` (h,).
+    """Tested hypotheses: remaining ``chi2`` (h,), ``sizes`` (h,) in parameters, ``effects`` (h,)
+    [px], and mask of the ``candidates`` (h,).
     """
 
     chi2: FloatArray

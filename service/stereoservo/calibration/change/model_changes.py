@@ -2,8 +2,8 @@
 least-squares estimates from the pixels of a check motion.
 
 A camera moved, the cameras moved together, the marker body moved, one marker slipped, the zero of a joint drifted:
-each is a change of few parameters. Its estimate takes the pixels of many poses and the covariance of the model itself
-into account, and several changes may be estimated together; which of them is significant is decided in `model_check`.
+each is a change of few parameters. Its estimate uses the pixels of many poses and the covariance of the model itself,
+and several changes may be estimated together; `model_check` decides which of them is significant.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ STEP = 1e-6
 """Step of the finite differences, relative to the size of the scene."""
 EVALUATIONS = 60
 SETTLED = 1e-3
-"""Last step [sigmas] at which an estimate has converged."""
+"""Size of the last step [sigmas] at which an estimate has converged."""
 
 State = tuple[RigModel, FloatArray]
 """A model under estimation and the drift (n,) of its joints' zeros, in the model's order."""
@@ -49,7 +49,7 @@ State = tuple[RigModel, FloatArray]
 
 @dataclass(frozen=True)
 class ModelChange:
-    """A hypothetical change of ``size`` parameters; ``apply`` returns a state with it at given parameters (size,)."""
+    """A hypothetical change of ``size`` parameters; ``apply`` returns the changed state at given parameters (size,)."""
 
     kind: CauseKind
     subject: str
@@ -59,7 +59,7 @@ class ModelChange:
 
 @dataclass(frozen=True)
 class LinearisedProblem:
-    """Model and pixels of a check: ``rig`` in its Euclidean frame where it has one, its ``data``, and ``uncertainty``
+    """Model and pixels of a check: ``rig`` in its Euclidean frame, if it has one, its ``data``, and ``uncertainty``
     B (2 k, p) of the covariance that the model's own uncertainty adds to the residuals (see `bounded`).
     """
 
@@ -83,7 +83,7 @@ class LinearisedProblem:
 
     @cached_property
     def white(self) -> Callable[[FloatArray], FloatArray]:
-        """Rows by a root of that weight, `whitening`."""
+        """Function that whitens rows by a root of that weight, `whitening`."""
         return whitening(self.uncertainty)
 
     def select(self, keep: npt.NDArray[np.bool_]) -> LinearisedProblem:
@@ -93,7 +93,7 @@ class LinearisedProblem:
 
 
 def bounded(A: FloatArray) -> FloatArray:
-    """Matrix ``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``: an uncertainty ``A`` of any size as one of norm below 1."""
+    """Matrix ``B`` with ``(I + A Aᵀ)⁻¹ = I - B Bᵀ``: maps an uncertainty ``A`` of any size to one of norm below 1."""
     if not A.shape[1]:
         return A
     triangle = np.linalg.cholesky(np.eye(A.shape[1]) + A.T @ A)
@@ -102,7 +102,7 @@ def bounded(A: FloatArray) -> FloatArray:
 
 
 def whitening(B: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Rows (2 k, q) by ``T``, the symmetric root of ``I - B Bᵀ``, of which ``B`` is :func:`bounded`."""
+    """Function that multiplies rows (2 k, q) by the symmetric root of ``I - B Bᵀ``, with ``B`` by :func:`bounded`."""
     values, vectors = np.linalg.eigh(B.T @ B)
     inner = (vectors / (1.0 + np.sqrt(np.maximum(1.0 - values, 0.0)))) @ vectors.T
     return lambda rows: rows - B @ (inner @ (B.T @ rows))
@@ -120,7 +120,7 @@ def unbounded(B: FloatArray) -> FloatArray:
 def known_measurements(model: CellModel, trials: TrialData, order: tuple[int, ...]) -> Measurements:
     """Pixels of those markers and cameras that are part of the model.
 
-    Raises CalibrationError (``bad_data``) where joints or cameras are not the model's.
+    Raises CalibrationError (``bad_data``) if joints or cameras are not the model's.
     """
     of_model = [camera.name for camera in model.cameras]
     if trials.joint_names != model.joint_names or [camera.name for camera in trials.cameras] != of_model:
@@ -148,8 +148,8 @@ def linearised_problem(
 ) -> LinearisedProblem:
     """The problem of a check; ``noise_factor`` >= 1 multiplies every sigma.
 
-    The model's uncertainty is its own covariance; without one it follows from the trials of its calibration,
-    ``made_from``; without those the model is taken as exact.
+    The model's uncertainty is its own covariance; without one it is computed from the trials of its calibration,
+    ``made_from``; without those the model is assumed exact.
     """
     rig, order = acting_rig(model), acting_order(model)
     data = known_measurements(model, check, order)
@@ -179,8 +179,8 @@ def with_corrected_zeros(problem: LinearisedProblem, model: CellModel, drift: Fl
 def _stated_uncertainty(
     model: CellModel, stated: ModelCovariance, data: Measurements, order: tuple[int, ...]
 ) -> FloatArray:
-    """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` by the model's stated covariance, and by the
-    errors of its joints' readings.
+    """Root (2 k, p) of the covariance [sigmas²] of the pixels of ``data`` due to the model's stated covariance, and to
+    the errors of its joints' readings.
     """
     slopes, columns = covariance_jacobian(model, stated, data)
     values, vectors = np.linalg.eigh(stated.covariance[np.ix_(columns, columns)])
@@ -189,8 +189,8 @@ def _stated_uncertainty(
 
 
 def joint_uncertainty(model: CellModel, data: Measurements, order: tuple[int, ...]) -> FloatArray:
-    """Root (2 k, e) of the covariance [sigmas²] of the pixels of ``data`` by the errors of the joints' readings that
-    the model states, at stops that its trials have not seen; e = 0 where it states none.
+    """Root (2 k, e) of the covariance [sigmas²] of the pixels of ``data`` due to the errors of the joints' readings
+    that the model states, at stops outside its trials; e = 0 if it states none.
     """
     accuracy = model.joint_accuracy
     if accuracy is None:
@@ -203,8 +203,8 @@ def joint_uncertainty(model: CellModel, data: Measurements, order: tuple[int, ..
 
 
 def covariance_charts(model: CellModel, stated: ModelCovariance) -> tuple[RigModel, Charts, npt.NDArray[np.int64]]:
-    """The model as a rig in its own frame, joints in `acting_order`, the charts of its covariance there, and which of
-    the covariance's parameters (p,) each parameter of the charts is.
+    """The model as a rig in its own frame, joints in `acting_order`, the charts of its covariance there, and the index
+    (p,) in the covariance of each parameter of the charts.
     """
     order = acting_order(model)
     charts = Charts(tuple(stated.generators[j] for j in order), stated.cameras, stated.lenses, stated.markers)
@@ -217,8 +217,8 @@ def covariance_charts(model: CellModel, stated: ModelCovariance) -> tuple[RigMod
 def covariance_jacobian(
     model: CellModel, stated: ModelCovariance, data: Measurements
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and which of them (p,) each
-    column belongs to.
+    """Derivative (2 k, p) of the residuals by the parameters of the model's covariance, and the parameter index (p,) of
+    each column.
     """
     rig, charts, columns = covariance_charts(model, stated)
     return jacobian(rig, charts, np.zeros(charts.size), data), columns
@@ -236,7 +236,7 @@ def _curvature_uncertainty(model: CellModel, rig: RigModel, past: Measurements, 
 
 
 def possible_changes(model: CellModel, problem: LinearisedProblem) -> list[ModelChange]:
-    """All changes to test: rigid motions in a Euclidean frame, free camera matrices without one."""
+    """All changes to test: rigid motions in a Euclidean frame, else free camera matrices."""
     rig = problem.rig
     metric = model.stratum == "metric"
     found: list[ModelChange] = []
@@ -322,8 +322,8 @@ def _joint(k: int) -> Callable[[State, FloatArray], State]:
 
 @dataclass(frozen=True)
 class ChangeEstimate:
-    """Changes estimated together: ``x`` (q,), its ``information`` (q, q), ``chi2`` that is left, and the change of the
-    pixels that each cause makes alone, ``effects_px`` (rms over all pixels of the check).
+    """Changes estimated together: ``x`` (q,), its ``information`` (q, q), the remaining ``chi2``, and the change of the
+    pixels by each cause alone, ``effects_px`` (rms over all pixels of the check).
     """
 
     changes: tuple[ModelChange, ...]
@@ -335,7 +335,7 @@ class ChangeEstimate:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (q, q); of directions that the pixels leave open none."""
+        """Covariance (q, q); zero for directions that the pixels leave undetermined."""
         return np.asarray(np.linalg.pinv(self.information))
 
 
@@ -374,7 +374,7 @@ def first_order_gain(problem: LinearisedProblem, cause: ModelChange, here: Float
 def estimate_changes(
     problem: LinearisedProblem, found: tuple[ModelChange, ...], start: FloatArray | None = None
 ) -> ChangeEstimate:
-    """Least-squares estimate of changes from ``start`` (q,) on, default nothing changed, with the model's
+    """Least-squares estimate of changes from ``start`` (q,), default no change, with the model's
     own uncertainty in the weights.
     """
 

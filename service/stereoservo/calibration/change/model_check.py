@@ -2,13 +2,13 @@
 has changed and by how much, as a report.
 
 Under a valid model the residuals are Gaussian with the stated noise and the model's own uncertainty. A chi-square test
-rejects the model; likelihood ratios, by the decision that the on-line monitor uses too (`hypothesis_test`), name what
-has changed: camera, cameras together, marker body, marker or joint zero.
+rejects the model; likelihood ratios, with the decision rule of the on-line monitor (`hypothesis_test`), identify the
+change: camera, cameras together, marker body, marker or joint zero.
 
 Reset of joint zeros: a new model in which the zeros of drifted joints are moved by the drifts that a check
 estimated.
 
-Nothing else of the model changes. Its covariance is extended by that of the drifts and their correlation with the
+The rest of the model is unchanged. Its covariance is extended by that of the drifts and their correlation with the
 errors of the model.
 
 Trends of a model over successive checks: weighted straight lines through the estimates of each change, the most
@@ -64,20 +64,20 @@ ALPHA = 0.003
 """Probability that a check of an unchanged cell reports any change, over all hypotheses."""
 MAX_CHANGES = 3
 NOISE_MARGIN = 1.2
-"""Residuals, in expected sigmas rms, above which a model is rejected that no change explains."""
+"""Rms residual, over the expected one, above which a model is rejected even if no change explains it."""
 GROSS = 6.0, 12.0
-"""A pixel is left out that differs from its marker's median over the stops by more than so many sigmas, and so many
-times what that marker's other pixels do in that camera."""
+"""A pixel is rejected if it differs from its marker's median over the stops by more than this many sigmas, plus this
+many times the median difference of that marker in that camera."""
 ALONE = 0.3
-"""Share of an image's pixels up to which they are wrong by themselves; where more are, something is wrong there."""
+"""Share of an image's pixels up to which they count as isolated outliers; more have a common cause."""
 MIN_MEASUREMENTS = 40
 SEARCHED = 3
-"""Stops over which far joint zeros are searched for."""
+"""Number of stops over which large zero drifts are searched for."""
 
 
 @dataclass(frozen=True)
 class ModelExamination:
-    """A ``model`` examined with the pixels of a ``check``: the ``hypotheses`` that were tested, the ``explanation``
+    """A ``model`` examined with the pixels of a ``check``: the tested ``hypotheses``, the ``explanation``
     that was found, and the number of isolated outliers ``left_out``.
     """
 
@@ -135,12 +135,12 @@ def examine_model(model: CellModel, check: TrialData, *, made_from: TrialData | 
 
 
 def _explains(problem: LinearisedProblem, found: ChangeEstimate) -> bool:
-    """Whether the residuals that an explanation leaves are noise."""
+    """Whether the residuals after an explanation are noise."""
     return not is_unexplained(found.chi2, 2 * len(problem.data.camera) - found.x.size, math.log(ALPHA), 0.0)
 
 
 def _schwarz(problem: LinearisedProblem, found: ChangeEstimate, other: ChangeEstimate) -> float:
-    """Schwarz's criterion (penalised chi-square) of an explanation, in the noise that the better one of two leaves."""
+    """Schwarz's criterion (penalised chi-square) of an explanation, at the noise that the better one of two leaves."""
     count = 2 * len(problem.data.camera)
     both = np.array([found.chi2, other.chi2])
     sizes = np.array([found.x.size, other.x.size], dtype=np.int64)
@@ -152,9 +152,9 @@ def estimate_joint_zeros(
     model: CellModel, problem: LinearisedProblem, hypotheses: list[ModelChange]
 ) -> ChangeEstimate | None:
     """Drifts of all joints' zeros estimated jointly, without the insignificant ones; for an arm that was switched
-    on again, or got new encoders, where several zeros may be far off.
+    on again, or got new encoders, so that several zeros may be far off.
 
-    None where the images do not determine the joints, leave several postures possible, or no drift is significant.
+    None if the images do not determine the joints, leave several postures possible, or no drift is significant.
     """
     by_name = {cause.subject: cause for cause in hypotheses if cause.kind == "joint"}
     named = tuple(by_name[name] for name in model.joint_names)
@@ -169,7 +169,7 @@ def estimate_joint_zeros(
             apart = _without_turns(model, one.x - best.x)
             other = float(apart @ best.information @ apart) > AMBIGUOUS
             if other and one.chi2 - best.chi2 < AMBIGUOUS * noise:
-                return None  # two postures that the pictures do not tell apart
+                return None  # two postures that the images do not distinguish
         found = best
     if (np.abs(found.x - _without_turns(model, found.x)) > np.pi).any():
         found = estimate_changes(problem, named, start=_without_turns(model, found.x))
@@ -179,7 +179,7 @@ def estimate_joint_zeros(
 
 def _best_subset(found: ChangeEstimate, price: float) -> list[int]:
     """Indices of the parameters that explain best when each one costs ``price``, to first order around an estimate; all
-    subsets are compared, since joints with similar axes replace each other one at a time.
+    subsets are compared, since joints with similar axes can replace each other one at a time.
     """
     information, q = found.information, found.x.size
     best: tuple[float, list[int]] = (np.inf, [])
@@ -193,14 +193,14 @@ def _best_subset(found: ChangeEstimate, price: float) -> list[int]:
 
 
 def _without_turns(model: CellModel, drifts: FloatArray) -> FloatArray:
-    """Drifts (n,) less whole turns of revolute joints, which no picture shows."""
+    """Drifts (n,) without whole turns of revolute joints, which are not observable."""
     revolute = np.array([kind == "revolute" for kind in model.joint_kinds])
     return np.where(revolute, np.mod(drifts + np.pi, 2.0 * np.pi) - np.pi, drifts)
 
 
 def _search_zeros(model: CellModel, problem: LinearisedProblem) -> tuple[FloatArray, ...]:
-    """Drifts (n,) of all joints' zeros by a global search (4.45) over a few stops: all that these leave possible; none
-    where they do not determine them.
+    """Drifts (n,) of all joints' zeros by a global search (4.45) over a few stops: all solutions consistent with these;
+    none if the stops do not determine them.
     """
     data = problem.data
     stops = np.unique(data.stop)[:SEARCHED]
@@ -224,10 +224,10 @@ def _thresholds(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> Th
 
 
 def explain_residuals(problem: LinearisedProblem, hypotheses: list[ModelChange]) -> ChangeEstimate:
-    """Changes that explain the pixels, the most significant first; empty where none is significant.
+    """Changes that explain the pixels, the most significant first; empty if none is significant.
 
-    One after the other, each beside those found before, by the decision of `hypothesis_test`: Schwarz's penalty keeps a
-    drifted joint from being taken for a moved camera, which could do the same and more.
+    Changes are added one by one to those found before, by the decision of `hypothesis_test`: Schwarz's penalty prevents
+    that a drifted joint is classified as a moved camera, which has more parameters and explains as much.
     """
     found = estimate_changes(problem, ())
     thresholds = _thresholds(problem, hypotheses)
@@ -244,7 +244,7 @@ def explain_residuals(problem: LinearisedProblem, hypotheses: list[ModelChange])
 def _add_best_cause(
     problem: LinearisedProblem, found: ChangeEstimate, others: list[ModelChange], thresholds: Thresholds
 ) -> ChangeEstimate | None:
-    """The estimate extended by the one of ``others`` that explains best; None where none is significant."""
+    """The estimate extended by the one of ``others`` that explains best; None if none is significant."""
     count = 2 * len(problem.data.camera)
     penalty = math.log(count)
     sizes = np.array([cause.size for cause in others], dtype=np.int64)
@@ -260,10 +260,10 @@ def _add_best_cause(
 
 
 def isolated_outliers(problem: LinearisedProblem) -> npt.NDArray[np.bool_]:
-    """Mask (k,) of isolated outliers: pixels far from where the same marker is seen at the other stops.
+    """Mask (k,) of isolated outliers: pixels far from the same marker's pixels at the other stops.
 
-    Whatever moved in the cell shows in a marker's pixels at all stops alike, or changes from stop to stop. What shows
-    in many markers of one image, as joints in a wrong order do, is no wrong pixel.
+    A change in the cell affects a marker's pixels at all stops equally, or varies with the stop. An effect on
+    many markers of one image, such as that of joints in a wrong order, is no isolated outlier.
     """
     here = problem.residuals_at(start_state(problem)).reshape(-1, 2)
     gross = np.zeros(len(here), dtype=bool)
@@ -287,14 +287,14 @@ def make_check_report(
     examined: ModelExamination, *, limit_px: float = 0.25, created: str = "", body_moves: bool = False
 ) -> CheckReport:
     """Report of an examination; ``limit_px``: tolerable change of the pixels [px]. ``body_moves``: the marker body is a
-    target that moves by itself (``[scene] moves``), and may stand elsewhere than when the model was learnt.
+    target that moves by itself (``[scene] moves``), and may have moved since the model was calibrated.
     """
     model, check, problem, found = examined.model, examined.check, examined.problem, examined.explanation
     here = problem.residuals_at(start_state(problem))
     chi2 = float(here @ problem.whitened(here))
     count = here.size
     squares = (here.reshape(-1, 2) ** 2).sum(axis=1) / 2.0
-    # The model's own uncertainty widens what is expected of a pixel.
+    # The model's own uncertainty increases the expected residuals.
     expected = 1.0 + _model_variance(problem)
     elsewhere = body_moves and any(change.kind == "body" for change in found.changes)
     named = [
@@ -409,7 +409,7 @@ SENTENCES: dict[str, Callable[[CellModel, str, float | None, float | None], str]
     "marker": lambda model, subject, value, deviation: f"marker {subject} slipped",
     "joint": _joint_sentence,
 }
-"""What each kind of change is in words, of a model, the subject, and value and deviation where there are any."""
+"""Functions that describe each kind of change, from model, subject, and value and deviation, if any."""
 
 
 def _unexplained(
@@ -443,7 +443,7 @@ def _unexplained(
 
 
 def _describe_stop(model: CellModel, problem: LinearisedProblem, stop: int) -> str:
-    """Description of a stop: the joints that are away from the base there."""
+    """Description of a stop: the joints that are away from the base at it."""
     offsets = problem.data.offsets - np.median(problem.data.offsets, axis=0)
     away = np.abs(offsets[stop]) > 0.2 * np.abs(offsets).max(axis=0)
     names = sorted(model.joint_names[problem.order[k]] for k in np.flatnonzero(away))
@@ -473,20 +473,20 @@ def _message(
 
 
 DISTINGUISHABLE = 25.0
-"""Chi-square by which another joint must explain the check worse than the one that is reset."""
+"""Least increase of chi-square when a different joint is assumed to have drifted than the one that is reset."""
 
 
 def reset_zeros(
     examined: ModelExamination, report: CheckReport, *, epoch: int, created: str = ""
 ) -> tuple[CellModel, ZeroReset]:
-    """New model of epoch ``epoch`` with the zeros of drifted joints moved, and what was moved.
+    """New model of epoch ``epoch`` with the zeros of drifted joints moved, and a record of the reset.
 
-    Raises CalibrationError: ``check_holds`` where nothing drifted, ``other_cause`` where anything but joint zeros
+    Raises CalibrationError: ``check_holds`` if nothing drifted, ``other_cause`` if anything but joint zeros
     changed, ``not_observable`` with the ``joints`` that the check does not distinguish or not determine well enough.
     """
     _must_be_zeros(report)
     model, found = examined.model, examined.explanation
-    # Again at the true joint positions: far zeros change what the model's own uncertainty does to the pixels.
+    # Again at the true joint positions: large drifts change the pixels' uncertainty due to the model.
     problem = with_corrected_zeros(examined.problem, model, changed_state(examined.problem, found.changes, found.x)[1])
     rest = estimate_changes(problem, found.changes)
     drift = found.x + rest.x
@@ -579,10 +579,10 @@ def _with_zeros(
     found: ChangeEstimate,
     own: FloatArray,
 ) -> ModelCovariance:
-    """The model's covariance with that of its moved zeros, ``own`` (z, z), and between both.
+    """The model's covariance extended by that of its moved zeros, ``own`` (z, z), and by the correlation of both.
 
-    A zero that is off by ``e`` moves what its joint carries by ``exp(e Ĥ)``: the generators of the joints behind it
-    in the chain and the markers, all with the same ``e``. The rest of what the check estimates is not used.
+    A zero error ``e`` moves the parts that its joint carries by ``exp(e Ĥ)``: the generators of the joints behind it
+    in the chain and the markers, all with the same ``e``. Other estimates of the check are not used.
     """
     at = [model.joint_names.index(cause.subject) for cause in found.changes]
     order = list(problem.order)
@@ -625,15 +625,15 @@ def _with_zeros(
 
 MIN_CHECKS = 3
 TREND_ALPHA = 0.003
-"""Probability that constant estimates are reported to grow, over all changes."""
+"""Probability that constant estimates are reported as growing, over all changes."""
 DAY_S = 86_400.0
 FAR_DAYS = 3650.0
 """Horizon beyond which no crossing is reported."""
 
 
 class DriftTrend(msgspec.Struct, frozen=True):
-    """A change that grows from check to check. ``ratio``: chi-square of its slope with ``freedoms``; ``px_a_day`` as
-    it shows in the images; ``days``: until it reaches the limit, 0 where it has, None where it is too far away or
+    """A change that grows from check to check. ``ratio``: chi-square of its slope with ``freedoms``; ``px_a_day``: its
+    growth in the images; ``days``: until it reaches the limit, 0 if it already has, None if that is too far away or it
     shrinks.
     """
 
@@ -648,9 +648,9 @@ class DriftTrend(msgspec.Struct, frozen=True):
 
 
 def find_trend(history: Sequence[CheckReport]) -> DriftTrend | None:
-    """The most significant trend over the checks of the newest one's model, oldest first.
+    """The most significant trend over the checks of the newest check's model, oldest first.
 
-    Reports without a time, or of other models, do not count. None where nothing grows.
+    Reports without a time, or of other models, are ignored. None if nothing grows.
     """
     if not history:
         return None
@@ -690,7 +690,7 @@ def _matrix(drift: Drift) -> FloatArray:
 
 
 def _fit_line(line: list[Drift], days: FloatArray, limit_px: float) -> DriftTrend | None:
-    """Weighted line ``x = a + b t`` through the estimates, and when it crosses the limit."""
+    """Weighted line ``x = a + b t`` through the estimates, and the time when it crosses the limit."""
     q = len(line[0].x)
     normal = np.zeros((2 * q, 2 * q))
     right = np.zeros(2 * q)
@@ -708,7 +708,7 @@ def _fit_line(line: list[Drift], days: FloatArray, limit_px: float) -> DriftTren
     size = float(np.sqrt(max(np.array(last.x) @ information @ np.array(last.x), 0.0)))
     if size == 0.0:
         return None
-    # The information is, but for the model's own uncertainty, the pixels' quadratic form.
+    # Except for the model's own uncertainty, the information is the pixels' quadratic form.
     scale = last.effect_px / size
     now = a + b * days[-1]
     aa, ab, bb = (float(u @ information @ v) * scale**2 for u, v in ((now, now), (now, b), (b, b)))

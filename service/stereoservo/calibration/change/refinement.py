@@ -1,10 +1,10 @@
 """On-line refinement of a calibrated model (recursive calibration, thesis 9.3): its kinematics, cameras, lenses and
-markers estimated again, by what was seen at the rest poses of goals, with the calibrated model and its covariance as
-the prior.
+markers are estimated again from observations at the rest poses of goals, with the calibrated model and its covariance
+as the prior.
 
-The estimate is the bundle's, linearised in the directions of the model's covariance. It is a step within that
-covariance or none: a chi-square test of the pixels with named causes (`model_check`) and one of the step itself stand
-before it, and it must predict poses that it was not made from significantly better than the model in use.
+The estimate is the bundle's, linearised in the directions of the model's covariance. A step is accepted only within
+that covariance: a chi-square test of the pixels with named causes (`model_check`) and one of the step itself must pass
+first, and the refined model must predict poses that were not used significantly better than the model in use.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
 CHANCE = 0.001
-"""Probability with which each test fails where nothing is wrong, or passes where nothing is better."""
+"""Probability with which each test fails although nothing is wrong, or passes although nothing is better."""
 LEAST_POSES = 16
 FOLDS = 4
-"""One in so many poses is held out of an estimate and judges it, in turn (cross-validation)."""
+"""Number of cross-validation folds: each is held out of an estimate, which is then evaluated on it."""
 LEAST_KNOWLEDGE = 0.01
-"""Information of the poses about a direction, relative to the prior's, below which its step is not tested."""
+"""Information of the poses on a direction, relative to the prior's, below which its step is not tested."""
 EVALUATIONS = 40
 SETTLED = 1e-3
 """Last step [sigmas of the prior] at which the estimate has converged."""
 
 
 class RefinementReport(msgspec.Struct, frozen=True):
-    """What a refinement of model ``base_epoch`` by so many ``poses`` found.
+    """Result of a refinement of model ``base_epoch`` by ``poses`` (their number).
 
-    ``before_px``, ``after_px``: rms distance of the pixels from the prediction of the model in use, and of one refined
-    by the other poses, a coordinate. ``score``: by how many deviations of chance that is better, above ``limit``.
+    ``before_px``, ``after_px``: rms distance, per coordinate, of the pixels from the prediction of the model in use,
+    and of one refined by the other poses. ``score``: improvement in standard deviations; ``limit``: required score.
     ``step_chi2``: chi-square of the step from the calibrated model, below ``step_limit``. ``predicted_before_px``,
-    ``predicted_after_px``: rms deviation of predicted pixels at the poses by the model's covariance, a coordinate.
+    ``predicted_after_px``: rms deviation, per coordinate, of predicted pixels at the poses by the model's covariance.
     """
 
     base_epoch: int
@@ -91,11 +91,11 @@ class RefinementReport(msgspec.Struct, frozen=True):
 def refine_model(
     base: CellModel, samples: TrialData, *, used: CellModel | None = None, created: str = ""
 ) -> tuple[CellModel, RefinementReport]:
-    """The model ``base`` refined by rest poses (trial data, all of any posture), epoch 0, and the report. ``used``: the
-    model in use, itself perhaps a refinement of ``base``, which the new one must be better than; default ``base``.
+    """The model ``base`` refined by rest poses (trial data, of any postures), epoch 0, and the report. ``used``: the
+    model in use, possibly a refinement of ``base``, which the new one must improve; default ``base``.
 
     Raises CalibrationError: ``too_few_stops``, ``no_covariance``; ``model_does_not_fit`` with the causes of the check
-    where the poses contradict the calibrated model; ``step_too_large``; ``not_better``.
+    if the poses contradict the calibrated model; ``step_too_large``; ``not_better``.
     """
     if base.covariance is None:
         raise CalibrationError(
@@ -152,7 +152,7 @@ def refine_model(
 @dataclass(frozen=True)
 class RefinementStep:
     """A step ``x`` (p,) of the parameters of a model's covariance, and the ``covariance`` (p, p) after it; ``chi2`` of
-    the step under a prior that holds, and its ``limit``.
+    the step under a valid prior, and its ``limit``.
     """
 
     x: FloatArray
@@ -164,7 +164,7 @@ class RefinementStep:
 def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     """Maximum a posteriori estimate by ``data``, its joints in the model's acting order, with the prior of ``base``.
 
-    In coordinates z of unit covariance, ``x = L z``: least ``zᵀz + rᵀ W r``, with the errors of the joints
+    In coordinates z of unit covariance, ``x = L z``: minimises ``zᵀz + rᵀ W r``, with the errors of the joints
     in the weights W. Raises NoCovarianceError.
     """
     stated = base.covariance
@@ -189,7 +189,7 @@ def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     covariance = (axes @ vectors / (1.0 + values)) @ (axes @ vectors).T
     told = values > LEAST_KNOWLEDGE
     steps = (vectors.T @ z)[told]
-    # Of a prior that holds, the estimate has the covariance M (I + M)⁻¹.
+    # Under a valid prior the estimate has the covariance M (I + M)⁻¹.
     chi2 = float((steps**2 * (1.0 + values[told]) / values[told]).sum())
     limit = float(chi2_distribution.isf(CHANCE, max(1, int(told.sum()))))
     return RefinementStep(axes @ z, 0.5 * (covariance + covariance.T), chi2, limit)
@@ -203,12 +203,12 @@ def _squares(error: FloatArray, B: FloatArray) -> float:
 def _cross_validated(
     base: CellModel, used: CellModel, data: Measurements, samples: TrialData
 ) -> tuple[float, float, float]:
-    """By how many deviations of chance models refined without some poses predict these better than ``used``, and the
-    rms [px] of either.
+    """Score [standard deviations] by which models refined without some poses predict these better than ``used``, and
+    the rms [px] of both.
 
-    Were ``used`` exact, ``-rᵀ W δ`` of its residuals r and the change δ of the prediction, which does not depend on the
-    same r, would have mean zero and variance ``δᵀ W δ``; over all folds at most twice the sum, since r of one is in δ
-    of the others. Noise that the new residuals show beyond the stated makes the score smaller.
+    If ``used`` were exact, ``-rᵀ W δ`` of its residuals r and the change δ of the prediction, which is independent of
+    the same r, would have mean zero and variance ``δᵀ W δ``; over all folds at most twice the sum, since r of one fold
+    enters δ of the others. Residual noise above the stated one reduces the score.
     """
     gain = size = before = after = 0.0
     errors: list[tuple[FloatArray, FloatArray]] = []
@@ -240,7 +240,7 @@ def _seen(model: CellModel, held: Measurements, samples: TrialData) -> FloatArra
 
 
 def _refined(base: CellModel, step: RefinementStep, created: str) -> CellModel:
-    """The model after a step, with its covariance in the same directions, static points seen by the new cameras."""
+    """The model after a step, with its covariance in the same directions and static points moved with the cameras."""
     stated = base.covariance
     assert stated is not None
     model = msgspec.structs.replace(
@@ -255,7 +255,7 @@ def _refined(base: CellModel, step: RefinementStep, created: str) -> CellModel:
 
 
 def _with_scene(base: CellModel, model: CellModel) -> CellModel:
-    """The refined model with the static points where its cameras see what the base's saw; their covariance stays."""
+    """The refined model with static points moved to keep their images; their covariance is unchanged."""
     pixels = []
     for camera in base.cameras:
         images = base.scene_points @ camera.matrix.T

@@ -1,8 +1,8 @@
 """Diagnosis of a failed calibration, naming its cause (exchanged views or ids, wrong joint kind, order or scale, …)
 where it can be identified; and notes on a fit that succeeded.
 
-Each cause is a correction of the trials: with the views of some stops exchanged back, two ids exchanged, an angle
-divided by a factor, the fit must succeed, or the cause is not reported.
+Each cause corresponds to a correction of the trials: with the views of some stops exchanged back, two ids exchanged, an
+angle divided by a factor, the fit must succeed, or the cause is not reported.
 """
 
 from __future__ import annotations
@@ -56,22 +56,22 @@ PLAIN = frozenset(
         "joint_did_not_move",
     }
 )
-"""Codes that name their cause themselves."""
+"""Codes that already name the cause."""
 STEPS_IMITATE = frozenset({"joint_without_effect", "lens_implausible"})
-"""Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that bends after it."""
+"""Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that adapts to it."""
 MISFITS = frozenset({"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"})
-"""Codes of data that contradict themselves: the misfit may show why."""
+"""Codes of contradictory data: the misfit may show the cause."""
 LASTING = frozenset({"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"})
-"""Codes of what has changed for good during the trials."""
+"""Codes of lasting changes during the trials."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
-"""Shares of outliers with which a fit serves to explain them."""
+"""Limits of outliers of the lenient fit that is used to explain them."""
 
 APART = 0.1
-"""Of a joint's way over the trials, how far from its middle it stands apart."""
+"""Distance of a joint from its median, relative to its range over the trials, from which it counts as displaced."""
 LEAST_TOGETHER = 4
-"""Stops with several joints apart that test what these do together."""
+"""Number of stops with several displaced joints that is sufficient to test their combined effect."""
 MOVED = 0.02
-"""Distance of the trials' bases [rad or m] from which they are different configurations."""
+"""Distance of the trials' bases [rad or m] from which they count as different configurations."""
 
 
 def diagnose_failure(
@@ -83,8 +83,8 @@ def diagnose_failure(
 ) -> CalibrationError:
     """Error that names the cause of ``error``; else ``error`` itself with a list of possible causes.
 
-    ``refit`` fits trial data again. Tries hypotheses until one makes the data fit; costs some fits. ``result``: the fit
-    that is refused for its lens.
+    ``refit`` fits trial data again. Hypotheses are tried until one makes the data fit, which takes several fits.
+    ``result``: the fit that was refused for its lens.
     """
     if error.code in STEPS_IMITATE:
         return _step_error(trials, result) or error
@@ -95,9 +95,9 @@ def diagnose_failure(
     try:
         named = _first_cause(trials, refit, options)
     except (GeometryError, np.linalg.LinAlgError):
-        named = None  # data on which the search for a cause breaks down, too: the first error is returned
+        named = None  # the search for a cause fails, too: the first error is returned
     if named is not None and named.code == "noise_understated":
-        # What was measured stays worth reading: the residual of each joint.
+        # The measured residual of each joint remains informative.
         return CalibrationError(named.code, named.message, **{**error.data, **named.data})
     if named is not None:
         return named
@@ -109,7 +109,7 @@ def diagnose_failure(
 def _first_cause(
     trials: TrialData, refit: Refit, options: FitOptions, result: CalibrationFit | None = None
 ) -> CalibrationError | None:
-    """Error of the first cause that holds, cheap tests first. ``result``: the fit, where there is one."""
+    """Error of the first cause that holds, cheap tests first. ``result``: the fit, if there is one."""
     for hypothesis in exchange_hypotheses(trials):
         if fit_of_correction(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
@@ -128,7 +128,7 @@ def _first_cause(
     try:
         views = pinhole_reconstruction(trials)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError):
-        return None  # without cameras no joint can be looked at
+        return None  # without cameras no joint can be tested
     for hypothesis in kind_hypotheses(trials, views):
         if fit_of_correction(hypothesis.trials, refit, options) is not None:
             return CalibrationError(hypothesis.code, hypothesis.message, **hypothesis.data)
@@ -142,7 +142,7 @@ def _first_cause(
 
 
 def _step_error(trials: TrialData, result: CalibrationFit | None = None) -> CalibrationError | None:
-    """Error of a step in the markers' tracks, or in what a fit leaves of them; None where there is none."""
+    """Error for a step in the markers' tracks, or in the residuals of a fit; None if there is none."""
     left = trials if result is None else residual_trials(trials, result)
     step = find_step(left)
     if step is None:
@@ -157,7 +157,7 @@ def _step_error(trials: TrialData, result: CalibrationFit | None = None) -> Cali
 
 
 def _outlier_error(trials: TrialData, error: CalibrationError, refit: Refit, options: FitOptions) -> CalibrationError:
-    """Error with what the outliers of a lenient fit have in common, or with a list of possible causes."""
+    """Error naming the common property of a lenient fit's outliers, or with a list of possible causes."""
     lenient = replace(options, max_outliers=LENIENT_OUTLIERS, max_trial_outliers=LENIENT_TRIAL_OUTLIERS)
     try:
         result = refit(trials, lenient)
@@ -191,8 +191,8 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
 
 
 def _contradiction_error(trials: TrialData, error: CalibrationError) -> CalibrationError:
-    """Error of a joint whose stops are lost because the cameras contradict each other, not because they see
-    nothing.
+    """Error for a joint whose stops are lost because the cameras contradict each other, not for lack of
+    observations.
     """
     own = trials.trials == trials.joint_names.index(error.data["joint"])
     seen = int(((trials.visible[:, own].sum(axis=0) >= 2).sum(axis=1) >= MIN_SHOWN).sum())
@@ -210,8 +210,8 @@ def _contradiction_error(trials: TrialData, error: CalibrationError) -> Calibrat
 def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, options: FitOptions) -> tuple[str, ...]:
     """Notes on a fit that succeeded: causes of its outliers, prismatic joints whose scales disagree.
 
-    Raises CalibrationError where the model is of a cell that is no more (a camera or marker moved), where two ids are
-    exchanged throughout, or where revolute joints report wrong scales.
+    Raises CalibrationError if the model describes an outdated cell (a camera or marker moved), if two ids are
+    exchanged throughout, or if revolute joints report wrong scales.
     """
     statistics = result.model.statistics
     assert statistics is not None
@@ -229,7 +229,7 @@ def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, option
         if named is not None:
             raise named
     nearly = not statistics.chi2_ok or any("follow" in note for note in result.report.notes)
-    # Distortion that was to be left out bends the tracks of revolute joints as a wrong scale would.
+    # Distortion that was excluded bends the tracks of revolute joints like a wrong scale.
     bent = result.report.lens.model == "none" and result.report.lens.chi2 > result.report.lens.limit
     if nearly and not bent:
         wrong = scale_error(trials, trials, result, np.ones(len(trials.joint_names)))
@@ -252,8 +252,8 @@ def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, option
 
 
 def untested(trials: TrialData) -> tuple[str, ...]:
-    """Notes on what the trials do not determine: what joints do together, and their order, where these only ever move
-    alone, from one configuration.
+    """Notes on properties that the trials do not determine: combined effects of the joints, and their order, if they
+    only move one at a time, from one configuration.
     """
     n = len(trials.joint_names)
     apart = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(trials.positions, axis=0)

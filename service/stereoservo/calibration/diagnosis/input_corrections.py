@@ -1,5 +1,5 @@
-"""Hypothetical corrections of calibration data that may make the model fit: views, marker ids, joint kinds or the
-order of joints exchanged back; and the fit of each.
+"""Hypothetical corrections of calibration data that may make the model fit: exchange of views, marker ids, joint kinds
+or the joints' order; and the fit of each.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from stereoservo.kinematics.parameterization import Kind, lens_model_of
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 AGREES = 0.9
-"""Share of matches that must fit one epipolar geometry once an exchange is undone."""
+"""Share of matches that must fit one epipolar geometry after an exchange is undone."""
 BETTER = 20.0
-"""Chi-square by which a stop must fit better with its views exchanged."""
+"""Least gain in chi-square of a stop from exchanging its views."""
 CAP = 50.0
-"""Largest chi-square that a match may add: a wrong one must not decide for its stop."""
+"""Largest chi-square of a match: a single wrong one must not decide for its stop."""
 UNRELATED = 0.75
-"""Share of a single trial's matches below which two cameras do not see the same points."""
+"""Share of a single trial's matches below which two cameras count as seeing different points."""
 FEW_MARKERS = 7
-"""Up to this many markers every pair of ids is tried; above, those that do not fit."""
+"""Largest number of markers for which every pair of ids is tried; above, only those that do not fit."""
 ROUNDS = 6
-"""Rounds of undoing exchanges and estimating again."""
+"""Most rounds of undoing exchanges and estimating again."""
 
 
 def exchanged_views(trials: TrialData, k: int) -> IntArray:
     """Stops at which the images of cameras 0 and ``k`` are exchanged: at most half of them, since exchanging all
-    only renames the cameras.
+    is equivalent to renaming the cameras.
     """
     exchanged = np.zeros(len(trials.positions), dtype=bool)
     for _ in range(ROUNDS):
@@ -69,7 +69,7 @@ def with_views_exchanged(trials: TrialData, k: int, stops: IntArray | BoolArray)
 
 
 def exchanged_ids(trials: TrialData, k: int) -> tuple[int, int] | None:
-    """Two markers (indices) whose ids are exchanged between cameras 0 and ``k`` at all stops; None where none fit."""
+    """Two markers (indices) whose ids are exchanged between cameras 0 and ``k`` at all stops; None if none fit."""
     m = len(trials.marker_ids)
     F = robust_fundamental(trials, k)
     shares = np.zeros(m) if F is None else _marker_shares(trials, F, k)
@@ -117,12 +117,12 @@ def views_unrelated(trials: TrialData, k: int) -> bool:
             _, inliers = fundamental_robust(left, right, 2.0 * sigma)
             verdicts.append(float(inliers.mean()) < UNRELATED)
         except GeometryError as error:
-            verdicts.append(error.code != "degenerate")  # points of one plane are related
+            verdicts.append(error.code != "degenerate")  # coplanar points count as related
     return bool(verdicts) and float(np.mean(verdicts)) > 0.5
 
 
 def robust_fundamental(trials: TrialData, k: int) -> FloatArray | None:
-    """Robust F (3, 3) of cameras 0 and ``k``, which most of their matches fit; None where there is none."""
+    """Robust F (3, 3) of cameras 0 and ``k`` that fits most of their matches; None if there is none."""
     left, right, sigma = _matches(trials, k)
     best, most = None, 0.0
     if len(left) < MIN_MATCHES:
@@ -131,7 +131,7 @@ def robust_fundamental(trials: TrialData, k: int) -> FloatArray | None:
         try:
             F, inliers = fundamental_robust(left, right, scale * sigma)
         except GeometryError:
-            continue  # no geometry at this noise: the wider one may show it
+            continue  # no geometry at this noise; the larger one may give one
         if float(inliers.mean()) / np.sqrt(scale) > most:
             best, most = F, float(inliers.mean()) / np.sqrt(scale)
     return best
@@ -146,7 +146,7 @@ def _matches(trials: TrialData, k: int) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _distances(trials: TrialData, F: FloatArray, k: int, crossed: bool) -> FloatArray:
-    """Epipolar distances (s, m) [sigmas], the two views taken as they are or crossed; NaN where one is missing."""
+    """Epipolar distances (s, m) [sigmas], with the two views as they are or exchanged; NaN if one is missing."""
     first, second = (trials.pixels[k], trials.pixels[0]) if crossed else (trials.pixels[0], trials.pixels[k])
     s, m = first.shape[:2]
     distances = np.abs(sampson_distances(F, first.reshape(-1, 2), second.reshape(-1, 2))).reshape(s, m)
@@ -155,13 +155,13 @@ def _distances(trials: TrialData, F: FloatArray, k: int, crossed: bool) -> Float
 
 
 def _stop_costs(trials: TrialData, F: FloatArray, k: int, crossed: bool) -> FloatArray:
-    """Chi-square (s,) of each stop's matches, each capped; 0 where a stop has none."""
+    """Chi-square (s,) of each stop's matches, each capped; 0 if a stop has none."""
     squares = np.minimum(_distances(trials, F, k, crossed) ** 2, CAP)
     return np.asarray(np.nansum(squares, axis=1))
 
 
 def _marker_shares(trials: TrialData, F: FloatArray, k: int) -> FloatArray:
-    """Inlier ratio (m,) of each marker's matches with F; NaN where a marker has none."""
+    """Inlier ratio (m,) of each marker's matches with F; NaN if a marker has none."""
     distances = _distances(trials, F, k, False)
     count = np.isfinite(distances).sum(axis=0)
     inside = (distances <= 2.0 * INLIER_SIGMAS).sum(axis=0)
@@ -169,7 +169,7 @@ def _marker_shares(trials: TrialData, F: FloatArray, k: int) -> FloatArray:
 
 
 PLANAR_MODULI = 0.1
-"""Spread of the moduli of a plane's eigenvalues from stop to stop above which it has left itself."""
+"""Spread of the moduli of a plane's eigenvalues between stops above which the plane has moved out of itself."""
 
 
 def plane_or_baseline(trials: TrialData, error: CalibrationError) -> CalibrationError:
@@ -198,8 +198,8 @@ def plane_or_baseline(trials: TrialData, error: CalibrationError) -> Calibration
 def _excludes_plane(trials: TrialData) -> bool:
     """Whether the first camera's tracks exclude coplanar markers that only move within their own plane.
 
-    A motion of a plane in itself has, in the image too, eigenvalues of one modulus; markers off one plane have no
-    homography from stop to stop at all.
+    A motion of a plane within itself has eigenvalues of equal modulus, also in the image; non-coplanar markers have no
+    homography between stops at all.
     """
     pixels, sigmas = trials.pixels[0], trials.sigmas[0]
     signs = []
@@ -225,7 +225,7 @@ def _excludes_plane(trials: TrialData) -> bool:
 
 
 KIND_BETTER = 1.25
-"""How many times better a joint's trial must fit the other kind; the fit of all joints decides then."""
+"""Least ratio by which a joint's trial must fit the other kind better; the fit of all joints then decides."""
 
 
 @dataclass(frozen=True)
@@ -257,8 +257,8 @@ def exchange_hypotheses(trials: TrialData) -> Iterator[InputCorrection]:
 
 
 def ids_exchanged(trials: TrialData, k: int, pair: tuple[int, int]) -> InputCorrection:
-    """Correction of two markers (indices) exchanged at all stops in camera ``k`` or in the first one, which two
-    cameras cannot distinguish.
+    """Correction of two markers (indices) exchanged at all stops, in camera ``k`` or in the first one: two
+    cameras do not distinguish these.
     """
     a, b = (trials.marker_ids[i] for i in pair)
     names = [trials.cameras[0].name, trials.cameras[k].name]
@@ -273,7 +273,7 @@ def ids_exchanged(trials: TrialData, k: int, pair: tuple[int, int]) -> InputCorr
 
 
 def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCorrection]:
-    """Corrections of a joint's kind where its own trial fits the other kind much better."""
+    """Corrections of a joint's kind if its own trial fits the other kind much better."""
     cameras, points, usable = views
     residuals_by_kind: dict[int, tuple[float, float, Kind]] = {}
     for joint, observations, displacement in own_trials(trials, points, usable):
@@ -283,7 +283,7 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
             best_single_joint(kind, cameras, observations, displacement, thorough=True)[1] for kind in (stated, other)
         )
         residuals_by_kind[joint] = as_stated, as_other, other
-    # The other kind must reach what the other joints do; a joint that fits neither kind has another fault.
+    # The other kind must fit as well as the other joints do; a joint that fits neither kind has a different fault.
     floor = (
         float(np.median([min(least, instead) for least, instead, _ in residuals_by_kind.values()]))
         if residuals_by_kind
@@ -304,8 +304,8 @@ def kind_hypotheses(trials: TrialData, views: InitialViews) -> Iterator[InputCor
 
 
 def order_hypotheses(trials: TrialData, refit: Refit, options: FitOptions) -> Iterator[InputCorrection]:
-    """Corrections of the joints' order (two exchanged, or all reversed) where free poses contradict the order
-    stated.
+    """Corrections of the joints' order (two exchanged, or all reversed) if free poses contradict the stated
+    order.
     """
     free = trials.trials < 0
     n = len(trials.joint_names)
@@ -364,11 +364,11 @@ InitialViews = tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]
 Refit = Callable[[TrialData, FitOptions], CalibrationFit]
 
 FEW_OUTLIERS = 0.1
-"""Share of pixels that a fit may leave out for its hypothesis to count."""
+"""Largest share of rejected pixels with which a hypothesis is accepted."""
 
 
 def fit_of_correction(trials: TrialData, refit: Refit, options: FitOptions) -> CalibrationFit | None:
-    """The fit of a hypothesis, or None where it does not make the data fit."""
+    """The fit of a hypothesis, or None if it does not make the data fit."""
     try:
         result = refit(trials, options)
     except (CalibrationError, GeometryError, np.linalg.LinAlgError):
@@ -408,7 +408,7 @@ def solution_of(trials: TrialData, result: CalibrationFit) -> Solution:
     evaluations = 1
     if model.joint_accuracy is not None:
         noise = noise_of_accuracy(model.joint_accuracy, readings(trials.positions - model.zero))
-        # The errors of the joints are not kept in the model: they take a step.
+        # The joint errors are not stored in the model: one step estimates them.
         data, evaluations = data.with_joint_noise(noise), 4
     lenses = lens_model_of(rig.lenses)
     return solve(rig, data, model.stratum, lenses=lenses, max_evaluations=evaluations)

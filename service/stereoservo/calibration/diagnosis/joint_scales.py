@@ -1,12 +1,12 @@
 """Estimated scale factors of joint readings (reported over true motion): of a revolute joint from the images, of a
 prismatic one relative to another.
 
-A revolute joint that reports its angle times a factor (counts, degrees, a wrong gear) is no projective rotation by the
-reported positions: the spectrum of its generator is ±i times the factor. The factor is estimated first from the
+A revolute joint that reports its angle times a factor (counts, degrees, a wrong gear ratio) is no projective rotation
+at the reported positions: the spectrum of its generator is ±i times the factor. The factor is estimated first from the
 joint's own trial, then with the whole model. Signs and the scale of all prismatic joints together are gauge.
 
-Whether errors of the joint readings explain a calibration's residuals, against what imitates them: a wrong scale,
-one wrong stop, a step.
+Also whether errors of the joint readings explain a calibration's residuals, as opposed to effects that imitate them: a
+wrong scale, one wrong stop, a step.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from stereoservo.geometry.cameras import NOMINAL_FOCAL
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 COARSE = tuple(float(2.0 ** (k / 4)) for k in range(-5, 6))
-"""Factors about the rigid estimate that a search begins with: nominal cameras misjudge angles."""
+"""Initial factors relative to the rigid estimate: nominal cameras misjudge angles."""
 WORTH = 40.0
-"""Chi-square by which a factor must improve a joint's own trial."""
+"""Least gain in chi-square of a joint's own trial from a factor."""
 ABOVE_FLOOR = 1.25
-"""How far above the residuals of the other joints' trials one may stay with its factor."""
+"""Largest ratio of the residuals with a factor to those of the other joints' trials."""
 SIGNIFICANT = 5.0
-"""Deviations from 1 at which a factor is one."""
+"""Number of standard deviations from 1 above which a factor differs from it significantly."""
 LOSS = RobustLoss("soft_l1", 2.0)
 LEAST_FACTOR = 2e-3
-"""Relative error of a scale below which it is not worth a refusal."""
+"""Relative error of a scale below which it is not refused."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class JointScaleEstimate:
 def trial_scales(
     trials: TrialData, cameras: FloatArray, points: FloatArray, usable: npt.NDArray[np.bool_]
 ) -> FloatArray:
-    """Scale factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 where no
-    other is significant, for prismatic joints, for trials of no use, and where the factor does not bring the
-    trial to the residuals of the other joints' trials (another fault is present then).
+    """Scale factor (n,) of each joint's reported positions from its own trial, cameras (c, 3, 4) fixed; 1 if no
+    other is significant, for prismatic joints, for unusable trials, and if the factor does not reduce the
+    trial's residuals to those of the other joints' trials (there is a different fault then).
     """
     factors, residual = np.ones(len(trials.joint_names)), np.full(len(trials.joint_names), np.nan)
     for joint, observations, displacement in own_trials(trials, points, usable):
@@ -96,13 +96,13 @@ def with_scales_removed(trials: TrialData, factors: FloatArray) -> TrialData:
 
 
 def _best_factor(cameras: FloatArray, observations: VirtualObservations, reported: FloatArray) -> tuple[float, float]:
-    """Scale factor of one joint's ``reported`` angles (k,), 1 where no other gains enough, and the median residual
-    [sigmas] with it; NaN where the joint fits with none.
+    """Scale factor of one joint's ``reported`` angles (k,), 1 if no other gains enough, and the median residual
+    [sigmas] with it; NaN if the joint fits with none.
     """
     rough = _rigid_factor(observations, reported)
     rigs: dict[float, tuple[RigModel, float]] = {}
     for factor in {1.0, *(rough * step for step in COARSE)}:
-        # As reported, the joint must have had every chance before another factor is believed.
+        # All starts are tried with the reported positions before another factor is accepted.
         rig, typical = best_single_joint("revolute", cameras, observations, reported / factor, thorough=factor == 1.0)
         if rig is not None and np.isfinite(typical):
             rigs[factor] = rig, typical
@@ -143,7 +143,7 @@ def _best_factor(cameras: FloatArray, observations: VirtualObservations, reporte
 
 
 def _rigid_factor(observations: VirtualObservations, reported: FloatArray) -> float:
-    """Coarse scale factor: reported over rotated angle between distant stops, as if the cameras were nominal ones."""
+    """Coarse scale factor: reported over estimated angle between distant stops, assuming the nominal cameras."""
     scale = np.array([1.0 / NOMINAL_FOCAL, 1.0 / NOMINAL_FOCAL, 1.0])
     with np.errstate(divide="ignore", invalid="ignore"):
         euclidean = observations.points[..., :3] * scale / observations.points[..., 3:]
@@ -171,7 +171,7 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     if not joints:
         return ()
     factor = orthogonal_factor(solution.rig, solution.charts, solution.data, scale_columns(solution, joints))
-    # What the other parameters can imitate of a factor is theirs.
+    # Effects of a factor that the other parameters can imitate count as theirs.
     at = solution.charts.start(3)
     found = estimate_beside(factor.core[at:, at:])
     deviations = np.sqrt(np.diag(found.covariance) * max(1.0, solution.determined.variance))
@@ -185,7 +185,7 @@ def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointS
     """Scale of each prismatic joint (reported motion per length) over that of the first one, with deviations; ()
     below the metric stratum and with fewer than two.
 
-    One scale for all of them is gauge; their ratios are not, and are 1 where every drive states the truth.
+    One common scale is gauge; the ratios are not, and are 1 if every drive reports true lengths.
     """
     joints = [j for j, kind in enumerate(solution.rig.kinds) if kind == "prismatic"]
     if result.model.stratum != "metric" or len(joints) < 2:
@@ -195,7 +195,7 @@ def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointS
     starts = np.cumsum([0, *(len(basis) for basis in solution.charts.generators)])
 
     def log_slope(joint: int) -> FloatArray:
-        """Change of the logarithm of a joint's length with the parameters, in their independent directions."""
+        """Derivative of the logarithm of a joint's length by the parameters, in their independent directions."""
         generator, basis = solution.rig.generators[joint], solution.charts.generators[joint]
         changes = (basis @ generator - generator @ basis)[:, :3, 3]
         relative = changes @ generator[:3, 3] / lengths[joint] ** 2
@@ -213,29 +213,29 @@ def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointS
 
 
 EXPLAINED = 1.5
-"""Residual over stated noise that may be left beside errors of the joints for these to be the cause."""
+"""Largest ratio of residual to stated noise at which joint errors count as the cause."""
 MOST_OUTLIERS = 0.02
-"""Share of the pixels that may be left out beside them."""
+"""Largest share of rejected pixels in that case."""
 ONE_STOP, OTHERS = 45.0, 0.75
-"""Largest square of a joint's errors, over the one that three quarters of them do not exceed, from which a single stop
-is wrong: Gaussian ones of nine stops get there twice in a thousand, and half of them may lie on one flank of a play.
+"""Largest square of a joint's errors, relative to their 0.75 quantile, above which a single stop is wrong: Gaussian
+errors of nine stops exceed it twice in a thousand, and half of them may lie on one flank of a play.
 """
 ONE_STEP = 0.5
-"""Share of what the model leaves at the reported positions that a step must explain to be what happened: errors of the
-joints leave more.
+"""Share of the residuals at the reported positions that a step must explain to count as the cause: joint errors
+leave more.
 """
 WRONG_SHARE = 0.5
-"""Error over reported displacement of a joint that stands elsewhere in another's trial, from which it is wrong."""
+"""Ratio of error to reported displacement of a joint that is displaced in another's trial, above which it is wrong."""
 LEAST_STOPS = 4
-"""Stops of a trial from which single ones can be told."""
+"""Least number of a trial's stops for detecting a single wrong one."""
 MOST_GIVEN = 0.06
-"""Largest share of its motion that a joint may seem to have too much or too little by sag or coupling."""
+"""Largest apparent scale error of a joint that sag or coupling can cause."""
 LIKE_OTHERS = 3.0
-"""Times the joints' own errors that a wrong scale must move a joint over its trial to be told from them."""
+"""Ratio of a joint's motion due to a wrong scale over its trial to the joints' errors, from which they are distinct."""
 
 
 class ScalesError(Exception):
-    """Errors of the joint readings explain the data beside these scale ``factors`` (n,)."""
+    """Errors of the joint readings explain the data together with these scale ``factors`` (n,)."""
 
     def __init__(self, factors: FloatArray, components: VarianceComponents) -> None:
         super().__init__("wrong scales")
@@ -243,7 +243,7 @@ class ScalesError(Exception):
 
 
 def explains(trials: TrialData, solution: Solution, inliers: BoolArray, components: VarianceComponents | None) -> bool:
-    """Whether a bundle with joint noise leaves nothing but noise, of readings that are not plainly wrong."""
+    """Whether a bundle with joint noise leaves only noise, for readings that are not plainly wrong."""
     if _moved_in_name_only(trials, solution):
         return False
     return (
@@ -255,8 +255,8 @@ def explains(trials: TrialData, solution: Solution, inliers: BoolArray, componen
 
 
 def _moved_in_name_only(trials: TrialData, solution: Solution) -> bool:
-    """Whether a joint would be off by much of what it reports to stand apart while another one moves: that is a wrong
-    position, no error of a gear.
+    """Whether the error of a joint is a large part of its reported displacement while another one moves: a wrong
+    position, not an error of a gear.
     """
     errors = solution.data.corrections
     apart = solution.data.offsets - errors
@@ -267,7 +267,7 @@ def _moved_in_name_only(trials: TrialData, solution: Solution) -> bool:
 
 
 def one_thing_happened(trials: TrialData, solution: Solution) -> bool:
-    """Whether the errors of the joints look like one event: a wrong stop, or a step that lasts."""
+    """Whether the errors of the joints look like a single event: a wrong stop, or a lasting step."""
     errors = solution.data.corrections
     for joint in range(errors.shape[1]):
         own = errors[trials.trials == joint, joint]
@@ -281,10 +281,10 @@ def one_thing_happened(trials: TrialData, solution: Solution) -> bool:
 
 
 def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArray:
-    """Scale factor (n,) of each joint's reading, 1 where none is significant beside the errors of the joints, or where
-    these are as large.
+    """Scale factor (n,) of each joint's reading, 1 if it is not significant beside the joint errors, or if these are
+    as large.
 
-    By Student's distribution of as many freedoms as the joint's errors are known with; false once in
+    By Student's distribution with the degrees of freedom of the joint's errors; false once in
     ``1 / FALSE_ALARM`` fits.
     """
     factors = np.ones(len(trials.joint_names))
@@ -306,15 +306,15 @@ def wrong_scales(trials: TrialData, components: VarianceComponents) -> FloatArra
 
 
 def refuse_wrong_scales(trials: TrialData, components: VarianceComponents) -> None:
-    """Raise ScalesError where scales are wrong beside the errors of the joints."""
+    """Raise ScalesError if scales are wrong beside the joint errors."""
     factors = wrong_scales(trials, components)
     if (factors != 1.0).any():
         raise ScalesError(factors, components)
 
 
 def small_scales(cause: CalibrationError) -> str:
-    """What may be instead of wrong scales where gears that give way may report as much, as a note; "" where they
-    cannot.
+    """Note on compliant gears as an alternative to wrong scales, if they could have the same effect; "" if they
+    could not.
     """
     joints = cause.data.get("joints") if cause.code == "wrong_scale" else None
     if not joints or any(abs(one["factor"] - 1.0) > MOST_GIVEN for one in joints.values()):

@@ -1,7 +1,7 @@
-"""Faults of calibration data that show without a model in the markers' image tracks: collinear markers, frozen
+"""Faults of calibration data that are visible in the markers' image tracks without a model: collinear markers, frozen
 encoders, steps of a camera or marker, noise of the tracks.
 
-Markers of a moving joint draw smooth tracks, and equal positions give equal images.
+Markers of a moving joint have smooth tracks, and equal positions give equal images.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 ON_A_LINE = 3.0
-"""Rms distance [sigmas] from their common line at which markers count as collinear: detectors misjudge their noise."""
+"""Rms distance [sigmas] from their common line up to which markers count as collinear: detectors misjudge their noise.
+"""
 MIN_IMAGE_MOTION = 10.0
-"""Motion of the markers between two stops [sigmas] at which a joint has moved, whatever its encoder says."""
+"""Motion of the markers between two stops [sigmas] from which a joint has moved, whatever its encoder reports."""
 FROZEN_STOPS = 3
-"""Successive stops with one reported position and moving images that make an encoder a frozen one."""
+"""Number of successive stops with equal reported positions and moving images from which an encoder is frozen."""
 SAME_POSITION = 1e-5
 """Difference of positions [rad or m] below which an encoder has not moved."""
 PATH_DEGREE = 4
-"""Of the polynomials that paths of markers over one joint are compared with."""
+"""Degree of the polynomials to which the markers' tracks over one joint are compared."""
 SMOOTH = 10.0
-"""Noise [stated sigmas] about smooth paths; wrong detections leave hundreds."""
+"""Largest noise [stated sigmas] about smooth tracks; wrong detections cause hundreds."""
 STEP_STATISTIC = 60.0
-"""Gain in chi-square, at the noise that is left, from which a path has a step."""
+"""Gain in chi-square, at the residual noise, from which a track has a step."""
 STEP_SHARE = 0.75
-"""Share of a camera's paths that must step for the camera to have moved; of all other paths at most a quarter may."""
+"""Share of a camera's tracks that must step for the camera to have moved; of all other tracks at most a quarter may."""
 
 
 def off_line_sigmas(trials: TrialData) -> float:
@@ -74,7 +75,7 @@ def frozen_stops(trials: TrialData, joint: int) -> IntArray:
 
 
 def check_motions(trials: TrialData) -> None:
-    """Check images and positions for faults that show before any fit. Raises CalibrationError.
+    """Check images and positions for faults that are visible before any fit. Raises CalibrationError.
 
     ``too_few_markers``, ``markers_collinear``, ``encoder_frozen``, ``joints_exchanged``.
     """
@@ -140,8 +141,8 @@ def _refuse_exchanged(trials: TrialData, joint: int, name: str) -> None:
 
 @dataclass(frozen=True)
 class TrackStep:
-    """A step in the tracks: they jump before ``stop`` and stay there. ``cameras``, ``markers``: indices of those
-    that do, all of them where they moved together; ``pixels``: median size [px].
+    """A step in the tracks: they jump before ``stop`` and stay there. ``cameras``, ``markers``: indices of the
+    affected ones, all of them if they moved together; ``pixels``: median size [px].
     """
 
     stop: int
@@ -151,7 +152,7 @@ class TrackStep:
 
 
 def path_noise(trials: TrialData) -> FloatArray:
-    """Noise of each track (c, m), estimated over stated, from its distance to a smooth polynomial; 1 where too few
+    """Noise of each track (c, m), estimated over stated, from its distance to a smooth polynomial; 1 if too few
     stops show a marker.
     """
     basis = path_basis(trials)
@@ -171,7 +172,7 @@ def path_noise(trials: TrialData) -> FloatArray:
 
 
 def paths_are_smooth(trials: TrialData) -> bool:
-    """Whether the tracks are smooth but for noise, as moving joints make them: without wrong detections."""
+    """Whether the tracks are smooth up to noise, as those of moving joints are: without wrong detections."""
     return float(np.median(path_noise(trials))) < SMOOTH
 
 
@@ -179,8 +180,8 @@ def find_step(trials: TrialData, share: float = 0.0) -> TrackStep | None:
     """A step at one stop of all markers in one camera, of one marker in all cameras, or of all in all; None if
     there is none.
 
-    Stops are in order of time. Each path is compared with polynomials in the moving joint about the common
-    base, one for each trial; None where no step explains what they leave, or less than a ``share`` of it.
+    Stops are in order of time. Each track is compared with polynomials in the moving joint about the common
+    base, one for each trial; None if no step explains their residuals, or less than a ``share`` of them.
     """
     gains, sizes, shares = _step_gains(trials)
     c, m = gains.shape[:2]
@@ -201,7 +202,7 @@ def find_step(trials: TrialData, share: float = 0.0) -> TrackStep | None:
 
 
 def path_basis(trials: TrialData) -> FloatArray:
-    """Basis columns (s, p) of smooth tracks: a constant for each base that trials start from, and powers of the
+    """Basis columns (s, p) of smooth tracks: a constant for each base at which trials start, and powers of the
     moving joint's displacement from it; zero for stops of no trial, no columns without any.
     """
     positions, columns = trials.positions, []
@@ -229,7 +230,7 @@ def path_basis(trials: TrialData) -> FloatArray:
 
 def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Reduction of chi-square by a step before each stop in each track (c, m, s), the step's size [px], and the
-    reduction over what polynomials leave.
+    reduction relative to the residuals of the polynomials.
     """
     c, s, m = trials.sigmas.shape
     basis = path_basis(trials)
@@ -252,7 +253,7 @@ def _step_gains(trials: TrialData) -> tuple[FloatArray, FloatArray, FloatArray]:
             steps = after[rows] * weights[:, None]
             steps = steps - q @ (q.T @ steps)
             square = (steps**2).sum(axis=0)
-            # A step that the polynomials imitate is no evidence.
+            # A step that the polynomials can imitate is no evidence.
             known = square > 0.2 * (weights**2).mean()
             size = np.where(known[:, None], steps.T @ rest, 0.0) / np.where(known, square, 1.0)[:, None]
             gain = (size**2).sum(axis=1) * square
@@ -269,8 +270,8 @@ def _trial_noise(
 ) -> FloatArray:
     """Mean squared residual (s,) of the track in each stop's own trial, with a step at that stop.
 
-    Polynomials follow a wide turn badly, and only there: what they leave is no step. ``rest`` (k, 2), ``steps``
-    (k, s) [sigmas], ``size`` (s, 2); ``of_row`` (k,) and ``of_stop`` (s,) number the trials.
+    Polynomials do not follow a large rotation well, but only in that trial: their residuals there are no step.
+    ``rest`` (k, 2), ``steps`` (k, s) [sigmas], ``size`` (s, 2); ``of_row`` (k,) and ``of_stop`` (s,) number the trials.
     """
     noise = np.zeros(len(size))
     for trial in np.unique(of_row[of_row >= 0]):

@@ -1,12 +1,12 @@
 """Causes of the outliers of a calibration's fit: exchanged views or marker ids, wrong joint positions at a stop, a
 moved camera or marker.
 
-The model that fits the other pixels predicts where the outliers should be, which identifies the cause.
+The model that fits the other pixels predicts the correct pixels of the outliers, which identifies the cause.
 
-What moved for good during trial motions: one camera, everything before all cameras, or not decided.
+Also what moved permanently during trial motions: one camera, the body relative to all cameras, or undecided.
 
-A model that was fitted to trials with such a step shares it out among all cameras: where its residuals step is no
-evidence. Each camera in turn is given another pose from the step on, and the bundle is solved again.
+A model fitted to trials with such a step distributes it over all cameras: a step in its residuals is no evidence of the
+camera. Instead each camera in turn gets a different pose from the step on, and the bundle is solved again.
 
 Consistency checks of calibration input: whether the stated detector noise is too small, and whether revolute joints
 report their angles at a wrong scale.
@@ -50,17 +50,17 @@ from stereoservo.calibration.variance_components import (
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 LOSS = RobustLoss("soft_l1", 2.0)
-"""Residual from which a pixel weighs less: stops of an onset that is found a little late, wrong pixels."""
+"""Loss that reduces the weight of large residuals: stops before a step that is detected too late, wrong pixels."""
 EVALUATIONS = 60
 TAIL = 1e-4
-"""Probability with which chance alone says that one camera's motion does not explain the step."""
+"""Probability of rejecting, by chance, that one camera's motion explains the step."""
 CLEARLY = 4.0
-"""Times that chi-square by which everything else must explain it worse."""
+"""Factor on that chi-square limit by which all other explanations must be worse."""
 
 
 def moved_part(trials: TrialData, start: Solution, stop: int) -> CalibrationError:
-    """Error that says what moved between ``stop`` and the one before, from a bundle of `every_pixel`: ``camera_moved``,
-    ``moved_together``, or ``camera_or_body_moved`` where the pixels do not tell.
+    """Error that states what moved between ``stop`` and the previous one, from a bundle of `every_pixel`:
+    ``camera_moved``, ``moved_together``, or ``camera_or_body_moved`` if the pixels do not determine it.
     """
     cameras = len(trials.cameras)
     try:
@@ -95,7 +95,7 @@ def camera_moved(trials: TrialData, camera: int, stop: int) -> CalibrationError:
 
 
 def moved_together(stop: int) -> CalibrationError:
-    """Error that everything jumps in all cameras before ``stop``."""
+    """Error that all markers jump in all cameras before ``stop``."""
     return CalibrationError(
         "moved_together",
         f"all markers jump in all cameras between stops {stop - 1} and {stop} and stay off. The images from there on "
@@ -106,7 +106,7 @@ def moved_together(stop: int) -> CalibrationError:
 
 
 def camera_or_body_moved(trials: TrialData, stop: int) -> CalibrationError:
-    """Error that something moved before ``stop``, and that the trials do not tell what."""
+    """Error that something moved before ``stop``, and that the trials do not determine what."""
     names = [camera.name for camera in trials.cameras]
     return CalibrationError(
         "camera_or_body_moved",
@@ -120,7 +120,7 @@ def camera_or_body_moved(trials: TrialData, stop: int) -> CalibrationError:
 
 
 def every_pixel(trials: TrialData, result: CalibrationFit) -> Solution:
-    """The fit's solution with all pixels of its markers, those that it left out too, without priors of its lenses."""
+    """The fit's solution with all pixels of its markers, including rejected ones, without priors of its lenses."""
     solution = solution_of(trials, result)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
     at = np.nonzero(trials.visible[:, :, kept])
@@ -139,7 +139,7 @@ def every_pixel(trials: TrialData, result: CalibrationFit) -> Solution:
 
 
 def _solved_with_moved(start: Solution, moved: Sequence[int], stop: int) -> Solution:
-    """The bundle in which the cameras ``moved`` are others from ``stop`` on. Raises LinAlgError."""
+    """The bundle in which the cameras ``moved`` have different poses from ``stop`` on. Raises LinAlgError."""
     rig, data, count = start.rig, start.data, len(start.rig.cameras)
     others = np.arange(count)
     others[list(moved)] = count + np.arange(len(moved))
@@ -165,18 +165,18 @@ def _robust_cost(solution: Solution) -> float:
 
 
 NEAR = 6.0
-"""Distance [sigmas] at which a pixel is where it is expected."""
+"""Distance [sigmas] up to which a pixel agrees with a prediction."""
 MOST = 0.6
-"""Share of a stop's pixels that must be outliers for the stop, or its image, to be wrong as a whole."""
+"""Share of outliers among a stop's pixels from which the stop, or its image, is wrong as a whole."""
 LASTING = 0.75
-"""Share of outliers from a stop on that makes a camera or a marker a moved one; before it, a tenth at most."""
+"""Share of outliers after a stop from which a camera or a marker counts as moved; before it, a tenth at most."""
 LASTING_STOPS = 3
-"""Stops, the last ones, that such a move must be seen at."""
+"""Number of last stops at which such a move must be visible."""
 
 
 @dataclass(frozen=True)
 class PredictedTrials:
-    """Predictions of a model for its trials: which pixels are outliers (c, s, m), expected pixels (c, s, m, 2), and
+    """Predictions of a model for its trials: mask of outliers (c, s, m), expected pixels (c, s, m, 2), and
     the distance [px] within which a pixel agrees with its prediction (c, s, m).
     """
 
@@ -190,7 +190,7 @@ class PredictedTrials:
     expected: FloatArray
 
     def near(self, pixels: FloatArray, where: FloatArray) -> BoolArray:
-        """Whether pixels (c, s, m, 2) agree with expected ones."""
+        """Whether pixels (c, s, m, 2) agree with the expected ones."""
         distance = np.linalg.norm(pixels - where, axis=-1)
         return np.asarray(np.where(np.isfinite(distance), distance, np.inf) <= NEAR * self.sigmas)
 
@@ -221,7 +221,7 @@ def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ..
     """Notes on the causes of the outliers of ``result``.
 
     Raises CalibrationError (``camera_moved``, ``marker_slipped``, ``moved_together``, ``camera_or_body_moved``) for
-    what has changed for good during the trials: the model describes the cell before that.
+    a permanent change during the trials: the model describes the cell before it.
     """
     found = predictions(trials, result)
     if not found.outliers.any():
@@ -247,8 +247,8 @@ def explain_outliers(trials: TrialData, result: CalibrationFit) -> tuple[str, ..
 
 
 def check_lasting_outliers(trials: TrialData, result: CalibrationFit, found: PredictedTrials) -> None:
-    """Raise CalibrationError where outliers begin at a stop and last: of one camera, of one marker, or of
-    everything.
+    """Raise CalibrationError if outliers begin at a stop and last: of one camera, of one marker, or of
+    all.
     """
     c, _, m = found.seen.shape
     cameras = [_lasting(found.outliers[k], found.seen[k]) for k in range(c)]
@@ -285,8 +285,8 @@ def marker_slipped(marker: int, stop: int) -> CalibrationError:
 
 
 def _lasting(outliers: BoolArray, seen: BoolArray) -> int | None:
-    """Stop that separates pixels (s, ...), most of which are outliers, from others of which few are, on either side
-    (the model follows the longer part); None where there is none.
+    """Stop that separates pixels (s, ...) that are mostly outliers from others with few, on either side
+    (the model follows the longer part); None if there is none.
     """
     after = _begun(outliers, seen)
     if after is not None:
@@ -296,13 +296,13 @@ def _lasting(outliers: BoolArray, seen: BoolArray) -> int | None:
 
 
 def _begun(outliers: BoolArray, seen: BoolArray) -> int | None:
-    """First stop from which most of the pixels (s, ...) are outliers while few are before; None where there is
+    """First stop from which most of the pixels (s, ...) are outliers while few are before; None if there is
     none.
     """
     s = len(outliers)
     bad = outliers.reshape(s, -1).sum(axis=1)
     shown = seen.reshape(s, -1).sum(axis=1)
-    # Of each stop k: outliers from k on, less inliers from k on, less twice the outliers before it.
+    # For each stop k: outliers from k on, minus inliers from k on, minus twice the outliers before it.
     gain = 2 * bad - shown
     score = gain.sum() - (np.cumsum(gain) - gain) - 2 * (np.cumsum(bad) - bad)
     k = int(score.argmax())
@@ -314,7 +314,7 @@ def _begun(outliers: BoolArray, seen: BoolArray) -> int | None:
 
 
 def _exchanged_stops(found: PredictedTrials) -> npt.NDArray[np.int64]:
-    """Stops at which cameras 0 and 1 show each other's predictions."""
+    """Stops at which cameras 0 and 1 agree with each other's predictions."""
     pair = found.expected[[1, 0]]
     crossed = found.near(found.pixels, np.concatenate([pair, found.expected[2:]]))[:2]
     both = found.outliers[:2].sum(axis=(0, 2))
@@ -323,7 +323,7 @@ def _exchanged_stops(found: PredictedTrials) -> npt.NDArray[np.int64]:
 
 
 def _exchanged_ids(found: PredictedTrials, rest: BoolArray) -> list[tuple[int, int, int, npt.NDArray[np.int64]]]:
-    """Cameras and pairs of markers that lie at each other's prediction, with the stops (k,)."""
+    """Cameras and pairs of markers that agree with each other's predictions, with the stops (k,)."""
     pairs: dict[tuple[int, int, int], list[int]] = {}
     for camera, stop, a in np.argwhere(rest):
         distance = np.linalg.norm(found.expected[camera, stop] - found.pixels[camera, stop, a], axis=1)
@@ -338,7 +338,7 @@ def _exchanged_ids(found: PredictedTrials, rest: BoolArray) -> list[tuple[int, i
 
 def _wrong_stop(trials: TrialData, found: PredictedTrials, stop: int) -> str:
     """Description of a stop whose pixels are all outliers: the positions of a neighbouring stop explain them, or
-    none do.
+    no positions do.
     """
     joint = int(trials.trials[stop])
     prefix = f"stop {stop} does not fit in any camera and was left out"
@@ -356,7 +356,7 @@ def _wrong_stop(trials: TrialData, found: PredictedTrials, stop: int) -> str:
     best = int(typical.argmin())
     step = float(tried[1] - tried[0])
     nearest = float(np.median(found.sigmas[:, stop])) * NEAR
-    # The grid is coarse: half a step of motion in the image is not the stop's fault.
+    # The grid is coarse: an error of half a step of motion in the image is not an error of the stop.
     slack = float(np.abs(np.diff(typical)).max())
     if typical[best] > nearest + slack:
         return f"{prefix}: no position of joint {name!r} explains its images"
@@ -377,22 +377,22 @@ def _stops(stops: npt.NDArray[np.int64]) -> str:
 
 
 SUSPICIOUS_OUTLIERS = 0.01
-"""Share of outliers from which a fit above the noise floor is looked into."""
+"""Share of outliers from which a fit above the noise floor is diagnosed."""
 DEGREES, ABOUT = float(np.degrees(1.0)), 2.0
-"""Factor of a joint that reports degrees, and by what factor, up or down, a coarse factor may be off a true one."""
+"""Scale factor of a joint that reports degrees, and largest ratio, either way, of a coarse factor to the true one."""
 UNDERSTATED = 1.5
-"""How many times the stated sigmas paths must scatter for the detector to be looked into."""
+"""Ratio of the tracks' scatter to the stated sigmas from which the detector noise is tested."""
 UNEVEN = 1.5
-"""Residual of one joint's trial over another's up to which both are one noise."""
+"""Ratio of the residuals of two joints' trials up to which they have a common noise."""
 NOTABLE = 0.1
-"""Share of the largest error of a joint, over its way, from which others are named beside it."""
+"""Share of the largest relative error of a joint from which other joints are named, too."""
 WHITE = 0.8
-"""Noise about smooth paths in what a model leaves, over its residual, from which the residual is noise alone."""
+"""Ratio of noise about smooth tracks to the residual, both after the fit, from which the residual is only noise."""
 
 
 def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -> CalibrationError | None:
-    """Error of sigmas that are stated too small, or of joints that stand as much beside their readings; None unless the
-    trials fit with the sigmas that the markers' tracks show, and only noise is left.
+    """Error for stated sigmas that are too small, or for joint errors of that size; None unless the trials fit with the
+    sigmas estimated from the markers' tracks, and only noise is left.
     """
     scatter = path_noise(trials)
     if not float(scatter.max()) > UNDERSTATED:
@@ -408,10 +408,10 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
     wild = used.outliers > SUSPICIOUS_OUTLIERS * (used.measurements // 2 + used.outliers)
     uneven = max(joint.rms_px for joint in used.joints) > UNEVEN * min(joint.rms_px for joint in used.joints)
     if smooth or wild or uneven:
-        return None  # noise is none of these: the model is wrong, or positions or times are
+        return None  # not only noise: the model is wrong, or positions or times are
     solution = solution_of(mended, result)
     joints = estimate_components(reduced_rows(solution, readings(solution.data.offsets)), scales=False)
-    # What moves all markers of a stop alike is no noise of pixels.
+    # An effect common to all markers of a stop is no pixel noise.
     if joints is not None and joints.significant and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2:
         return _inexact_joints(trials, joints)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
@@ -433,7 +433,7 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
 
 
 def _inexact_joints(trials: TrialData, found: VarianceComponents) -> CalibrationError:
-    """Error of joints that stand so far beside their readings that no fit starts from these."""
+    """Error for joints whose readings are so inaccurate that no fit starts from them."""
     deviations = np.sqrt(found.random + found.repeatable)
     ways = np.ptp(trials.positions, axis=0)
     listed = ", ".join(
@@ -451,7 +451,7 @@ def _inexact_joints(trials: TrialData, found: VarianceComponents) -> Calibration
 
 
 def residual_trials(trials: TrialData, result: CalibrationFit) -> TrialData:
-    """The trials with the model's residuals in place of the pixels, in which steps stay and smooth tracks vanish."""
+    """The trials with the model's residuals in place of the pixels: steps remain and smooth tracks vanish."""
     found = predictions(trials, result)
     return msgspec.structs.replace(
         trials,
@@ -464,7 +464,7 @@ def residual_trials(trials: TrialData, result: CalibrationFit) -> TrialData:
 def scaled_positions(
     trials: TrialData, views: InitialViews, refit: Refit, options: FitOptions
 ) -> CalibrationError | None:
-    """Error of revolute joints whose positions have a wrong scale, if the trials fit without it; else None."""
+    """Error for revolute joints whose positions have a wrong scale, if the trials fit without it; else None."""
     factors = trial_scales(trials, *views)
     if (factors == 1.0).all():
         return None
@@ -477,7 +477,7 @@ def scaled_positions(
 
 
 def _likely_factors(trials: TrialData, factors: FloatArray) -> list[FloatArray]:
-    """Factors (n,) to try, likeliest first: a unit that most revolute joints share, and so perhaps all; degrees;
+    """Factors (n,) to try, most likely first: a unit that most revolute joints share, and so perhaps all; degrees;
     the joints' own coarse estimates.
     """
     revolute = np.array([kind == "revolute" for kind in trials.joint_kinds])
@@ -494,8 +494,8 @@ def _likely_factors(trials: TrialData, factors: FloatArray) -> list[FloatArray]:
 def scale_error(
     trials: TrialData, mended: TrialData, result: CalibrationFit, factors: FloatArray
 ) -> CalibrationError | None:
-    """Error that states wrong scales: ``factors`` (n,) that were divided out, refined with the model of the
-    ``mended`` trials; None where none is left.
+    """Error that states wrong scales: the removed ``factors`` (n,), refined with the model of the
+    ``mended`` trials; None if none is left.
     """
     found = {}
     for scale in model_scales(solution_of(mended, result)):

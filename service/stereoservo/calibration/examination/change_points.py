@@ -1,16 +1,16 @@
 """Change-point test: whether, and from which frame on, a change of few parameters explains the residuals of a model.
 
 Generalised likelihood ratio over hypotheses and onsets (Basseville, Nikiforov, 1993, 2.4), to first order by
-cumulative sums; the best are then estimated in full by `estimate_changes`, and their onsets again. The threshold is the
-chi-square quantile of the false-alarm probability over all hypotheses and onsets (Bonferroni), in units of the noise
-that is left, its correlation from frame to frame included.
+cumulative sums; the best ones are then estimated in full by `estimate_changes`, and their onsets again. The threshold
+is the chi-square quantile of the false-alarm probability over all hypotheses and onsets (Bonferroni), in units of the
+residual noise, including its correlation from frame to frame.
 
-From which frame on all pictures of one camera are displaced, told by that camera alone, before any arm is known.
+Also the frame from which all images of one camera are displaced, by that camera alone, before any arm is known.
 
-While no more than one joint is away from where the others' motions pass, a marker's pixel is a ratio of linear forms of
-1 and the sine and cosine of that joint (or its way); where no joint is away all joints' forms have one value in common.
-A camera that moved adds, from one frame on, a displacement of the picture that is nearly a homography's and has the
-same parameters for all markers: generalised likelihood ratio over onsets, the forms free at each.
+While at most one joint is displaced from its median during the others' motions, a marker's pixel is a ratio of linear
+forms of 1 and the sine and cosine of that joint (or its displacement); the forms of all joints share their value at
+zero displacement. A camera that moved adds, from one frame on, an image displacement that is nearly a homography's and
+has the same parameters for all markers: generalised likelihood ratio over onsets, with the forms free at each.
 """
 
 from __future__ import annotations
@@ -54,25 +54,25 @@ from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 COURSE = Limits(evaluations=30, tolerance=0.0, settled=1e-6)
-"""Of a course's least squares."""
+"""Termination of the least-squares fit of a track."""
 ROUNDS = 6
-"""Times that the onset is estimated again."""
+"""Most times that the onset is estimated again."""
 INVERTED, PARALLAX = 4, 0.1
-"""Steps in which a displacement is inverted, and the share of it that depends on how far a marker is."""
+"""Iterations for inverting a displacement, and the share of it that depends on the depth of a marker."""
 LEAST_DEPTH = 0.1
-"""Of a marker, over that where no joint is away."""
+"""Least depth of a marker, relative to that at zero displacement of all joints."""
 KNOWN = 1e-6
-"""Share of a step's information that the forms must leave."""
+"""Share of a step's information that must be independent of the forms."""
 SPARE = 1.5
-"""Values for each unknown of a marker's courses below which nothing is told by it."""
+"""Least number of pixel coordinates per unknown of a marker's track."""
 CLEAR, ALONE_BY, NEAR = 100.0, 4.0, 8
-"""Chi-square from which a step is one, how many times that of other cameras elsewhere a step of one alone has, and
-frames of all cameras within which steps of several are one event."""
+"""Chi-square from which a step is significant, ratio to other cameras' steps at other onsets from which one camera's is
+accepted, and number of frames (of all cameras) within which steps of several cameras are one event."""
 
 
 class Step(NamedTuple):
     """A step of a camera's pixels at frame ``onset`` (among all), the ``span`` of frames that are not excluded, its
-    ``gain``: chi-square that it explains, in the noise that it leaves; and its parameters (q,).
+    ``gain``: explained chi-square in units of the remaining noise; and its parameters (q,).
     """
 
     onset: int
@@ -82,8 +82,8 @@ class Step(NamedTuple):
 
 
 def moved_camera(views: RecordedViews) -> int | None:
-    """The camera that alone was moved, by its step in frames of stops, which late stamps do not displace; None where
-    none stands out from the others, or another steps there too, as by a joint that drifted.
+    """The only camera that was moved, by its step in frames of stops, which late stamps do not displace; None if
+    none is distinct from the others, or another has a step there too, as with a joint that drifted.
     """
     stops = instants(views) >= 0
     steps = [step_of_camera(views, c, stops) for c in range(len(views.cameras))]
@@ -100,7 +100,7 @@ def step_of_camera(
     views: RecordedViews, camera: int, frames: BoolArray | None = None, marker: int | None = None
 ) -> Step | None:
     """The step that explains most of a camera's pixels in all or some ``frames`` (f,), of all markers, or one; None
-    where too few of them show motions of single joints.
+    if too few of them show motions of single joints.
     """
     every = np.flatnonzero(views.camera == camera)
     forms, single = _forms(views)
@@ -112,7 +112,7 @@ def step_of_camera(
     ]
     if len(mine) < 2 * LASTING + 1 or not tracks:
         return None
-    # A step between two of the frames may be at any of those between them.
+    # A step between two of these frames may be at any frame between them.
     onsets = every[(every >= mine[LASTING]) & (every <= mine[-LASTING])]
     best, shifts = -1, [np.zeros_like(track.pixels) for track in tracks]
     for _ in range(ROUNDS):
@@ -133,8 +133,8 @@ def step_of_camera(
 
 
 def without_step(views: RecordedViews, camera: int, step: Step) -> RecordedViews:
-    """The recording with the later pixels of a camera where they would be without the step, and as uncertain as a share
-    of it is: what a homography does not follow.
+    """The recording with the step removed from the later pixels of a camera; their sigmas are increased by a share of
+    the step, the part that a homography does not describe.
     """
     later = (views.camera == camera) & (np.arange(len(views.camera)) >= step.onset)
     half, shown = 0.5 * views.cameras[camera].width, views.pixels[later]
@@ -149,7 +149,8 @@ def without_step(views: RecordedViews, camera: int, step: Step) -> RecordedViews
 
 class _MarkerTrack(NamedTuple):
     """``pixels`` (k, 2) and ``sigmas`` (k,) [px] of a marker in the ``frames`` (k,) that show it, with the ``forms``
-    (k, r) of the joints there; ``half`` of the picture's width [px], and whether a step may do more than shift it.
+    (k, r) of the joints there; ``half`` of the image width [px], and whether a step may be more than a shift
+    (``together``).
     """
 
     frames: IntArray
@@ -161,8 +162,8 @@ class _MarkerTrack(NamedTuple):
 
 
 class _Course(NamedTuple):
-    """What forms of the joints predict of a track, (k, 2) [px], how a step's parameters displace that, ``warps``
-    (k, 2, q), and an orthonormal basis (2 k, p) of what the forms' parameters change, to first order [sigmas].
+    """Prediction (k, 2) [px] of a track by forms of the joints, its displacements ``warps`` (k, 2, q) by a step's
+    parameters, and an orthonormal basis (2 k, p) of its derivatives by the forms' parameters [sigmas].
     """
 
     predicted: FloatArray
@@ -171,8 +172,8 @@ class _Course(NamedTuple):
 
 
 def _forms(views: RecordedViews) -> tuple[FloatArray, BoolArray]:
-    """Sine and cosine less 1, or way, of each joint (f, 2 n) from where it mostly is while others move alone, and in
-    which frames (f,) no more than one joint is away from there.
+    """Sine and cosine minus 1, or displacement, of each joint (f, 2 n) relative to its median while others move alone,
+    and mask of the frames (f,) in which at most one joint is displaced.
     """
     stops = stop_positions(views, instants(views))
     alone = single_joint_motions(stops) >= 0
@@ -188,7 +189,7 @@ def _forms(views: RecordedViews) -> tuple[FloatArray, BoolArray]:
 def _track(
     views: RecordedViews, frames: IntArray, marker: int, forms: FloatArray, together: bool
 ) -> _MarkerTrack | None:
-    """The track of a marker, its steps those of all markers ``together`` or its own; None where seen too little."""
+    """The track of a marker, with steps of all markers ``together`` or its own; None if seen in too few frames."""
     shown = frames[views.seen[frames, marker]]
     own = forms[shown]
     own = own[:, np.ptp(own, axis=0) > 0.0] if len(own) else own
@@ -209,8 +210,8 @@ def _warps(pixels: FloatArray, half: float, together: bool) -> FloatArray:
 
 
 def _course(track: _MarkerTrack, pixels: FloatArray) -> _Course:
-    """The course of a track whose pixels (k, 2) are as given: least squares (Levenberg, Marquardt), from forms without
-    depth on.
+    """The course fitted to a track with given pixels (k, 2): least squares (Levenberg, Marquardt), starting from forms
+    without depth.
     """
     middle, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
     seen, weight = (pixels - middle) / size, (size / track.sigmas)[:, None]
@@ -255,8 +256,8 @@ def _slopes(terms: FloatArray, none: FloatArray, here: FloatArray, depths: Float
 def _profile(
     tracks: list[_MarkerTrack], courses: list[_Course], onsets: IntArray
 ) -> tuple[FloatArray, FloatArray, float, int]:
-    """Reduction (b,) of chi-square by a step at each of ``onsets`` (b,), its parameters (b, q), chi-square without one,
-    and the freedom beside one.
+    """Reduction (b,) of chi-square by a step at each of ``onsets`` (b,), its parameters (b, q), chi-square without a
+    step, and the degrees of freedom with one.
     """
     q = courses[0].warps.shape[2]
     moment, information = np.zeros((len(onsets), q)), np.zeros((len(onsets), q, q))
@@ -275,7 +276,7 @@ def _profile(
         information -= np.einsum("bki,bkj->bij", shared, shared)
         left += float(apart @ apart)
         freedom += len(apart) - Q.shape[1]
-    # What the forms explain as well says nothing.
+    # Directions that the forms explain as well carry no information.
     scale = np.sqrt(whole.clip(min=1e-12))
     scaled = information / (scale[:, :, None] * scale[:, None, :]) + KNOWN * np.eye(q)
     y = np.linalg.solve(scaled, (moment / scale)[..., None])[..., 0]
@@ -283,29 +284,29 @@ def _profile(
 
 
 def sums_from(rows: FloatArray, begin: IntArray) -> FloatArray:
-    """Sums (b, ...) of ``rows`` (k, ...) from each of ``begin`` (b,) on."""
+    """Sums (b, ...) of ``rows`` (k, ...) from each index ``begin`` (b,) to the end."""
     none = np.zeros((1, *rows.shape[1:]))
     return np.asarray(np.concatenate([np.cumsum(rows[::-1], axis=0)[::-1], none])[begin])
 
 
 FALSE_ALARM = 0.001
-"""Probability that a recording to which nothing has happened is said to have any change."""
+"""Probability that any change is reported for an unchanged recording."""
 LEAST_PX = 0.25
-"""rms change of the pixels below which a change is not told, however significant."""
+"""Rms change of the pixels [px] below which a change is not reported, however significant."""
 BLOCKS = 150
-"""Onsets that are tried to first order."""
+"""Number of onsets that are tested to first order."""
 LASTING = 3
-"""Frames that a change must last, and that must be before a step."""
+"""Least number of frames after an onset, and before it."""
 SETTLED = 3
-"""Times that the onset is estimated again."""
+"""Most times that the onset is estimated again."""
 
 
 @dataclass(frozen=True)
 class ChangePoint:
-    """A change found. ``frames`` (f,): which show it; ``after``: whether these are the later ones. ``onset``: first
-    frame of the later ones, among all; ``span``: the first and last frame that the onset may be. ``x`` (q,) with
-    ``covariance`` (q, q); ``effect`` (r, 2) [px] on the ``rows`` (k,) concerned. ``runner_up``: a hypothesis that
-    explains the data nearly as well.
+    """A detected change. ``frames`` (f,): mask of those that show it; ``after``: whether these are the later ones.
+    ``onset``: first frame of the later ones, among all; ``span``: first and last frame not excluded as onset. ``x``
+    (q,) with ``covariance`` (q, q); ``effect`` (r, 2) [px] on the affected ``rows`` (k,). ``runner_up``: a hypothesis
+    that explains the data nearly as well.
     """
 
     hypothesis: Hypothesis
@@ -322,19 +323,19 @@ class ChangePoint:
 
     @property
     def effect_px(self) -> float:
-        """rms change of the pixels [px] over the frames that show it."""
+        """Rms change of the pixels [px] over the frames that show it."""
         return float(np.sqrt((self.effect**2).sum(axis=1).mean()))
 
     @property
     def throughout(self) -> bool:
-        """Whether it is there from the first frame to the last, of stamps: of the cameras that it is of."""
+        """Whether all frames show it; for a change of stamps, all frames of its cameras."""
         stamps = self.hypothesis.kind == "stamps"
         return bool(self.frames.all()) or (stamps and self.after and self.onset == 0)
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A hypothesis with the onset that explains most, and how much of chi-square, to first order."""
+    """A hypothesis with its best onset and the explained chi-square, to first order."""
 
     hypothesis: Hypothesis
     after: bool
@@ -345,7 +346,7 @@ class _Candidate:
 def best_change(
     problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], middle: int
 ) -> ChangePoint | None:
-    """The most probable significant change, None where there is none; ``middle``: a frame that the model is of."""
+    """The most probable significant change, or None; ``middle``: a frame of the model's own data."""
     here = problem.residuals_at(start_state(problem))
     found = _likely_changes(problem, views, tested, middle)
     count = here.size
@@ -375,7 +376,7 @@ def change_of(
     x: float,
     deviation: float,
 ) -> ChangePoint:
-    """A change of one known parameter, from ``onset`` on: what it does to the pixels."""
+    """A change of one known parameter, from ``onset`` on, with its effect on the pixels."""
     frames = _frames_of(_Candidate(one, True, onset, 0.0), views, onset)
     rows = frames[problem.data.stop]
     part = problem.select(rows)
@@ -388,7 +389,7 @@ def change_of(
 def _likely_changes(
     problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], middle: int
 ) -> list[ChangePoint]:
-    """The changes of the largest gain to first order, significant or not, estimated in full, the likeliest first."""
+    """The changes of largest first-order gain, significant or not, estimated in full, the most likely first."""
     here = problem.residuals_at(start_state(problem))
     candidates = [_first_order(problem, views, one, here, middle) for one in tested]
     price = math.log(here.size)
@@ -398,8 +399,8 @@ def _likely_changes(
 
 
 def _lasting(problem: ExaminedFrames, views: RecordedViews, one: ChangePoint, price: float) -> ChangePoint:
-    """A change of stamps as one that is there throughout, where an onset explains less beside that than its ``price``:
-    frames of a rest say nothing of stamps.
+    """A change of stamps as one of all frames, unless an onset explains more than its ``price`` in addition:
+    frames at rest carry no information on stamps.
     """
     if one.hypothesis.kind != "stamps" or one.throughout:
         return one
@@ -420,8 +421,8 @@ def _by_frame(problem: ExaminedFrames, frames: int, rows: FloatArray) -> FloatAr
 def _first_order(
     problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, here: FloatArray, middle: int
 ) -> _Candidate:
-    """The onset, to a block of frames, at which a hypothesis explains most: later frames changed where it is after
-    ``middle``, else earlier ones; of stamps either.
+    """The best onset of a hypothesis, to a block of frames: later frames are changed if it is after
+    ``middle``, else earlier ones; for stamps either.
     """
     concerned = frames_concerned(one, views)
     slopes = change_jacobian(problem, (one.change,), np.zeros(one.change.size), here)
@@ -444,7 +445,7 @@ def _first_order(
     if one.kind == "stamps":
         best = _Candidate(one, True, 0, float(later[0]))
     for k, onset in enumerate(onsets.tolist()):
-        # A model that is learnt at rest is of no stamps.
+        # A model that was learnt at rest does not depend on stamps.
         for after in (True, False) if one.kind == "stamps" else (onset > middle,):
             gain = float(later[k + 1] if after else before[k])
             if gain > best.gain:
@@ -453,8 +454,9 @@ def _first_order(
 
 
 def _gains(moment: FloatArray, information: FloatArray, shared: FloatArray, *, across: FloatArray) -> FloatArray:
-    """Reduction (b,) of chi-square by a change of the frames that ``moment`` (b, q), ``information`` (b, q, q) and
-    ``shared`` (b, q, p) are sums of, beside the model's uncertainty, which ``across`` (p,) is the residuals' share in.
+    """Reduction (b,) of chi-square by a change of some frames, beside the model's uncertainty. ``moment`` (b, q),
+    ``information`` (b, q, q) and ``shared`` (b, q, p) are sums over these frames; ``across`` (p,): projection of the
+    residuals on the uncertainty.
     """
     moment = moment - shared @ across
     information = information - shared @ shared.transpose(0, 2, 1)
@@ -466,7 +468,7 @@ def _gains(moment: FloatArray, information: FloatArray, shared: FloatArray, *, a
 
 
 def _frames_of(one: _Candidate, views: RecordedViews, onset: int) -> BoolArray:
-    """Which frames (f,) show a change."""
+    """Mask (f,) of the frames that show a change."""
     index = np.arange(len(views.camera))
     shown = index >= onset if one.after else index < onset
     mine = np.zeros(len(index), dtype=bool)
@@ -475,7 +477,7 @@ def _frames_of(one: _Candidate, views: RecordedViews, onset: int) -> BoolArray:
 
 
 def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> ChangePoint:
-    """A candidate estimated in full, with the onset at which it then explains most."""
+    """A candidate estimated in full, with its best onset after that."""
     here = problem.residuals_at(start_state(problem))
     change, onset, x = one.hypothesis.change, one.onset, None
     span = (onset, onset)
@@ -486,7 +488,7 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
         estimate = estimate_changes(part, (change,), x)
         x, last = estimate.x, onset
         if one.after and one.onset == 0 and onset == 0:
-            break  # there throughout
+            break  # present throughout
         changed = problem.residuals_at(changed_state(problem, (change,), x))
         onset, span = _onset(problem, views, one, here**2 - changed**2, onset)
         if onset == last:
@@ -494,7 +496,7 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
     frames = _frames_of(one, views, onset)
     rows = frames[problem.data.stop]
     part = problem.select(rows)
-    # Beside what all frames tell of the model: those that are changed leave more of it open.
+    # With the model constrained by all frames: the changed ones alone determine it less well.
     whole = partly_changed(problem, rows)
     estimate = estimate_changes(whole, (change,), x)
     ratio = float(here @ problem.whitened(here)) - estimate.chi2
@@ -505,7 +507,7 @@ def _refined(problem: ExaminedFrames, views: RecordedViews, one: _Candidate) -> 
 
 
 def change_effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: FloatArray) -> FloatArray:
-    """Change (r, 2) [px] of the pixels, observed less predicted, by changes ``x`` (q,)."""
+    """Change (r, 2) [px] of the pixels, observed minus predicted, by changes ``x`` (q,)."""
     plain = replace(part, joint_slopes=np.zeros((0, len(part.order))))
     changed = plain.residuals_at(changed_state(plain, changes, x))
     apart = (changed - plain.residuals_at(start_state(plain))).reshape(-1, 2)
@@ -515,7 +517,7 @@ def change_effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: Flo
 def _onset(
     problem: ExaminedFrames, views: RecordedViews, one: _Candidate, gains: FloatArray, last: int
 ) -> tuple[int, tuple[int, int]]:
-    """The onset at which a change explains most, by what it gains in each row, and the span of those not excluded."""
+    """The best onset of a change, from its gain in each row, and the span of onsets that are not excluded."""
     frames = len(views.camera)
     gain = _by_frame(problem, frames, gains)
     concerned = frames_concerned(one.hypothesis, views)
@@ -529,9 +531,9 @@ def _onset(
 
 
 def _correlation(problem: ExaminedFrames, views: RecordedViews, found: ChangePoint) -> float:
-    """How much the noise along a change adds up from frame to frame, over what independent frames would: 1 at least.
+    """Variance of the noise along a change, over that of independent frames, at least 1: correlation between frames.
 
-    Errors of the joints that change with their positions do; by sums over blocks of frames.
+    Joint errors that change with position cause it; estimated from sums over blocks of frames.
     """
     state = changed_state(problem, (found.hypothesis.change,), found.x)
     here = problem.residuals_at(start_state(problem))

@@ -1,5 +1,5 @@
-"""Examination of a recording of joints and pictures: a model learnt from it, and what has happened to cameras, joints,
-stamps and frames, each with its onset, size and deviation.
+"""Examination of a recording of joints and images: a model learnt from it, and the changes of cameras, joints,
+stamps and frames, each with its onset, size and standard deviation.
 """
 
 from __future__ import annotations
@@ -57,20 +57,20 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 PUT_BACK = 2
-"""Times that the pixels of a camera that moved are put back by a model, and it is learnt again."""
+"""Rounds of removing a moved camera's displacement from its pixels by a model, and learning the model again."""
 MENDS, TRIED = 2, 2
-"""Times that something is taken back, and changes that are tried for each."""
+"""Most changes that are removed before learning, and number of candidates tried for each."""
 FREE = 30.0
-"""Deviations of the model that count as one: what a change of the model explains says nothing."""
+"""Factor on the model's standard deviations with which it counts as free: effects of a model error prove nothing."""
 ALIKE = 0.98
-"""Share of what a change explains from which another one, from the same frames on, is not told apart from it."""
+"""Ratio of explained chi-square from which another hypothesis of the same onset is indistinguishable."""
 EXPLAINS = 0.05
-"""Share of chi-square that a change must explain beside the model to be tried."""
+"""Least share of chi-square that a change must explain beside the model to be tried."""
 
 
 class _Step(NamedTuple):
-    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; ``share`` of chi-square it explains,
-    ``beside`` another hypothesis that explains nearly as much.
+    """Change of one parameter from frame ``onset`` on, ``span`` not excluded; explained ``share`` of chi-square,
+    ``beside``: another hypothesis that explains nearly as much.
     """
 
     hypothesis: Hypothesis
@@ -83,7 +83,7 @@ class _Step(NamedTuple):
 
 
 def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
-    """Recording, with stamps and joints put right, the model learnt from it, and what was taken back. Raises
+    """Recording with corrected stamps and joints, the model learnt from it, and the changes that were removed. Raises
     LearningError, CalibrationError (``bad_data``, ``too_few_stops``).
     """
     try:
@@ -108,10 +108,10 @@ def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, Reference
 
 
 def _learnt_beside_step(views: RecordedViews) -> ReferenceModel | None:
-    """The model of an arm and its cameras as they were first, where one of these moved while the arm is learnt, its
-    later pixels put back; None where none did, or more than noise is left.
+    """Model of an arm and its cameras in their initial state, if one camera moved while the arm is learnt, with that
+    camera's later pixels corrected; None if none moved, or more than noise is left.
 
-    First along a homography, then by the camera's motion as the model so learnt tells it.
+    The correction is first a homography, then the camera's motion estimated with the model so learnt.
     """
     camera = moved_camera(views) if views.generators is None else None
     if camera is None or (step := step_of_camera(views, camera)) is None:
@@ -125,7 +125,7 @@ def _learnt_beside_step(views: RecordedViews) -> ReferenceModel | None:
 
 
 def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onset: int) -> RecordedViews:
-    """The recording with a camera's pixels from a frame on as they would be had it not moved, by a model."""
+    """The recording with a camera's motion, estimated by a model, removed from its pixels from frame ``onset`` on."""
     problem = examined_frames(reference.model, views, reference.noise_factor)
     name = views.cameras[camera].name
     one = next(h for h in hypotheses(reference.model, views, problem) if (h.kind, h.subject) == ("camera", name))
@@ -139,9 +139,9 @@ def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onse
 
 
 def _better(views: RecordedViews, reference: ReferenceModel) -> tuple[RecordedViews, ReferenceModel, _Step] | None:
-    """Recording and model without the change that explains most, None where the model is no better without."""
+    """Recording and model without the change that explains most; None if the model is no better without it."""
     model, problem = _freed(views, reference)
-    # What is learnt at rest does not depend on stamps.
+    # A model learnt at rest does not depend on stamps.
     kinds = ("joint",) if reference.at_rest else ("joint", "stamps")
     steps = [_step(problem, views, one) for one in hypotheses(model, views, problem) if one.kind in kinds]
     for step in sorted(steps, key=lambda one: -one.share)[:TRIED]:
@@ -174,7 +174,7 @@ def _learnt(views: RecordedViews) -> ReferenceModel | None:
 
 
 def _freed(views: RecordedViews, reference: ReferenceModel) -> tuple[CellModel, ExaminedFrames]:
-    """The model without errors of its joints, and the problem of all frames with that model free to change."""
+    """The model without errors of its joints, and the problem of all frames with that model nearly free."""
     exact = msgspec.structs.replace(reference.model, joint_accuracy=None)
     problem = examined_frames(exact, views, reference.noise_factor)
     root = FREE * problem.root
@@ -182,7 +182,7 @@ def _freed(views: RecordedViews, reference: ReferenceModel) -> tuple[CellModel, 
 
 
 def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset: int | None = None) -> _Step:
-    """The onset of a hypothesis of one parameter that explains most, of every frame or as given (Rao's score test)."""
+    """Best onset of a hypothesis of one parameter, over all frames or as given (Rao's score test)."""
     here = problem.residuals_at(start_state(problem))
     slope = change_jacobian(problem, (one.change,), np.zeros(1), here)[:, 0]
     concerned = frames_concerned(one, views)
@@ -215,8 +215,8 @@ def _step(problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, onset:
 
 
 def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> ChangePoint:
-    """What was taken back as a change point of the recording as it now is; what is then still left of it, to first
-    order, is part of its deviation.
+    """A removed change as a change point of the corrected recording; its remaining part, to first order,
+    is included in the deviation.
     """
     problem = examined_frames(reference.model, views, reference.noise_factor)
     model, free = _freed(views, reference)
@@ -227,7 +227,7 @@ def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> Cha
     report = reference.report
     for joint in () if report is None else report.joints:
         if (one.kind, one.subject) == ("joint", joint.name):
-            # What its readings err by where it stands is not averaged out.
+            # The reading error at its position does not average out.
             deviation = float(np.hypot(deviation, np.hypot(joint.random, joint.repeatable)))
     found = change_of(problem, views, one, step.onset, step.span, step.x, deviation)
     return replace(found, runner_up=step.beside)
@@ -235,17 +235,17 @@ def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> Cha
 
 MOST_CHANGES = 8
 SAME_ONSET = 4
-"""Frames within which two onsets are one."""
+"""Number of frames within which two onsets count as equal."""
 CANCEL, OPEN_S = 5.0, 1e-3
-"""Deviations, or [s], up to which the sum of two changes of stamps is none."""
+"""Standard deviations, or [s], up to which the sum of two changes of stamps counts as zero."""
 AWAY = 0.2
-"""Share of its largest distance from its median from which a joint is away from it."""
+"""Share of its largest distance from its median from which a joint counts as displaced."""
 MOST_GAPS = 20
-"""Gaps of a camera's frames that are listed."""
+"""Most gaps of a camera's frames that are listed."""
 UNLIKELY = 18.4
 """Chi-square of a pixel that noise exceeds once in 10 000."""
 UNKNOWN_S = 0.05
-"""Deviation [s] from which the offset of a camera's stamps is not known."""
+"""Standard deviation [s] above which the offset of a camera's stamps counts as unknown."""
 
 RecordingCauseKind = Literal[
     "camera_moved", "cameras_moved", "body_moved", "marker_slipped", "joint_zero", "late_stamps", "dropped_frames",
@@ -264,15 +264,15 @@ _REFUSALS: dict[str, RecordingCauseKind] = {
     "camera_moved": "camera_moved",
     "marker_slipped": "marker_slipped",
 }
-"""Refusals of a fit that are causes by themselves."""
+"""Failures of a fit that are causes by themselves."""
 
 _Gaps = dict[str, list[Gap] | None]
 
 
 class Onset(msgspec.Struct, frozen=True):
-    """First frame of what has happened: ``frame`` counts those of ``camera`` from 0, ``earliest`` and ``latest``
-    (likewise) are those that the data do not exclude. ``after_s``: stamp of the camera's last frame before it; both
-    [s] as stamped. ``in_episode``: the frame counted from the first of its ``episode``.
+    """First frame affected by a change: ``frame`` counts those of ``camera`` from 0; ``earliest`` and ``latest``
+    (likewise) are the limits that the data do not exclude. ``time_s``: its stamp; ``after_s``: stamp of the camera's
+    last frame before it; both [s] as stamped. ``in_episode``: the frame counted from the first of its ``episode``.
     """
 
     camera: str
@@ -286,10 +286,10 @@ class Onset(msgspec.Struct, frozen=True):
 
 
 class RecordingCause(msgspec.Struct, frozen=True):
-    """What has happened. ``onset``: None where it is there throughout. ``episodes``: those in which frames differ by it
-    from what the model was learnt from, before the onset where that was learnt after it. ``value`` with ``deviation``
-    [``unit``]; ``effect_px``: rms change of the pixels. ``or_else``: what explains the data nearly as well, and
-    ``tells_apart`` what would decide.
+    """A cause found in a recording. ``onset``: None if it is present throughout. ``episodes``: those whose frames
+    differ from the model by it, before the onset if the model was learnt after it. ``value`` with ``deviation``
+    [``unit``]; ``effect_px``: rms change of the pixels. ``or_else``: a cause that explains the data nearly as well, and
+    ``tells_apart``: observations that would distinguish them.
     """
 
     kind: RecordingCauseKind
@@ -307,8 +307,8 @@ class RecordingCause(msgspec.Struct, frozen=True):
 
 
 class CameraResiduals(msgspec.Struct, frozen=True):
-    """Of a camera: its ``frames``, residuals rms [px] beside the causes, ``dropped`` frames (None: cannot be told), and
-    by how much later [s] than stamped its pictures are, with the deviation; None where no motion shows it.
+    """Results for a camera: its ``frames``, residuals rms [px] with the causes removed, ``dropped`` frames (None if
+    unknown), and the delay [s] of its images after their stamps, with its deviation; None if no motion shows it.
     """
 
     frames: int
@@ -319,11 +319,11 @@ class CameraResiduals(msgspec.Struct, frozen=True):
 
 
 class RecordingReport(msgspec.Struct, frozen=True):
-    """Result of an examination. Residuals rms [px] an axis beside the causes found, ``before_px`` with them.
+    """Result of an examination. Residuals rms [px] per axis with the causes found removed, ``before_px`` without.
 
     ``joints``: of the frames in which a joint is away from its median. ``learnt_from``: first and last frame (of all),
-    stops.
-    ``false_alarm``: probability that a recording to which nothing has happened is said to have any change.
+    number of stops.
+    ``false_alarm``: probability that any change is reported for an unchanged recording.
     """
 
     rms_px: float | None
@@ -341,8 +341,8 @@ class RecordingReport(msgspec.Struct, frozen=True):
 
 
 def examine_views(views: RecordedViews) -> RecordingReport:
-    """The report on a recording. Raises CalibrationError (``bad_data``, ``too_few_stops``, ``too_few_cameras``) for one
-    that nothing can be learnt from.
+    """The report on a recording. Raises CalibrationError (``bad_data``, ``too_few_stops``, ``too_few_cameras``) if
+    nothing can be learnt from it.
     """
     lost = _dropped(views)
     dropped = {camera.name: gaps(views, c) for c, camera in enumerate(views.cameras)}
@@ -388,7 +388,7 @@ def _learnt_from(reference: ReferenceModel) -> tuple[int, int, int] | None:
 def _offsets(
     problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], offsets: FloatArray
 ) -> list[ChangePoint]:
-    """Offsets (c,) [s] of stamps that were put right before the model was learnt, as changes."""
+    """Offsets (c,) [s] of stamps that were corrected before the model was learnt, as changes."""
     return [
         change_of(problem, views, one, 0, (0, 0), float(offsets[c]), LEAST_DEVIATION_S)
         for c, camera in enumerate(views.cameras)
@@ -399,7 +399,7 @@ def _offsets(
 
 
 def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
-    """Changes of one parameter with those that only add to them: of the same subject, from the same frame on."""
+    """Changes of one parameter, added up for the same subject and onset."""
     kept: list[ChangePoint] = []
     for one in found:
         same = [
@@ -418,7 +418,7 @@ def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
             kept[same[0]] = replace(other, x=x, effect=effect, covariance=one.covariance)
         else:
             kept.append(one)
-    # What was put right and was not wrong is found with the opposite sign.
+    # An unnecessary correction is found again with the opposite sign.
     kept = [one for one in kept if one.hypothesis.kind != "stamps" or one.effect_px >= LEAST_PX]
     for early in [one for one in kept if one.hypothesis.kind == "stamps" and not one.after]:
         for k, one in enumerate(kept):
@@ -437,7 +437,7 @@ def _merged(found: list[ChangePoint]) -> list[ChangePoint]:
 
 
 def _cancel(one: ChangePoint, other: ChangePoint) -> bool:
-    """Whether two changes of stamps add to nothing."""
+    """Whether two changes of stamps add up to zero."""
     spread = float(np.sqrt(one.covariance[0, 0] + other.covariance[0, 0]))
     return abs(float(one.x[0] + other.x[0])) <= max(CANCEL * spread, OPEN_S)
 
@@ -447,7 +447,7 @@ def _when(cause: RecordingCause) -> float:
 
 
 def _residuals_px(problem: ExaminedFrames) -> FloatArray:
-    """Residuals (k, 2) [px], predicted less observed, errors of the joints included."""
+    """Residuals (k, 2) [px], predicted minus observed, errors of the joints included."""
     plain = problem.plain_residuals_at(start_state(problem)).reshape(-1, 2)
     return np.asarray(plain * problem.data.sigmas[:, None])
 
@@ -472,7 +472,7 @@ def _without(problem: ExaminedFrames, change: ChangePoint) -> ExaminedFrames:
 
 
 def _onset(views: RecordedViews, frame: int, span: tuple[int, int], camera: int) -> Onset:
-    """An onset at ``frame`` among all frames, told in those of a camera."""
+    """An onset at ``frame`` among all frames, counted in those of a camera."""
     mine = np.flatnonzero(views.camera == camera)
     k, first, last = (min(int(np.searchsorted(mine, one)), len(mine) - 1) for one in (frame, *span))
     before = float(views.stamped[mine[k - 1]]) if k > 0 else None
@@ -493,7 +493,7 @@ def _episodes(views: RecordedViews, frames: BoolArray | IntArray) -> tuple[int, 
 
 
 def _amount(model: CellModel, change: ChangePoint) -> tuple[float | None, float | None, str]:
-    """Size, deviation and unit of a change: of a turn its angle, of the earlier frames seen from the later ones."""
+    """Size, deviation and unit of a change: for a rotation its angle, for earlier frames relative to later ones."""
     x, covariance = change.x, change.covariance
     one = change.hypothesis
     sign = 1.0 if change.after else -1.0
@@ -582,7 +582,7 @@ def _dropped(views: RecordedViews) -> list[RecordingCause]:
 
 
 def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
-    """Errors of the joints' readings, or of the poses, that the model found where it was learnt and scatters by."""
+    """Errors of the joints' readings, or of the poses, that the model found in its own data."""
     joints = () if reference.report is None else reference.report.joints
     errors = {one.name: float(np.linalg.norm([one.random, one.repeatable, one.posture])) for one in joints}
     if reference.fits or not errors:
@@ -605,7 +605,7 @@ def _joint_errors(reference: ReferenceModel) -> list[RecordingCause]:
 
 
 def _unexplained(model: CellModel, views: RecordedViews, problem: ExaminedFrames) -> list[RecordingCause]:
-    """What is left beside the causes, where it is no noise."""
+    """Remaining residuals beside the causes, if they are not noise."""
     here = problem.residuals_at(start_state(problem))
     chi2 = float(here @ problem.whitened(here))
     if not is_unexplained(chi2, here.size, math.log(FALSE_ALARM), NOISE_MARGIN**2 * here.size):
@@ -639,8 +639,8 @@ def _times(ratio: float) -> str:
 def _not_learnt(
     views: RecordedViews, failed: LearningError, lost: list[RecordingCause], dropped: _Gaps
 ) -> RecordingReport:
-    """The report where no model can be learnt: a camera that moved meanwhile, else the refusal of the fit is the cause,
-    with the frame of its stop.
+    """The report if no model can be learnt: the cause is a camera that moved, else the failure of the fit, with the
+    frame of its stop.
     """
     error = failed.error
     names = [camera.name for camera in views.cameras]
@@ -650,7 +650,7 @@ def _not_learnt(
         kind, camera = "camera_moved", names[alone]
     onset = _refused_from(views, failed, names.index(camera) if camera in names else None)
     if kind == "camera_moved":
-        # The stops that the refusal names may be some beside the step.
+        # The stops named by the failure may be some near the step.
         message = f"camera {camera} moved: all markers jump in its pictures and stay off, in no other camera"
     if onset is not None:
         message += f"; from frame {onset.frame} of camera {onset.camera} on ({_stamp(views, onset)})"
@@ -666,7 +666,7 @@ def _not_learnt(
 
 
 def _refused_from(views: RecordedViews, failed: LearningError, camera: int | None) -> Onset | None:
-    """Onset of what a fit was refused for: of a camera, or a marker, told by its pixels; else of the stop named."""
+    """Onset of the cause of a failed fit: of a camera, or a marker, from its pixels; else from the stop named."""
     error, frames = failed.error, failed.stops.frames
     marker, stop = error.data.get("marker"), error.data.get("stop")
     one = views.marker_ids.index(marker) if marker in views.marker_ids else None
@@ -697,7 +697,7 @@ def _by_camera(
     found: list[ChangePoint],
     dropped: _Gaps,
 ) -> dict[str, CameraResiduals]:
-    """Residuals, offsets and dropped frames of each camera; an offset that was found throughout is part of its own."""
+    """Residuals, offsets and dropped frames of each camera; an offset of all frames is added to its own."""
     late = {one.subject: one for one in tested if one.kind == "stamps"}
     answers = {}
     for c, camera in enumerate(views.cameras):

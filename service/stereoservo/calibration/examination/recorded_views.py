@@ -1,5 +1,5 @@
 """The frames of a recording as residuals of a learnt model, whitened by the errors of the joints and by the model's own
-uncertainty, and what may have happened to them.
+uncertainty, and the hypotheses of changes.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from stereoservo.kinematics.parameterization import Kind
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 AT_REST = 0.01
-"""[rad/s or m/s] Joint speed up to which the arm stands."""
+"""Joint speed [rad/s or m/s] up to which the arm counts as at rest."""
 SAME_INSTANT_S = 1e-3
-"""Frames of several cameras are of one instant where their stamps are no further apart."""
+"""Largest difference of stamps of frames at the same instant."""
 SPEED_OVER_S = 0.02
-"""Half of the time over which joint speeds are taken."""
+"""Half of the interval over which joint speeds are computed."""
 MOVED = 3.0
-"""Times what noise gives, of the squares by which a frame differs from another of its rest that shows another place."""
+"""Ratio to the noise of the squared difference between frames of a rest, above which one shows a different position."""
 LEAST_RESTS = 12
-"""Rests from which a model is learnt from these alone: a late stamp does not matter there."""
+"""Number of rests from which a model is learnt from these alone: late stamps have no effect there."""
 LEAST_RUN = 4
-"""Stops of a single joint's motion."""
+"""Least number of stops in a single joint's motion."""
 ALONE = 1e-3
-"""[rad or m] that the other joints may move meanwhile."""
+"""Largest motion [rad or m] of the other joints during it."""
 MOST_OF_RUN, MOST_FREE = 15, 40
-"""Stops of each single joint's motion, and of all joints, that a model is learnt from."""
+"""Most stops of each single joint's motion, and of all joints, that a model is learnt from."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class RecordedViews:
     """A recording, frames in the order of their stamps.
 
     Joint samples at ``joint_times`` (j,) [s], ``positions`` (j, n) [rad or m]. Frames: ``camera`` (f,) index,
-    ``times`` (f,) [s], ``numbers`` (f,) as counted by the camera, -1 where nothing counts, ``episodes`` (f,),
-    ``pixels`` (f, m, 2) raw [px], NaN where a marker was not seen, ``sigmas`` (f, m) [px]. ``generators`` (n, 4, 4):
-    of an arm that is known, such as that of poses. ``timed``: false where stamps are no times, but an order.
-    ``counted``: whether stamps are a count of frames over their rate, which tells of no drops.
-    ``model``: one that the recording holds, for where none can be learnt. ``added`` (f,) [s]: to the stamps, where
-    these were found wrong. ``body_moves``: whether the markers are also carried by something else than the arm, whose
-    motion is then as one of late stamps. ``notes``: what the reader of the report is to know of the recording.
+    ``times`` (f,) [s], ``numbers`` (f,) as counted by the camera, -1 if not counted, ``episodes`` (f,),
+    ``pixels`` (f, m, 2) raw [px], NaN if a marker was not seen, ``sigmas`` (f, m) [px]. ``generators`` (n, 4, 4):
+    of a known arm, such as that of poses. ``timed``: false if stamps are only an order, not times.
+    ``counted``: whether stamps are a count of frames over their rate, which shows no drops.
+    ``model``: one contained in the recording, used if none can be learnt. ``added`` (f,) [s]: correction of stamps
+    that were found wrong. ``body_moves``: whether the markers are also moved by something other than the arm; that
+    motion has the effect of late stamps. ``notes``: remarks on the recording for the reader of the report.
     """
 
     joint_names: tuple[str, ...]
@@ -87,12 +87,12 @@ class RecordedViews:
 
     @property
     def seen(self) -> BoolArray:
-        """(f, m): which markers each frame shows."""
+        """Mask (f, m) of the markers seen in each frame."""
         return np.asarray(np.isfinite(self.pixels).all(axis=-1))
 
     @property
     def ranks(self) -> IntArray:
-        """Number (f,) of each frame among those of its camera, from 0."""
+        """Index (f,) of each frame among those of its camera, from 0."""
         found = np.zeros(len(self.camera), dtype=np.int64)
         for c in range(len(self.cameras)):
             mine = self.camera == c
@@ -100,11 +100,11 @@ class RecordedViews:
         return found
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Positions (k, n) at ``times`` (k,) [s], interpolated; those of the ends beyond them."""
+        """Positions (k, n) at ``times`` (k,) [s], interpolated; constant beyond the ends."""
         return np.array([np.interp(times, self.joint_times, q) for q in self.positions.T]).T
 
     def speeds(self, times: FloatArray) -> FloatArray:
-        """Fastest joint (k,) [rad/s or m/s] about ``times`` (k,)."""
+        """Speed (k,) [rad/s or m/s] of the fastest joint about ``times`` (k,)."""
         apart = np.abs(self.at(times + SPEED_OVER_S) - self.at(times - SPEED_OVER_S))
         return np.asarray(apart.max(axis=1) / (2.0 * SPEED_OVER_S))
 
@@ -115,14 +115,14 @@ class RecordedViews:
         return replace(self, added=added, **{name: getattr(self, name)[frames] for name in fields})
 
     def shifted(self, late: FloatArray) -> RecordedViews:
-        """The recording with ``late`` (f,) [s] added to its stamps, frames in their order."""
+        """The recording with ``late`` (f,) [s] added to its stamps, frames sorted again."""
         added = late if self.added is None else self.added + late
         times = self.times + late
         return replace(self, times=times, added=added).select(np.argsort(times, kind="stable"))
 
 
 def frames_apart(views: RecordedViews) -> TrialData:
-    """Every frame as a stop of its own, at its own stamp."""
+    """Trial data with every frame as a separate stop, at its own stamp."""
     f, m = views.sigmas.shape
     shape = (len(views.cameras), f, m)
     pixels, sigmas = np.full((*shape, 2), np.nan), np.ones(shape)
@@ -140,8 +140,8 @@ class LearningStops:
 
 
 def learning_stops(views: RecordedViews) -> LearningStops:
-    """Stops that a model can be learnt from: rests, where there are enough of them, else instants at which several
-    cameras took a frame; of each, which joint moved alone.
+    """Stops from which a model can be learnt: rests, if there are enough of them, else instants at which several
+    cameras took a frame; for each, the joint that moved alone.
     """
     instant = instants(views)
     stops = np.unique(instant[instant >= 0])
@@ -169,7 +169,7 @@ def stop_positions(views: RecordedViews, instant: IntArray) -> FloatArray:
 
 
 def _average(views: RecordedViews, frames: IntArray, pixels: FloatArray, sigmas: FloatArray) -> None:
-    """Put the mean of some frames of a camera into ``pixels`` (m, 2), and its deviation into ``sigmas`` (m,)."""
+    """Write the mean of some frames of a camera into ``pixels`` (m, 2), and its deviation into ``sigmas`` (m,)."""
     known = views.seen[frames]
     count = known.sum(axis=0)
     some = count > 0
@@ -197,11 +197,11 @@ def _trials(
 
 
 def instants(views: RecordedViews) -> IntArray:
-    """Number (f,) of the instant that each frame is of: of a rest, where there are enough, -1 in motion."""
+    """Number (f,) of each frame's instant: of its rest, if there are enough, with -1 in motion."""
     if views.timed and len(views.times) > 1:
         still = views.speeds(views.times) <= AT_REST
         began = still & ~np.concatenate([[False], still[:-1]])
-        # From one rest to the next the arm may have moved between two frames.
+        # Between two rests the arm may have moved between two frames.
         there = views.at(views.times)
         jumped = np.abs(np.diff(there, axis=0)).max(axis=1) > ALONE
         began |= still & np.concatenate([[False], jumped])
@@ -213,8 +213,8 @@ def instants(views: RecordedViews) -> IntArray:
 
 
 def _standing(rests: IntArray, views: RecordedViews) -> IntArray:
-    """Rests (f,) without the frames that show another place than the one nearest to the middle of the rest, in their
-    camera: where stamps are wrong, the first or the last ones show motion.
+    """Rests (f,) without the frames whose markers differ from those nearest to the middle of the rest, by
+    camera: with wrong stamps, the first or the last ones show motion.
     """
     kept = rests.copy()
     for rest in range(int(rests.max()) + 1):
@@ -233,7 +233,7 @@ def _standing(rests: IntArray, views: RecordedViews) -> IntArray:
 
 
 def single_joint_motions(positions: FloatArray) -> IntArray:
-    """Joint (s,) that moved alone about each of the stops at ``positions`` (s, n), -1 where several did or none."""
+    """Joint (s,) that moved alone about each of the stops at ``positions`` (s, n), -1 if several did or none."""
     alone = np.full(len(positions), -1)
     for begin, end in _runs(positions):
         moved = np.ptp(positions[begin:end], axis=0)
@@ -243,7 +243,7 @@ def single_joint_motions(positions: FloatArray) -> IntArray:
 
 
 def _runs(positions: FloatArray) -> Iterator[tuple[int, int]]:
-    """Stretches of stops over which at most one joint moves."""
+    """Runs of stops over which at most one joint moves."""
     begin = 0
     for k in range(1, len(positions) + 1):
         if k == len(positions) or (np.ptp(positions[begin : k + 1], axis=0) > ALONE).sum() > 1:
@@ -252,23 +252,23 @@ def _runs(positions: FloatArray) -> Iterator[tuple[int, int]]:
 
 
 def _thinned(alone: IntArray) -> IntArray:
-    """Indices of the stops to learn from: some of each joint's motion, some of all others'."""
+    """Indices of the stops to learn from: some of each joint's motion, some of all others."""
     kept = []
     for joint in np.unique(alone).tolist():
         mine = np.flatnonzero(alone == joint)
         most = MOST_OF_RUN if joint >= 0 else MOST_FREE
-        # Of poses and known arms all stops are free.
+        # For poses and known arms all stops are free.
         most = most if (alone >= 0).any() else 3 * MOST_FREE
         kept.append(mine[np.unique(np.linspace(0, len(mine) - 1, min(most, len(mine))).round().astype(int))])
     return np.sort(np.concatenate(kept)) if kept else np.zeros(0, dtype=np.int64)
 
 
 GAP, JITTERS = 1.5, 6.0
-"""A gap is longer than so many periods, and than a period by so many times the stamps' scatter."""
+"""Least length of a gap, in periods, and its excess over a period, in multiples of the stamps' scatter."""
 REGULAR, NEAR = 0.8, 0.25
-"""Share of the intervals that must be within a share of the period for there to be one."""
+"""Share of the intervals that must be near the period for it to exist, and their largest relative distance from it."""
 CREDIBLE = 9.2
-"""Difference of chi-square within which another onset is not excluded: odds of 100 to 1."""
+"""Difference of chi-square up to which another onset is not excluded: odds of 100 to 1."""
 
 
 class Gap(NamedTuple):
@@ -279,8 +279,8 @@ class Gap(NamedTuple):
 
 
 def probable_onset(gains: FloatArray) -> tuple[int, int, int]:
-    """Median onset, and the first and last that are not excluded, of those (b,) that explain ``gains`` of chi-square:
-    all are equally likely beforehand.
+    """Median onset, and the first and last that are not excluded, from the chi-square ``gains`` (b,) of all onsets,
+    which are equally likely a priori.
     """
     likely = np.cumsum(np.exp(0.5 * (gains - gains.max())))
     near = np.flatnonzero(gains >= gains.max() - CREDIBLE)
@@ -288,13 +288,13 @@ def probable_onset(gains: FloatArray) -> tuple[int, int, int]:
 
 
 def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
-    """Gaps in a camera's frames; None where these have neither numbers nor a period."""
+    """Gaps in a camera's frames; None if these have neither numbers nor a period."""
     mine = np.flatnonzero(views.camera == camera)
     same = np.diff(views.episodes[mine]) == 0
     numbers = views.numbers[mine]
     if (numbers >= 0).all() and len(mine) > 1:
         counted = np.diff(numbers)
-        # A stream of every second frame, or fourth, has dropped none.
+        # A stream of every second frame, or fourth, has no drops.
         every = max(1, int(np.median(counted[same]))) if same.any() else 1
         missing = np.round(counted / every).astype(np.int64) - 1
     else:
@@ -306,7 +306,7 @@ def gaps(views: RecordedViews, camera: int) -> list[Gap] | None:
 
 
 def _missing(intervals: FloatArray, same: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> IntArray | None:
-    """Frames missing in each interval (k,); None where there is no period."""
+    """Frames missing in each interval (k,); None if there is no period."""
     if same.sum() < 3:
         return None
     period = float(np.median(intervals[same]))
@@ -322,12 +322,12 @@ def _missing(intervals: FloatArray, same: np.ndarray[tuple[int], np.dtype[np.boo
 HypothesisKind = Literal["camera", "cameras", "body", "marker", "joint", "stamps"]
 
 LOOSE = 1e3
-"""Deviations of its estimate within which a cause that was found is left free."""
+"""Standard deviations by which a detected cause is left free."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may have happened: a ``change`` of the model, or of the stamps of a camera (its ``subject``, "" for all)."""
+    """A hypothetical ``change`` of the model, or of the stamps of a camera (its ``subject``, "" for all)."""
 
     kind: HypothesisKind
     subject: str
@@ -336,9 +336,9 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class ExaminedFrames(LinearisedProblem):
-    """Problem whose stops are frames, its rows in the order of these. ``root`` (2 k, p) of the covariance that the
-    model's uncertainty adds to the residuals. ``joint_slopes`` (2 k, n): by the errors of the joints, in their standard
-    deviations; residuals are whitened of what these have in common in a frame.
+    """Problem whose stops are frames, with rows sorted by frame. ``root`` (2 k, p) of the covariance that the
+    model's uncertainty adds to the residuals. ``joint_slopes`` (2 k, n): derivatives by the errors of the joints, in
+    their standard deviations; residuals are whitened of these common errors of a frame.
     """
 
     root: FloatArray
@@ -346,7 +346,7 @@ class ExaminedFrames(LinearisedProblem):
 
     @cached_property
     def _whiteners(self) -> tuple[IntArray, FloatArray]:
-        """Of each row its place (2 k,) in a padded table of frames (f, w), and matrices (f, w, w) that whiten it."""
+        """Index (2 k,) of each row in a padded table of frames (f, w), and whitening matrices (f, w, w)."""
         frame = np.repeat(self.data.stop, 2)
         _, begin, which = np.unique(frame, return_index=True, return_inverse=True)
         place = np.arange(len(frame)) - begin[which]
@@ -358,7 +358,7 @@ class ExaminedFrames(LinearisedProblem):
 
     @cached_property
     def _undrifted(self) -> FloatArray:
-        """Displacements (f, 4, 4) of the body where no joint has drifted."""
+        """Displacements (f, 4, 4) of the body without drift of the joints."""
         return displacements(self.rig, self.data.offsets)
 
     def plain_residuals_at(self, state: State) -> FloatArray:
@@ -373,7 +373,7 @@ class ExaminedFrames(LinearisedProblem):
         return self.without_joint_errors(self.plain_residuals_at(state)[:, None])[:, 0]
 
     def without_joint_errors(self, rows: FloatArray) -> FloatArray:
-        """Rows (2 k, q) whitened frame by frame."""
+        """Rows (2 k, q) whitened of joint errors frame by frame."""
         if not self.joint_slopes.size:
             return rows
         place, whiteners = self._whiteners
@@ -389,8 +389,8 @@ class ExaminedFrames(LinearisedProblem):
         return replace(self, data=self.data.select(keep), root=root, uncertainty=bounded(root), joint_slopes=slopes)
 
     def explained(self, rows: BoolArray, effect: FloatArray, slopes: FloatArray) -> ExaminedFrames:
-        """The problem where an ``effect`` (r, 2) [px] is removed from the pixels of ``rows`` (k,), along whose
-        ``slopes`` (2 k, q), in deviations of the estimate, they then say nothing.
+        """The problem with an ``effect`` (r, 2) [px] removed from the pixels of ``rows`` (k,), which then carry no
+        information along its ``slopes`` (2 k, q), in deviations of the estimate.
         """
         pixels = self.data.pixels.copy()
         pixels[rows] -= effect
@@ -400,7 +400,7 @@ class ExaminedFrames(LinearisedProblem):
 
 @dataclass(frozen=True)
 class PartlyChanged(ExaminedFrames):
-    """All frames, of which a changed state is that of some alone: those of the rows ``changed`` (k,)."""
+    """All frames, where a changed state applies only to some: those of the rows ``changed`` (k,)."""
 
     changed: BoolArray
 
@@ -413,7 +413,7 @@ class PartlyChanged(ExaminedFrames):
 
 
 def partly_changed(problem: ExaminedFrames, changed: BoolArray) -> PartlyChanged:
-    """The problem in which a change is one of some rows (k,), whole frames."""
+    """The problem in which a change applies to some rows (k,) only, whole frames."""
     parts = {field.name: getattr(problem, field.name) for field in fields(problem)}
     return PartlyChanged(**parts, changed=changed)
 
@@ -436,10 +436,10 @@ def examined_frames(model: CellModel, views: RecordedViews, noise_factor: float)
 
 
 def hypotheses(model: CellModel, views: RecordedViews, problem: ExaminedFrames) -> list[Hypothesis]:
-    """All that may have happened: changes of the model, and where stamps are times, late ones.
+    """All hypotheses: changes of the model, and late stamps if stamps are times.
 
-    Of an arm whose displacements are given the joints have no zeros of their own; what moved is then the body or all
-    cameras. Of a body that moves by itself stamps are not asked for.
+    An arm given by its displacements has no joint zeros of its own: the body or all cameras may have moved instead. For
+    a body that moves by itself late stamps are not tested.
     """
     found = [
         Hypothesis(change.kind, change.subject, change)
@@ -455,7 +455,7 @@ def hypotheses(model: CellModel, views: RecordedViews, problem: ExaminedFrames) 
 
 
 def _late(views: RecordedViews, problem: ExaminedFrames, subject: str, frames: BoolArray) -> Hypothesis:
-    """Stamps of some frames (f,) that are early or late by one parameter [s] that is added to them."""
+    """Hypothesis that the stamps of some frames (f,) are early or late by one parameter [s], which is added to them."""
     order, there = list(problem.order), views.at(views.times)
 
     def apply(state: State, x: FloatArray) -> State:
@@ -466,15 +466,15 @@ def _late(views: RecordedViews, problem: ExaminedFrames, subject: str, frames: B
 
 
 def corrected_views(views: RecordedViews, one: Hypothesis, frames: BoolArray, x: float) -> RecordedViews | None:
-    """The recording as it would be without a change ``x`` of a joint's zero, or of stamps, in ``frames`` (f,); None
-    where it is a change of another kind.
+    """The recording without a change ``x`` of a joint's zero, or of stamps, in ``frames`` (f,); None
+    for a change of another kind.
     """
     if one.kind == "stamps":
         return views.shifted(np.where(frames, x, 0.0))
     if one.kind != "joint" or not frames.any():
         return None
     shown = views.times[frames]
-    # Those included between which the joints of the first and the last of the frames are interpolated.
+    # Including the samples between which the joints of the first and the last frame are interpolated.
     begin = int(np.searchsorted(views.joint_times, shown[0], side="right")) - 1
     end = int(np.searchsorted(views.joint_times, shown[-1]))
     index = np.arange(len(views.joint_times))
@@ -485,7 +485,7 @@ def corrected_views(views: RecordedViews, one: Hypothesis, frames: BoolArray, x:
 
 
 def frames_concerned(hypothesis: Hypothesis, views: RecordedViews) -> IntArray:
-    """Indices of the frames that show the change: of one camera, or all."""
+    """Indices of the frames that the change may affect: of one camera, or all."""
     names = [camera.name for camera in views.cameras]
     if hypothesis.kind in ("camera", "stamps") and hypothesis.subject:
         return np.flatnonzero(views.camera == names.index(hypothesis.subject))

@@ -1,5 +1,5 @@
-"""The model that a recording is examined with: learnt from the stretch of it that fits best, since something may have
-happened in the rest.
+"""The model with which a recording is examined: learnt from the part of it that fits best, since the rest may contain
+a change.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 SOUGHT_S, GRID_S = 0.2, 0.02
-"""Offsets that are tried, to either side, and their distance."""
+"""Largest offset that is tried in either direction, and the spacing of the offsets."""
 TOLD_S = 2e-3
-"""Offsets below are left to the examination, which knows the cameras."""
+"""Smaller offsets are estimated by the examination, which uses the calibrated cameras."""
 MARKERS = 4
-"""Those seen most often are used."""
+"""Number of markers that are used, those seen most often."""
 WEIGHED = 3
-"""Times that the depths are put into the weights again."""
+"""Rounds of recomputing the weights from the depths."""
 SPARE = 2.0
-"""Rows for each unknown below which nothing is told."""
+"""Least number of rows per unknown."""
 
 
 class Course(NamedTuple):
-    """Of some frames: ``offsets`` (c,) [s] by which each camera's pictures are later than stamped, and the mean square
-    [sigmas²] that is left then, of the worst camera.
+    """Result for some frames: ``offsets`` (c,) [s] of each camera's images after their stamps, and the remaining mean
+    square [sigmas²] of the worst camera.
     """
 
     offsets: FloatArray
@@ -51,10 +51,10 @@ class Course(NamedTuple):
 
 
 def course(views: RecordedViews, frames: IntArray) -> Course:
-    """The course of ``frames`` (k,) of a recording whose displacements are known.
+    """The `Course` of ``frames`` (k,) of a recording with known displacements.
 
-    A pixel is a ratio of linear forms in the entries of the body's displacement, whatever camera and marker are:
-    fitted to each marker at the displacements of many offsets (direct linear transformation, depths as weights).
+    A pixel is a ratio of linear forms in the entries of the body's displacement, for any camera and marker: fitted
+    to each marker at the displacements of many offsets (direct linear transformation, depths as weights).
     """
     offsets, left = np.zeros(len(views.cameras)), 0.0
     grid = np.arange(-SOUGHT_S, SOUGHT_S + 0.5 * GRID_S, GRID_S) if views.timed else np.zeros(1)
@@ -76,8 +76,8 @@ def course(views: RecordedViews, frames: IntArray) -> Course:
 
 
 def _misfit(views: RecordedViews, mine: IntArray, late: float) -> float:
-    """Mean square [sigmas²] that is left of the pixels of frames ``mine`` at displacements ``late`` [s] after them;
-    infinite from too few.
+    """Mean squared residual [sigmas²] of frames ``mine`` at displacements ``late`` [s] after them;
+    infinite for too few.
     """
     seen = views.seen[mine]
     forms = _forms(views, views.times[mine] + late)
@@ -94,7 +94,7 @@ def _misfit(views: RecordedViews, mine: IntArray, late: float) -> float:
 
 
 def _forms(views: RecordedViews, times: FloatArray) -> FloatArray:
-    """Entries (k, r) of the displacements that change, each centred and of deviation 1, and a column of ones."""
+    """Varying entries (k, r) of the displacements, each centred and of unit deviation, and a column of ones."""
     assert views.generators is not None
     chain = ProjectiveChain(views.joint_kinds, views.generators, np.zeros(len(views.joint_kinds)))
     entries = chain.displacements(views.at(times))[:, :3].reshape(len(times), 12)
@@ -105,7 +105,7 @@ def _forms(views: RecordedViews, times: FloatArray) -> FloatArray:
 
 
 def _fitted(forms: FloatArray, pixels: FloatArray) -> tuple[FloatArray, int]:
-    """What ratios of linear forms (k, r) leave of pixels (k, 2), and the number of their unknowns."""
+    """Residuals (k, 2) of pixels fitted by ratios of linear forms (k, r), and the number of unknowns."""
     middle, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
     x = (pixels - middle) / size
     r = forms.shape[1]
@@ -124,19 +124,19 @@ def _fitted(forms: FloatArray, pixels: FloatArray) -> tuple[FloatArray, int]:
 
 
 AS_GOOD = 1.1
-"""The whole is taken where it scatters no more than so many times the best half."""
+"""Largest ratio of the whole recording's scatter to the best half's with which the whole is used."""
 GOOD = 1.5
-"""A model that scatters more than so many times the noise is asked whether something happened while it was learnt."""
+"""Ratio of a model's scatter to the noise above which a change is searched for in its own data."""
 ORDERS = 2, 4, 6
-"""Differences that the noise of the pixels is told from: of a high order little of a smooth motion is left."""
+"""Orders of the differences that estimate the noise of the pixels: high orders suppress a smooth motion."""
 NOISE_BLOCK, LEAST_VALUES, LOW = 80, 100, 0.25
-"""Frames of a block, differences that tell a noise, and the quantile of the blocks that is taken."""
+"""Frames in a block, least number of differences for a noise estimate, and quantile of the blocks that is used."""
 
 
 @dataclass(frozen=True)
 class ReferenceModel:
-    """A ``model`` and its ``report`` from the ``stops`` of frames ``first`` to ``last``; without report and stops where
-    it was there before the recording. ``noise``: of the pixels over what is stated, as they differ from frame to frame.
+    """A ``model`` and its ``report`` from the ``stops`` of frames ``first`` to ``last``; without report and stops if
+    it existed before the recording. ``noise``: of the pixels over the stated one, from differences between frames.
     """
 
     model: CellModel
@@ -146,36 +146,36 @@ class ReferenceModel:
     last: int
     noise: float
     offsets: FloatArray
-    """(c,) [s] by which pictures were found to be later than stamped, before the model was learnt."""
+    """Delays (c,) [s] of the images after their stamps, found before the model was learnt."""
     at_rest: bool = False
-    """Whether its stops are rests, at which stamps do not matter."""
+    """Whether its stops are rests, at which stamps have no effect."""
     of_first: bool = False
-    """Whether it is of the first frames: later ones were put back to be learnt from."""
+    """Whether it describes the first frames: later ones were corrected to learn from them."""
 
     def put_right(self, views: RecordedViews) -> RecordedViews:
-        """The recording that it was learnt from, with the stamps that it was learnt with."""
+        """The recording with the stamps with which the model was learnt."""
         return views.shifted(self.offsets[views.camera]) if self.offsets.any() else views
 
     @property
     def middle(self) -> int:
-        """A frame that the model is of; -1 where it was there before the first."""
+        """A frame of the model's own data; -1 if it existed before the first one."""
         return -1 if self.of_first else (self.first + self.last) // 2
 
     @property
     def noise_factor(self) -> float:
-        """Noise of the pixels over what is stated, 1 at least: what they leave may be more than noise."""
+        """Noise of the pixels over the stated one, at least 1: residuals may contain more than noise."""
         return self.noise if self.report is None else max(1.0, min(self.report.sigma_factor, self.noise))
 
     @property
     def fits(self) -> bool:
-        """Whether nothing but noise, of pixels and within it of joints, was left where the model was learnt."""
+        """Whether the residuals of the learnt model are only noise of pixels and, within it, of joints."""
         if self.stops is None:
             return True
         return self.scatter_px <= GOOD * self.noise * float(np.median(self.stops.trials.sigmas))
 
     @cached_property
     def scatter_px(self) -> float:
-        """rms deviation [px] that the model expects of a pixel at its stops, errors of the joints included."""
+        """Expected rms deviation [px] of a pixel at the model's stops, errors of the joints included."""
         if self.stops is None or self.report is None:
             return 0.0
         _, covariances = pixel_covariances(self.model, self.stops.trials.positions)
@@ -184,7 +184,7 @@ class ReferenceModel:
 
 
 class LearningError(Exception):
-    """No stretch of a recording gives a model; ``stops``: those of the last attempt, ``error``: its refusal."""
+    """No part of a recording gives a model; ``stops``: those of the last attempt, ``error``: its failure."""
 
     def __init__(self, error: CalibrationError, stops: LearningStops) -> None:
         super().__init__(str(error))
@@ -192,7 +192,7 @@ class LearningError(Exception):
 
 
 def learn_reference(views: RecordedViews) -> ReferenceModel:
-    """The model of the best stretch. Raises LearningError where there is none, CalibrationError (``bad_data``,
+    """The model of the best part. Raises LearningError if there is none, CalibrationError (``bad_data``,
     ``too_few_stops``).
     """
     if not len(views.camera):
@@ -205,7 +205,7 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
     f = len(views.camera)
     stretches = (0, f - 1), (0, f // 2 - 1), (f // 2, f - 1)
     courses = [course(views, np.arange(first, last + 1)) for first, last in stretches]
-    # A stretch in which something happened has no course of its own.
+    # A part that contains a change does not fit one course.
     whole, *halves = range(3)
     halves.sort(key=lambda k: courses[k].misfit)
     clean = courses[whole].misfit <= AS_GOOD**2 * max(1.0, courses[halves[0]].misfit)
@@ -221,9 +221,9 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
 
 
 def frame_noise(views: RecordedViews) -> float:
-    """Noise of the pixels over the stated one, 1 at least: the least that differences of a marker's pixels from frame
-    to frame of a camera tell, of even order by blocks of frames, of first order at rest. An upper bound: too large by
-    what is left of the motion there.
+    """Noise of the pixels over the stated one, at least 1: the smallest estimate from differences of a marker's pixels
+    between frames of a camera, of even order by blocks of frames, of first order at rest. An upper bound: it includes
+    the remaining motion.
     """
     still = views.speeds(views.times) <= AT_REST
     by_order: dict[int, list[float]] = {order: [] for order in (1, *ORDERS)}
@@ -243,7 +243,7 @@ def frame_noise(views: RecordedViews) -> float:
 
 
 def _noise(apart: FloatArray, order: int) -> float:
-    """Deviation of what has differences ``apart`` of an ``order``, by their median; infinite from too few."""
+    """Standard deviation of values with differences ``apart`` of an ``order``, by their median; infinite if too few."""
     values = np.abs(apart[np.isfinite(apart)])
     if len(values) < LEAST_VALUES:
         return math.inf
