@@ -15,7 +15,7 @@ from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 TO_NEXT = np.eye(4)[:, [1, 2, 0, 3]]
-"""Rotation (4, 4) from z to x: x, y, z axes in turn. From the base to the first virtual joint's frame."""
+"""Rotation (4, 4) whose z axis is the previous x, so that x, y, z come in turn; base to first virtual joint's frame."""
 
 
 def virtual_links(attitude: FloatArray) -> FloatArray:
