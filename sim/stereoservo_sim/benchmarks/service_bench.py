@@ -399,7 +399,7 @@ def second_daemon(bench: ServiceBench) -> int:
 
 
 def second_daemon_elsewhere(bench: ServiceBench) -> int:
-    """Start a second daemon of the same drives with other directories and endpoints, likewise."""
+    """Start a second daemon of the same drives with other directories and endpoints; the time is its refusal."""
     folder = bench.folder / "other"
     folder.mkdir(exist_ok=True)
     cell = folder / bench.cell.name

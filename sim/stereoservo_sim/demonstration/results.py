@@ -253,7 +253,7 @@ def _calibration_page(demonstration: Demonstration, trials: TrialData) -> Calibr
 
 
 def residuals(model: CellModel, trials: TrialData) -> FloatArray:
-    """Measured minus predicted raw pixels (c, s, m, 2), NaN where a marker was not seen."""
+    """Measured minus predicted raw pixels (c, s, m, 2), NaN for markers that were not seen."""
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
     matrices = np.array([camera.matrix for camera in model.cameras])
     rows = [model.marker_ids.index(marker) for marker in trials.marker_ids]
@@ -290,7 +290,7 @@ def _goal(goal: Judgement, gain: float) -> GoalPlots:
     )
 
 
-# -- how the report looks ------------------------------------------------------------------------------------
+# -- layout of the report --------------------------------------------------------------------------------------
 # HTML report of a servoing session, from arrays; deterministic.
 #
 # The images are embedded, so that the file can be mailed as it is.

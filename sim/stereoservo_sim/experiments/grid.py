@@ -103,7 +103,7 @@ def scene_shifts() -> FloatArray:
     """Translation of the scene relative to the rig at the 18 stops, (18, 3) [m], from the first one."""
     directions = np.repeat(np.eye(3)[[0, 2, 1]], [5, 6, 6], axis=0)
     path = np.vstack([np.zeros(3), STEP * np.cumsum(directions, axis=0)])
-    # Half of every axis on either side of where the cameras look.
+    # Half of every axis on either side of the point at which the cameras aim.
     return np.asarray(path - STEP * np.array([2.5, 3.0, 3.0]))
 
 

@@ -37,7 +37,7 @@ ArmName = Literal["free", "rx90", "twist"]
 MID_RANGE = translation(0.0, 0.0, 1.1) @ rotation("y", 15) @ rotation("x", -10)
 """The plate's pose (4, 4) at the centre of calibration."""
 PLATE_ON_FLANGE = translation(0.0, 0.0, 0.02) @ rotation("x", 180)
-"""Pose (4, 4) of the plate on the flange: its printed face is turned along the flange's z."""
+"""Pose (4, 4) of the plate on the flange: its printed face points along the flange's z."""
 RX90_HOME = np.radians([10.0, -60.0, 165.0, 20.0, 50.0, 15.0])
 RX90_LIMITS = np.radians(
     [(-160.0, 160.0), (-227.5, 47.5), (-52.5, 232.5), (-270.0, 270.0), (-105.0, 120.0), (-270.0, 270.0)]

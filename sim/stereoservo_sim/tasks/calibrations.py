@@ -169,7 +169,7 @@ def with_trial_ranges(cell: SyntheticCell) -> SyntheticCell:
 
 
 def _shows_face(cell: SyntheticCell, positions: FloatArray) -> npt.NDArray[np.bool_]:
-    """(s,): whether each camera sees the plate's front at less than ``TRIAL_ANGLE_DEG`` from its normal."""
+    """Mask (s,): whether each camera sees the plate's front at less than ``TRIAL_ANGLE_DEG`` from its normal."""
     markers = cell.markers(positions)[..., :3]
     middle = markers.mean(axis=1)
     normal = -np.cross(markers[:, 1] - markers[:, 0], markers[:, 3] - markers[:, 0])

@@ -72,7 +72,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 PRESETS: dict[MechanicsPreset, Mechanics] = {
     # Makers' catalogues: accuracy of 0.5 to 1.5 arcmin, two periods a turn of the wave generator, ratios 50 to 160;
     # no play; spring constants of a size 20 gear that yield about 1 mrad at its first torque. Encoder of 16 bits on
-    # the motor: it sees nothing of the gear.
+    # the motor: it measures no error of the gear.
     "strain_wave": Mechanics(
         encoder_step=float(2.0 * np.pi / (65536 * 100)), ripple=0.5 * ARCMIN, ripple_order=200.0, sag=1e-3,
         dead_band=2e-5, lag_s=0.002,
@@ -262,7 +262,7 @@ def horizontal_load(q: FloatArray) -> FloatArray:
     return found
 
 
-# -- what has a memory ----------------------------------------------------------------------------------------
+# -- mechanics with memory -------------------------------------------------------------------------------------
 
 
 class Transmission:

@@ -164,7 +164,7 @@ class PybulletPlant(RigidPlant):
         for place, position in zip(self._places, positions.tolist(), strict=True):
             rests[place] = position
         still = [0.0] * len(rests)
-        self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's axes for the world's
+        self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's frame as the world's
         balanced = self._bullet.calculateInverseDynamics(self._arm, rests, still, still, physicsClientId=self._client)
         self._pull(GRAVITY)
         self.efforts = np.array(balanced)[self._places]

@@ -108,7 +108,7 @@ class RandomCase:
 
 
 def hidden_out_of_view(cell: SyntheticCell, trials: TrialData) -> TrialData:
-    """The trials with NaN where the cell's exact pixels are outside an image."""
+    """The trials with NaN for exact pixels outside an image."""
     seen = cell.in_view(trials.positions)
     return msgspec.structs.replace(trials, pixels=np.where(seen[..., None], trials.pixels, np.nan))
 

@@ -363,7 +363,7 @@ class BentImage:
     """Distorts the image of ``pinhole``, a larger one without distortion at the same pose, into a camera's image."""
 
     def __init__(self, camera: PinholeCamera) -> None:
-        """Raises ValueError where the lens's image ends inside the image."""
+        """Raises ValueError if the distorted image ends inside the image."""
         if not camera.sees_whole_image:
             raise ValueError(f"camera {camera.name!r}: k1 = {camera.k1:g} leaves the image's corners dark")
         self.camera = camera

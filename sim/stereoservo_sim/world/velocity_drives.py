@@ -212,8 +212,8 @@ class PositionBank(DriveBank):
         self._orders, self._speed = self._q.copy(), np.zeros_like(self._q)
 
     def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """Apply a velocity command, limited to the joints' speeds; the orders follow it. Returns the same as
-        `DriveBank`.
+        """Apply a velocity command (n,), limited to the joints' speeds; the orders follow it. Returns the limited
+        command (n,), and why it differs.
         """
         self.advance(t_ns)
         sent = np.clip(velocities, -self._velocity, self._velocity)

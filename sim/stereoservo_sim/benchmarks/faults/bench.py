@@ -374,7 +374,7 @@ def _wall_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def service_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
-    """A row of the service likewise."""
+    """A row of the service as text, by column; ``digits`` as in `drive_cells`."""
     return {
         "fault": row["fault"],
         "all at rest": _summary(row["rest_ms"], digits) if row["rest_ms"] else "goes on",
@@ -389,7 +389,7 @@ def service_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
 
 
 def input_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
-    """A row of the inputs likewise."""
+    """A row of the inputs as text, by column."""
     return {
         "input": row["input"],
         "fault": row["fault"],

@@ -76,7 +76,7 @@ def sum_up(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
 
 
 def _median_and_max(values: Sequence[float | None]) -> tuple[float | None, float | None]:
-    """Median and maximum of the values that are not None, to 0.01; None where there are none."""
+    """Median and maximum of the values that are not None, to 0.01; None if there are none."""
     there = [value for value in values if value is not None]
     if not there:
         return None, None

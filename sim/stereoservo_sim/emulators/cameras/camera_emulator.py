@@ -83,7 +83,7 @@ class CameraEmulator:
         for camera in self.cameras:
             camera.close()
 
-    # -- pictures ---------------------------------------------------------------------------------------------------
+    # -- images -----------------------------------------------------------------------------------------------------
 
     def take(self, now_ns: int) -> int:
         """Make every image that is due and requested; returns when to call again [ns]."""

@@ -344,7 +344,7 @@ class DriveMotion:
         value = self._dictionary.get(index)
         return value / abs(self._units) if value else self.axis.joint.acceleration_max
 
-    # -- what is measured ----------------------------------------------------------------------------------------
+    # -- measured values -------------------------------------------------------------------------------------------
 
     def _measured(self) -> float:
         """Joint position reported by the encoder: mirrored about the position at which an injected reversal began."""
@@ -413,7 +413,7 @@ class DriveMotion:
         target = self._dictionary.get(0x60FF)
         return abs(self.velocity() - target) <= max(REACHED_SHARE * self._largest, STANDING_UNITS)
 
-    # -- what is done --------------------------------------------------------------------------------------------
+    # -- actions ---------------------------------------------------------------------------------------------------
 
     def power_lost(self, t_ns: int) -> None:
         """Reset after loss of the supply or a reboot of the firmware."""

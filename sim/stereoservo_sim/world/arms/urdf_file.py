@@ -218,7 +218,7 @@ def _spec(joint: UrdfJoint, path: Path) -> JointSpec:
     return JointSpec(joint.name, kind, low, high, speed, ACCELERATION[kind])
 
 
-# -- what hangs on each joint ---------------------------------------------------------------------------------
+# -- rigid parts of each joint ---------------------------------------------------------------------------------
 
 Part = list[tuple[FloatArray, Element]]
 """Rigidly connected links, each with its pose (4, 4) in their joint's frame."""
@@ -519,7 +519,7 @@ def _found(tree: UrdfTree, link: str, left: _LeftOut) -> list[UrdfJoint]:
     else:
         chain = _without_jaw(tree, chain, left)
         link = chain[-1].child if chain else link
-    ahead = tree.below(link)  # a tool's frame behind the last joint, where it is the only one
+    ahead = tree.below(link)  # a tool's frame behind the last joint, if it is the only one
     while len(ahead) == 1 and not ahead[0].moves:
         chain.append(ahead[0])
         ahead = tree.below(ahead[0].child)
